@@ -1,0 +1,1 @@
+"""Association: which ray belongs to which object."""

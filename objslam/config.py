@@ -1,0 +1,209 @@
+"""The settings: nested, with a default for everything; YAML files and `--set key=value` change them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from objslam.errors import ConfigError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Device = Literal["auto", "cpu", "cuda"]
+Loss = Literal["l1", "huber", "cauchy", "gnc"]
+
+
+class Section(BaseModel):
+    """A part of the settings: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Poses(Section):
+    """How poses are read off the log."""
+
+    max_gap: Positive = 0.5
+    """s; a frame in a longer gap of the path is dropped and counted."""
+
+
+class RayNoise(Section):
+    """From boxes to rays."""
+
+    pixel_sigma: Positive = 3.0
+    """px; one standard deviation of a box centre, per axis."""
+    min_score: NotNegative = 0.0
+    """boxes with a lower score are dropped and counted."""
+    border: float = 1.0
+    """px; a box that comes this close to the image's edge is cut off there, its centre is not the object's: dropped and
+    counted. A negative number keeps such boxes."""
+
+
+class Depth(Section):
+    """The optional depth at a box, used as a range along its ray."""
+
+    use: bool = True
+    sigma: Positive = 0.03
+    """m; the part of the noise that does not depend on the distance."""
+    sigma_per_m: NotNegative = 0.02
+    """m per m; the part that grows with it."""
+
+
+class Odometry(Section):
+    """How far odometry drifts: standard deviations that grow with the square root of the way (a random walk)."""
+
+    xy_per_m: NotNegative = 0.05
+    """m after 1 m of driving."""
+    xy_per_rad: NotNegative = 0.01
+    """m after turning 1 rad."""
+    yaw_per_m: NotNegative = 0.02
+    """rad after 1 m of driving."""
+    yaw_per_rad: NotNegative = 0.05
+    """rad after turning 1 rad."""
+    floor_xy: Positive = 1e-3
+    """m a step; what remains when the robot stands."""
+    floor_yaw: Positive = 1e-3
+    """rad a step."""
+
+
+class Planar(Section):
+    """How planar a planar path is: a real floor is not perfect. Per step."""
+
+    z: Positive = 1e-3
+    """m."""
+    tilt: Positive = 1e-3
+    """rad, roll and pitch."""
+
+
+class Localization(Section):
+    """How good absolute poses are (standard deviation of each pose)."""
+
+    xy: Positive = 0.02
+    """m."""
+    yaw: Positive = 0.005
+    """rad."""
+
+
+class Triangulation(Section):
+    """Objects from rays with known poses."""
+
+    device: Device = "auto"
+    consensus: bool = True
+    """start from the best agreement of ray pairs, so that outliers do not move an object."""
+    hypotheses: Annotated[int, Field(ge=1)] = 256
+    """ray pairs tried for each object."""
+    min_parallax_deg: NotNegative = 3.0
+    """an object whose rays span less is unresolved."""
+    max_rel_sigma: Positive = 0.5
+    """an object whose position is less certain than this share of its distance is unresolved."""
+
+
+class Fixed(Section):
+    """Objects with the poses as they are."""
+
+    loss: Loss = "l1"
+
+
+class Joint(Section):
+    """Poses and objects together."""
+
+    loss: Loss = "huber"
+    factor: Literal["bearing", "point_to_line"] = "bearing"
+    """point_to_line is Eq. 1; with free poses it shrinks the map, since a smaller world has smaller distances."""
+    min_parallax_deg: NotNegative = 8.0
+    """a landmark enters the growing graph once its rays span this much."""
+    prior_sigma: Positive = 20.0
+    """m; a weak prior on each landmark that keeps the graph determined."""
+    grow_step: Annotated[int, Field(ge=2)] = 60
+    """keyframes added at a time when there is odometry alone."""
+    max_iterations: Annotated[int, Field(ge=1)] = 100
+
+
+class Output(Section):
+    """What a run writes."""
+
+    recording: bool = True
+    picture: bool = True
+
+
+class Settings(Section):
+    """All settings of a run."""
+
+    mode: Literal["fixed", "joint"] = "fixed"
+    seed: int = 0
+    poses: Poses = Poses()
+    rays: RayNoise = RayNoise()
+    depth: Depth = Depth()
+    odometry: Odometry = Odometry()
+    planar: Planar = Planar()
+    localization: Localization = Localization()
+    triangulation: Triangulation = Triangulation()
+    fixed: Fixed = Fixed()
+    joint: Joint = Joint()
+    output: Output = Output()
+
+
+def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
+    """Settings from defaults, a YAML file, then `key=value` overrides (dotted keys, YAML values), the later the stronger.
+
+    ConfigError names the file or override, the key, and what is wrong with it.
+    """
+    data: dict[str, Any] = {}
+    if file is not None:
+        data = _read_yaml(file)
+        _validate(data, str(file))
+    for text in overrides:
+        key, sign, value = text.partition("=")
+        if not sign or not key:
+            raise ConfigError(f"--set {text!r} is not key=value", hint="for example --set joint.loss=cauchy")
+        try:
+            _put(data, key.strip().split("."), yaml.safe_load(value))
+        except yaml.YAMLError as error:
+            raise ConfigError(f"the value of --set {text!r} is not YAML") from error
+        _validate(data, f"--set {text}")
+    return _validate(data, "settings")
+
+
+def dump_settings(settings: Settings) -> str:
+    """The settings as YAML that `load_settings` reads back."""
+    return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the settings: {error}", where=str(file)) from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{file}:{mark.line + 1}" if mark else str(file)
+        raise ConfigError(f"not YAML: {getattr(error, 'problem', error)}", where=where) from error
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise ConfigError("the settings must be a mapping of keys to values", where=str(file))
+    return data
+
+
+def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
+    for key in keys[:-1]:
+        inner = data.setdefault(key, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"--set {'.'.join(keys)}: {key} has no keys below it")
+        data = inner
+    data[keys[-1]] = value
+
+
+def _validate(data: dict[str, Any], where: str) -> Settings:
+    try:
+        return Settings.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            message = f"there is no setting {key}"
+        else:
+            message = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, got {first['input']!r}"
+        raise ConfigError(message, where=where, hint="`objslam config dump` shows every setting") from error

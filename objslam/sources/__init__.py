@@ -1,0 +1,1 @@
+"""Sources: whatever a robot recorded, read into a `Log`."""
