@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +108,7 @@ class Detections:
 
     def take(self, boxes: Bools | Ints) -> Self:
         """The same frames with a selection of the boxes (mask or increasing indices)."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         for name in ("frame", "boxes", "label", "scores", "depths", "track_ids"):
             values[name] = values[name][boxes]
         return type(self)(**values)
@@ -198,7 +198,7 @@ class Keyframes:
 
     def take(self, keyframes: Bools | Ints) -> Self:
         """A selection of the keyframes (mask or increasing indices)."""
-        values = {}
+        values: dict[str, Any] = {}
         for f in fields(self):
             value = getattr(self, f.name)
             values[f.name] = value[keyframes] if isinstance(value, np.ndarray) else value
@@ -235,8 +235,9 @@ class Rays:
 
     def take(self, rays: Bools | Ints) -> Self:
         """A selection of the rays (mask or increasing indices)."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self)(**{k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()})
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()}
+        return type(self)(**selected)
 
 
 @dataclass(frozen=True)
