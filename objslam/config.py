@@ -36,7 +36,7 @@ class RayNoise(Section):
     """px; one standard deviation of a box centre, per axis."""
     min_score: NotNegative = 0.0
     """boxes with a lower score are dropped and counted."""
-    border: float = 1.0
+    border: Annotated[float, Field(allow_inf_nan=False)] = 1.0
     """px; a box that comes this close to the image's edge is cut off there, its centre is not the object's: dropped and
     counted. A negative number keeps such boxes."""
 
@@ -54,10 +54,12 @@ class Depth(Section):
 class Odometry(Section):
     """How far odometry drifts: standard deviations that grow with the square root of the way (a random walk)."""
 
-    xy_per_m: NotNegative = 0.05
-    """m after 1 m of driving."""
+    x_per_m: NotNegative = 0.05
+    """m along the drive after 1 m of it."""
+    y_per_m: NotNegative = 0.01
+    """m sideways after 1 m; wheels hardly slip sideways, an omnidirectional base may need as much as for x."""
     xy_per_rad: NotNegative = 0.01
-    """m after turning 1 rad."""
+    """m after turning 1 rad on the spot."""
     yaw_per_m: NotNegative = 0.02
     """rad after 1 m of driving."""
     yaw_per_rad: NotNegative = 0.05
@@ -132,7 +134,7 @@ class Settings(Section):
     """All settings of a run."""
 
     mode: Literal["fixed", "joint"] = "fixed"
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
     poses: Poses = Poses()
     rays: RayNoise = RayNoise()
     depth: Depth = Depth()
@@ -160,7 +162,7 @@ def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> 
             raise ConfigError(f"--set {text!r} is not key=value", hint="for example --set joint.loss=cauchy")
         try:
             _put(data, key.strip().split("."), yaml.safe_load(value))
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, ValueError) as error:  # PyYAML lets the ValueError of an impossible date through
             raise ConfigError(f"the value of --set {text!r} is not YAML") from error
         _validate(data, f"--set {text}")
     return _validate(data, "settings")
@@ -176,7 +178,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
         data = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the settings: {error}", where=str(file)) from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # as above
         mark = getattr(error, "problem_mark", None)
         where = f"{file}:{mark.line + 1}" if mark else str(file)
         raise ConfigError(f"not YAML: {getattr(error, 'problem', error)}", where=where) from error

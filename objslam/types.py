@@ -174,8 +174,9 @@ class Keyframes:
 
     stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into that camera's
     detections.frame_stamps. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4), the path to start from (localisation, else
-    odometry). localized: whether map_T_base is an absolute measurement. odom_T_base: (K, 4, 4) or None without odometry;
-    travelled: (K,) m and turned: (K,) rad, what the odometry had summed up by then, for its noise model.
+    odometry). localized_every: how many keyframes share one absolute pose measurement (>= 1; they are interpolated), or 0
+    when map_T_base is odometry. odom_T_base: (K, 4, 4) poses in a frame that starts with the odometry, None without it;
+    drift: (K, 6, 6), the covariance that the odometry has gathered by then, as a sum in that same frame.
     """
 
     stamps: Floats
@@ -183,10 +184,9 @@ class Keyframes:
     frame: Ints
     base_T_camera: Floats
     map_T_base: Floats
-    localized: bool
+    localized_every: float = 0.0
     odom_T_base: Floats | None = None
-    travelled: Floats | None = None
-    turned: Floats | None = None
+    drift: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)

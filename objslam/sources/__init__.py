@@ -1,1 +1,118 @@
-"""Sources: whatever a robot recorded, read into a `Log`."""
+"""Sources: whatever a robot recorded, read into a `Log`.
+
+One file a kind of recording. `SOURCES` is the table of them: a new kind is one more file and one more row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from objslam.errors import ConfigError, LogError
+from objslam.ledger import Ledger
+from objslam.sources import folder, mrclam, tum
+from objslam.types import Log
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What a recording does not say itself.
+
+    format: the name of a source, None to guess it. robot: which one, where there are several. with_range: whether measured
+    depths are used. anonymous: whether landmarks that tell who they are get one label. label: for boxes without a class.
+    """
+
+    format: str | None = None
+    robot: int | None = None
+    with_range: bool = True
+    anonymous: bool = False
+    label: str | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """A kind of recording: how to tell it, in words and as a function, how to read it, and which options it takes."""
+
+    name: str
+    looks_for: str
+    detects: Callable[[Path], bool]
+    reads: Callable[[Path, Ledger, SourceOptions], Log]
+    takes: frozenset[str] = frozenset()
+
+
+def _read_log(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    return folder.read_log_folder(path, ledger)
+
+
+def _read_mrclam(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    with_range, anonymous = options.with_range, options.anonymous
+    return mrclam.read_mrclam(path, options.robot, with_range=with_range, anonymous=anonymous, ledger=ledger)
+
+
+def _read_tum_numbered(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    return tum.read_numbered(path, ledger, label=options.label or "object", with_range=options.with_range)
+
+
+def _read_tum(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    return tum.read_stamped(path, ledger, label=options.label or "object", with_range=options.with_range)
+
+
+SOURCES: tuple[Source, ...] = (
+    Source("log", "camera.yaml or cameras/ with odometry.txt or localization.txt", folder.is_log_folder, _read_log),
+    Source(
+        "mrclam",
+        "Barcodes.dat and Robot<n>_Odometry.dat (or .dat.gz)",
+        mrclam.is_mrclam,
+        _read_mrclam,
+        frozenset({"robot", "with_range", "anonymous"}),
+    ),
+    Source(
+        "tum_numbered",
+        "truth_cam_poses.txt and boxes/<number>*.txt",
+        tum.is_numbered,
+        _read_tum_numbered,
+        frozenset({"label", "with_range"}),
+    ),
+    Source(
+        "tum",
+        "groundtruth.txt (or .gz) and rgb.txt, or boxes in <stamp>.txt in a folder or tar archive",
+        tum.is_stamped,
+        _read_tum,
+        frozenset({"label", "with_range"}),
+    ),
+)
+
+
+def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
+    """Read a recording of any kind that `SOURCES` lists; the kind is guessed from what the path holds unless it is given.
+
+    An option that the kind does not take is named in a warning. LogError where nothing fits or the recording cannot be read;
+    ConfigError for a format that does not exist.
+    """
+    options = options or SourceOptions()
+    source = _choose(path, options.format)
+    default = SourceOptions()
+    for option in (field.name for field in fields(options) if field.name != "format"):
+        if option not in source.takes and getattr(options, option) != getattr(default, option):
+            ledger.warn(f"{path}: the option {option} has no meaning for a {source.name} recording")
+    return source.reads(path, ledger, options)
+
+
+def _choose(path: Path, name: str | None) -> Source:
+    if name is not None:
+        for source in SOURCES:
+            if source.name == name:
+                return source
+        raise ConfigError(f"there is no format {name!r}", hint=f"known: {', '.join(source.name for source in SOURCES)}")
+    try:
+        path.stat()
+        for source in SOURCES:
+            if source.detects(path):
+                return source
+        if folder.resembles_log(path):  # reading it says what is missing
+            return SOURCES[0]
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
+    looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)
+    raise LogError("nothing here that objslam reads", where=str(path), hint=f"looked for {looked_for}")

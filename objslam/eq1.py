@@ -1,0 +1,243 @@
+"""Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the smallest sum of distances to its lines.
+
+Imported when something is triangulated (torch is slow to import); `triangulation` is the way in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+_MAX_ITERATIONS = 80
+# in units of an object's mean distance to its lines:
+_LATE = 1e-9  # smoothing this small leaves the rest to `_settle`, after a few more steps
+_FLOOR = 1e-11  # rounding leaves no room for less
+_ON_LINE = (1e-7, 1e-5)  # a line this close to the smoothed solution may pass through the exact one
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of many objects: foot (R, 3), the point of each line nearest to its object's own origin; direction (R, 3), unit;
+    index (R,), the object of each line; count, the number of objects N."""
+
+    foot: Tensor
+    direction: Tensor
+    index: Tensor
+    count: int
+
+    @classmethod
+    def through(cls, origin: Tensor, direction: Tensor, index: Tensor, count: int) -> Self:
+        """Lines through points (R, 3), given in the coordinates of their object, along unit directions (R, 3)."""
+        # projected twice: the first leaves rounding of the size of the origin along the line, which a small foot cannot bear
+        return cls(across(across(origin, direction), direction), direction, index, count)
+
+    def sum(self, values: Tensor) -> Tensor:
+        """Sums (N, ...) over each object's lines of values (R, ...)."""
+        return object_sum(values, self.index, self.count)
+
+    def offset(self, points: Tensor) -> Tensor:
+        """Offsets (R, 3) of each object's point (N, 3) from its lines, perpendicular to them: Eq. 1 sums their norms."""
+        return across(points[self.index], self.direction) - self.foot
+
+    def projectors(self) -> Tensor:
+        """(R, 3, 3) I - n n^T of each line."""
+        return _projectors(self.direction)
+
+    def scaled(self, factor: Tensor) -> Lines:
+        """The lines with each object's coordinates multiplied by its factor (N,)."""
+        return Lines(self.foot * factor[self.index, None], self.direction, self.index, self.count)
+
+    def select(self, objects: Tensor) -> tuple[Lines, Tensor]:
+        """The lines of some objects (N,) bool, renumbered, and which lines (R,) bool they are."""
+        rays = objects[self.index]
+        number = torch.cumsum(objects, 0) - 1
+        return Lines(self.foot[rays], self.direction[rays], number[self.index[rays]], int(objects.sum())), rays
+
+
+def object_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Sums (N, ...) over each object's rays of values (R, ...)."""
+    return values.new_zeros((count, *values.shape[1:])).index_add_(0, index, values)
+
+
+def across(vectors: Tensor, direction: Tensor) -> Tensor:
+    """The parts (R, 3) of vectors perpendicular to unit directions (R, 3)."""
+    return vectors - direction * (vectors * direction).sum(-1, keepdim=True)
+
+
+def closed_form(origin: Tensor, direction: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The points (N, 3) with the smallest sum of squared distances to their lines, and whether the lines fix them (N,).
+
+    Parallel lines (a single one is) do not: then the point is 1 m ahead of the mean origin, on the mean line. Objects
+    without lines: NaN.
+    """
+    number = object_sum(torch.ones_like(origin[:, 0]), index, count)
+    base = object_sum(origin, index, count) / number[:, None]  # map coordinates may be large, an object's spread is not
+    lines = Lines.through(origin - base[index], direction, index, count)
+    eigenvalues, vectors = torch.linalg.eigh(lines.sum(lines.projectors()))
+    # an eigenvalue is the sum of squared sines between the lines and its axis
+    usable = eigenvalues > 1e-10 * number[:, None]
+    pull = (vectors.mT @ lines.sum(lines.foot)[:, :, None])[:, :, 0]
+    point = (vectors @ torch.where(usable, pull / torch.where(usable, eigenvalues, 1.0), 0.0)[:, :, None])[:, :, 0]
+    determined = usable.all(dim=1)
+    heading = object_sum(direction, index, count)
+    ahead = vectors[:, :, 0]
+    ahead = torch.where((ahead * heading).sum(1, keepdim=True) < 0, -ahead, ahead)
+    return base + point + torch.where(determined[:, None], 0.0, ahead), determined
+
+
+def solve(origin: Tensor, direction: Tensor, index: Tensor, count: int, start: Tensor) -> tuple[Tensor, int, Tensor]:
+    """Eq. 1 for N objects from a start (N, 3): the points (N, 3), the iterations, the norm of the gradient (N,).
+
+    Where lines pass through the solution, the gradient is the smallest subgradient found: 0 proves the optimum all the
+    same. Objects must have lines that fix a point; those without any stay where they start.
+    """
+    lines = Lines.through(origin - start[index], direction, index, count)
+    number = lines.sum(torch.ones_like(origin[:, 0])).clamp(min=1)
+    unit = lines.sum(lines.foot.norm(dim=1)) / number
+    reach = lines.sum((origin - start[index]).norm(dim=1)) / number
+    meeting = unit <= 1e-14 * reach  # all lines meet at the start, up to rounding
+    lines, _ = lines.scaled(1 / torch.where(meeting, 1.0, unit)).select(~meeting)
+    point, dual, iterations = _minimise(lines)
+    smoothed, (point, gradient) = point, _settle(lines, point, dual, 0.0)
+    for on_line in _ON_LINE:
+        doubtful = gradient > 1e-10
+        some, rays = lines.select(doubtful)
+        other, rest = _settle(some, smoothed[doubtful], dual[rays], on_line)
+        better = rest < gradient[doubtful]
+        point[doubtful] = torch.where(better[:, None], other, point[doubtful])
+        gradient[doubtful] = torch.where(better, rest, gradient[doubtful])
+    result, norm = start.clone(), torch.zeros_like(unit)
+    result[~meeting] += point * unit[~meeting, None]
+    norm[~meeting] = gradient
+    return result, iterations, norm
+
+
+def _minimise(lines: Lines) -> tuple[Tensor, Tensor, int]:
+    """Primal-dual Newton on the sum of sqrt(distance^2 + epsilon^2) while epsilon goes to zero, all objects together.
+
+    Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000); the linearisation is Chan, Golub & Mulet's.
+    The dual (R, 3) of a line, within the unit ball across it, is the unit offset, or what takes its place where the
+    solution lies on the line. In units of an object's mean distance, from its own origin.
+    """
+    zeros = lines.foot.new_zeros(lines.count)
+    point, dual = zeros[:, None].repeat(1, 3), torch.zeros_like(lines.foot)
+    live = torch.arange(lines.count, device=zeros.device)  # objects still worked on, and their lines
+    live_rays = torch.arange(len(lines.foot), device=zeros.device)
+    number = lines.sum(torch.ones_like(lines.foot[:, 0])).clamp(min=1)
+    o, epsilon, late = point.clone(), torch.ones_like(zeros), torch.zeros_like(zeros)
+    q = lines.offset(o)
+    y = q / _radius(q, epsilon[lines.index])[:, None]
+    projectors = lines.projectors()
+    for iteration in range(_MAX_ITERATIONS):
+        distance = q.norm(dim=1).clamp(min=_TINY)
+        gradient = lines.sum(q / distance[:, None]).norm(dim=1)
+        # what rounding leaves of the gradient: an offset is known to 1e-16, its direction to that over its length
+        finished = gradient <= 4e-16 * lines.sum(1 + 1 / distance).clamp(max=1e6)
+        finished |= late >= 4
+        if finished.any():
+            point[live], dual[live_rays] = o, y
+            lines, rays = lines.select(~finished)
+            live, live_rays, projectors = live[~finished], live_rays[rays], projectors[rays]
+            o, q, y, number = o[~finished], q[rays], y[rays], number[~finished]
+            epsilon, late = epsilon[~finished], late[~finished]
+            if lines.count == 0:
+                return point, dual, iteration
+        if iteration:
+            gap = lines.sum(q.norm(dim=1) - (y * q).sum(1)) / number
+            residual = lines.sum(y).norm(dim=1) / number
+            epsilon = torch.minimum(epsilon, torch.maximum(0.1 * torch.maximum(gap, residual), 0.01 * epsilon))
+            epsilon = epsilon.clamp(min=_FLOOR)
+            late += epsilon <= _LATE
+        o, q, y = _newton_step(lines, projectors, o, q, y, epsilon)
+    point[live], dual[live_rays] = o, y
+    return point, dual, _MAX_ITERATIONS
+
+
+def _newton_step(
+    lines: Lines, projectors: Tensor, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One damped primal-dual step from points o (N, 3) with offsets q and duals y (R, 3): the new o, q, y."""
+    r = _radius(q, epsilon[lines.index])
+    outer = y[:, :, None] * (q / r[:, None])[:, None, :]
+    hessian = lines.sum((projectors - 0.5 * (outer + outer.mT)) / r[:, None, None])
+    trace = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
+    hessian = hessian + 1e-14 * trace[:, None, None] * torch.eye(3, dtype=o.dtype, device=o.device)
+    gradient = lines.sum(q / r[:, None])
+    step = -torch.linalg.solve(hessian, gradient)
+    slope, value, length = (gradient * step).sum(1), lines.sum(r), torch.ones_like(epsilon)
+    for _ in range(40):  # halve each object's step until its cost falls (Armijo), up to rounding
+        new = o + length[:, None] * step
+        new_q = lines.offset(new)
+        too_long = lines.sum(_radius(new_q, epsilon[lines.index])) > value + 1e-4 * length * slope + 1e-14 * value
+        if not too_long.any():
+            break
+        length = torch.where(too_long, 0.5 * length, length)
+    change = new_q - q
+    dual_step = (new_q - y * ((q * change).sum(1) / r)[:, None]) / r[:, None] - y
+    # as far as the unit ball allows
+    a, b = dual_step.square().sum(1), (y * dual_step).sum(1)
+    c = (y.square().sum(1) - 1).clamp(max=0)
+    share = (0.999 * ((b.square() - a * c).clamp(min=0).sqrt() - b) / a.clamp(min=_TINY)).clamp(max=1)
+    return new, new_q, y + share[:, None] * dual_step
+
+
+def _settle(lines: Lines, point: Tensor, dual: Tensor, on_line: float) -> tuple[Tensor, Tensor]:
+    """The exact optimum next to the smoothed one, (N, 3), and the norm of its smallest subgradient (N,).
+
+    Lines within on_line of the smoothed solution are taken to pass through the exact one: moved onto them, then Newton
+    along what freedom they leave. The subgradient tells whether that was right; inf where the lines do not meet.
+    """
+    on = lines.offset(point).norm(dim=1) <= on_line
+    weight = on.to(point.dtype)[:, None]
+    eigenvalues, vectors = torch.linalg.eigh(lines.sum(lines.projectors() * weight[:, :, None]))
+    fixed = eigenvalues > 1e-9 * eigenvalues[:, -1:].clamp(min=_TINY)
+    inverse = _assemble(vectors, torch.where(fixed, 1 / torch.where(fixed, eigenvalues, 1.0), 0.0))
+    free = _assemble(vectors, (~fixed).to(point.dtype))
+    pull = torch.zeros_like(point)
+    for newton in (True, True, True, False):
+        point = point - _apply(inverse, lines.sum(lines.offset(point) * weight))
+        q = lines.offset(point)
+        d = torch.where(on, 1.0, q.norm(dim=1)).clamp(min=1e-14)[:, None]
+        u = q / d * (1 - weight)
+        pull = lines.sum(u)
+        if newton:
+            curvature = (lines.projectors() - u[:, :, None] * u[:, None, :]) * ((1 - weight) / d)[:, :, None]
+            point = point - _short_newton(free @ lines.sum(curvature) @ free, _apply(free, pull))
+    # the smallest subgradient: the lines on the point answer the pull of the others, each with at most 1
+    answer = across(dual, lines.direction) * weight
+    for _ in range(30 if bool(on.any()) else 0):
+        rest = pull + lines.sum(answer)
+        answer = answer - across(_apply(inverse, rest)[lines.index], lines.direction) * weight
+        answer = answer / answer.norm(dim=1, keepdim=True).clamp(min=1)
+    missed = lines.sum((q.norm(dim=1) > 1e-9) * on.to(point.dtype)) > 0
+    return point, torch.where(missed, torch.inf, (pull + lines.sum(answer)).norm(dim=1))
+
+
+def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
+    """Newton steps (N, 3) where there is curvature, no longer than 1e-3: the solution is next to here or not at all."""
+    scale = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
+    eigenvalues, vectors = torch.linalg.eigh(hessian / scale[:, None, None])
+    inverse = torch.where(eigenvalues > 1e-10, 1 / eigenvalues.clamp(min=_TINY), 0.0)
+    step = _apply(_assemble(vectors, inverse), gradient / scale[:, None])
+    return step * (1e-3 / step.norm(dim=1, keepdim=True).clamp(min=1e-3))
+
+
+def _radius(offset: Tensor, epsilon: Tensor) -> Tensor:
+    return (offset.square().sum(1) + epsilon.square()).sqrt()
+
+
+def _projectors(direction: Tensor) -> Tensor:
+    eye = torch.eye(3, dtype=direction.dtype, device=direction.device)
+    return eye - direction[:, :, None] * direction[:, None, :]
+
+
+def _assemble(vectors: Tensor, eigenvalues: Tensor) -> Tensor:
+    return (vectors * eigenvalues[:, None, :]) @ vectors.mT
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors[:, :, None])[:, :, 0]

@@ -1,0 +1,249 @@
+"""How good a map is, and a path: compared with the ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.errors import ConfigError, LogError
+from objslam.geometry import align as align_points
+from objslam.geometry import interpolate
+from objslam.matching import IDENTITY, Alignment, Transform, align_objects, match
+from objslam.results import dump_json, write_file
+from objslam.types import Floats, MapObject, ObjectMap, Trajectory, Truth, TruthObject
+
+MAX_TRUTH_GAP = 1.0
+"""s; in a longer gap of the true path there is no truth to interpolate."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """A map object and the true object that it is; error (m) after the alignment, offset (3,) is map minus truth."""
+
+    object: MapObject
+    truth: TruthObject
+    offset: Floats
+
+    @property
+    def error(self) -> float:
+        """Distance between the two, m."""
+        return float(np.linalg.norm(self.offset))
+
+
+@dataclass(frozen=True)
+class ObjectScores:
+    """The map against the true objects: what was matched (one-to-one, same label, within the radius), missed and false.
+
+    Unresolved objects claim no position: they are neither matched nor false, only counted.
+    """
+
+    matches: tuple[Match, ...]
+    missed: tuple[TruthObject, ...]
+    false: tuple[MapObject, ...]
+    unresolved: int
+    transform: Transform
+
+    @property
+    def errors(self) -> Floats:
+        """Position errors (matched,), m."""
+        return np.array([m.error for m in self.matches])
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the mapped objects that are matched; None when none is mapped."""
+        return _share(len(self.matches), len(self.false))
+
+    @property
+    def recall(self) -> float | None:
+        """Share of the true objects that are matched."""
+        return _share(len(self.matches), len(self.missed))
+
+
+@dataclass(frozen=True)
+class PathScores:
+    """The path against the true one: translation errors (N,), m, at the stamps of the path that the truth covers.
+
+    errors: after aligning the path by itself (absolute trajectory error; Sturm et al., IROS 2012). errors_with_map: after
+    the alignment of the objects, which shows what the two agree on; None without objects. outside: stamps without truth.
+    """
+
+    errors: Floats
+    errors_with_map: Floats | None
+    outside: int
+    transform: Transform
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The comparison of a result with the ground truth; each part is None where there was nothing to compare."""
+
+    objects: ObjectScores | None
+    path: PathScores | None
+    align: Alignment
+    radius: float
+    warnings: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What evaluation.json holds: counts, m and s; null where there is no value."""
+        return {
+            "align": self.align,
+            "radius": self.radius,
+            **_object_dict(self.objects),
+            **_path_dict(self.path),
+            "warnings": list(self.warnings),
+            **_listing(self.objects),
+        }
+
+
+def evaluate(
+    map: ObjectMap,
+    truth: Truth | None,
+    trajectory: Trajectory | None = None,
+    *,
+    align: Alignment = "none",
+    radius: float = 0.5,
+) -> Evaluation:
+    """Compare a map, and the path (map_T_base) where both are there, with the ground truth.
+
+    align: none, or lay the map onto the truth first: se2 turns it about z and moves it, sim2 scales it too; objects by their
+    matches, the path by itself. radius: m, the farthest that a match may be off; only objects of one label are matched.
+    LogError without any truth to compare with, ConfigError for a radius that is not positive.
+    """
+    if not radius > 0:
+        raise ConfigError(f"the radius must be positive, got {radius}")
+    pairs = None
+    if trajectory is not None and truth is not None and truth.trajectory is not None:
+        pairs = _path_pairs(trajectory, truth.trajectory)
+    if truth is None or (not truth.objects and pairs is None):
+        raise LogError("no ground truth", hint="give --truth FILE")
+    on_path = IDENTITY if pairs is None else Transform(*align_points(pairs.ours, pairs.theirs, align))
+    objects = path = None
+    if truth.objects:
+        start = on_path if pairs is not None and len(pairs.ours) >= 2 else None
+        objects = _score_objects(map, truth.objects, align, radius, start)
+    if pairs is not None:
+        with_map = None if objects is None else _distances(objects.transform.apply(pairs.ours), pairs.theirs)
+        path = PathScores(_distances(on_path.apply(pairs.ours), pairs.theirs), with_map, pairs.outside, on_path)
+    return Evaluation(objects, path, align, radius, tuple(_warnings(objects, path, align)))
+
+
+def write_evaluation(evaluation: Evaluation, out: Path) -> None:
+    """Write evaluation.json into the result folder `out`; OutputError when the disk refuses."""
+    write_file(out / "evaluation.json", dump_json(evaluation.to_dict()).encode())
+
+
+def _score_objects(
+    map: ObjectMap, truth: tuple[TruthObject, ...], kind: Alignment, radius: float, on_path: Transform | None
+) -> ObjectScores:
+    # an order of our own: what is found must not depend on the order in the files
+    mapped = sorted(map.resolved(), key=lambda o: (o.label, o.id))
+    true = sorted(truth, key=lambda o: (o.label, o.id))
+    ours = np.array([o.position for o in mapped]).reshape(-1, 3)
+    theirs = np.array([o.position for o in true]).reshape(-1, 3)
+    same = np.array([[o.label == t.label for t in true] for o in mapped], dtype=bool).reshape(len(mapped), len(true))
+    # labels that repeat leave open who is whom: then the path says how map and truth lie, where there is one
+    repeat = bool((same.sum(axis=0) > 1).any() or (same.sum(axis=1) > 1).any())
+    transform = align_objects(ours, theirs, same, radius, kind, start=on_path if repeat else None)
+    moved = transform.apply(ours)
+    rows, columns = match(moved, theirs, same, radius)
+    return ObjectScores(
+        matches=tuple(Match(mapped[i], true[k], moved[i] - theirs[k]) for i, k in zip(rows, columns, strict=True)),
+        missed=tuple(true[k] for k in np.setdiff1d(np.arange(len(true)), columns)),
+        false=tuple(mapped[i] for i in np.setdiff1d(np.arange(len(mapped)), rows)),
+        unresolved=len(map) - len(mapped),
+        transform=transform,
+    )
+
+
+def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
+    warnings = []
+    if objects is not None and kind != "none" and 0 < len(objects.matches) < 3:
+        warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only: their errors say little")
+    if objects is not None and not 0.5 <= objects.transform.scale <= 2.0:
+        warnings.append(f"the map is scaled by {objects.transform.scale:.3g} to fit the truth: do they show the same place?")
+    if path is not None and not len(path.errors):
+        warnings.append("no pose of the path has a truth at its stamp: do both use the same clock?")
+    return warnings
+
+
+@dataclass(frozen=True)
+class _PathPairs:
+    """Positions (N, 3), m, of the path and of the truth at the same stamps; outside: how many stamps have no truth."""
+
+    ours: Floats
+    theirs: Floats
+    outside: int
+
+
+def _path_pairs(path: Trajectory, truth: Trajectory) -> _PathPairs:
+    poses, known = interpolate(truth.stamps, truth.poses, path.stamps, MAX_TRUTH_GAP)
+    return _PathPairs(path.poses[known, :3, 3], poses[known, :3, 3], int((~known).sum()))
+
+
+def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
+    return {
+        "matched": None if scores is None else len(scores.matches),
+        "missed": None if scores is None else len(scores.missed),
+        "false": None if scores is None else len(scores.false),
+        "unresolved": None if scores is None else scores.unresolved,
+        "precision": None if scores is None else scores.precision,
+        "recall": None if scores is None else scores.recall,
+        **_summary("position_", None if scores is None else scores.errors),
+        "transform": None if scores is None else _transform_dict(scores.transform),
+    }
+
+
+def _path_dict(path: PathScores | None) -> dict[str, Any]:
+    ate = _summary("ate_", None if path is None else path.errors)
+    with_map = _summary("", None if path is None else path.errors_with_map)
+    return {
+        "ate": ate.pop("ate_rmse"),
+        **ate,
+        "ate_in_map_alignment": with_map["rmse"],
+        "path_poses": None if path is None else len(path.errors),
+        "path_poses_without_truth": None if path is None else path.outside,
+        "path_transform": None if path is None else _transform_dict(path.transform),
+    }
+
+
+def _listing(scores: ObjectScores | None) -> dict[str, Any]:
+    matches, missed, false = ((), (), ()) if scores is None else (scores.matches, scores.missed, scores.false)
+    return {
+        "objects": [
+            {
+                "id": m.object.id,
+                "truth_id": m.truth.id,
+                "label": m.truth.label,
+                "error": m.error,
+                "offset": m.offset.tolist(),
+            }
+            for m in matches
+        ],
+        "missed_objects": [{"truth_id": o.id, "label": o.label} for o in missed],
+        "false_objects": [{"id": o.id, "label": o.label} for o in false],
+    }
+
+
+def _distances(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.linalg.norm(a - b, axis=1))
+
+
+def _share(part: int, rest: int) -> float | None:
+    return part / (part + rest) if part + rest else None
+
+
+def _summary(prefix: str, errors: Floats | None) -> dict[str, float | None]:
+    if errors is None or not len(errors):
+        return dict.fromkeys((f"{prefix}rmse", f"{prefix}median", f"{prefix}max"))
+    rmse = float(np.sqrt((errors**2).mean()))
+    return {f"{prefix}rmse": rmse, f"{prefix}median": float(np.median(errors)), f"{prefix}max": float(errors.max())}
+
+
+def _transform_dict(transform: Transform) -> dict[str, Any]:
+    """map to truth: scale * rotation @ point + translation."""
+    pose = transform.pose
+    yaw = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
+    return {"scale": transform.scale, "yaw_deg": yaw, "translation": pose[:3, 3].tolist()}

@@ -1,0 +1,260 @@
+"""The whole log in one factor graph: objects with fixed poses, or poses and objects together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from objslam.config import Loss, Settings
+from objslam.geometry import inverse
+from objslam.graph import factors
+from objslam.graph.grow import anchor, grow, landmark_priors, range_factors, ray_factors
+from objslam.graph.marginals import marginal_covariances
+from objslam.graph.optimise import (
+    Optimum,
+    build_graph,
+    graduated,
+    levenberg_marquardt,
+    make_values,
+    read_points,
+    read_poses,
+)
+from objslam.ledger import Ledger
+from objslam.rays import angles_off
+from objslam.triangulation import Triangulation, triangulate
+from objslam.types import Association, Bools, Floats, Ints, Keyframes, Rays
+
+_REJECT_ROUNDS = 4
+"""Outliers are looked for again at the solved poses until nothing changes, this often at the most."""
+_RAYLEIGH_MEDIAN = 1.1774
+"""The median norm of a standard Gaussian in the plane."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a solve found.
+
+    map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN where not solved. solved: (N,) whether the
+    object was part of the graph. weight: (R,) each ray's robust weight in [0, 1], 0 without object or when rejected. The costs
+    are the errors of the graph that was solved last, at its start and at its optimum.
+    """
+
+    map_T_base: Floats
+    positions: Floats
+    covariance: Floats
+    solved: Bools
+    weight: Floats
+    cost_before: float
+    cost_after: float
+    iterations: int
+
+
+def triangulate_at(
+    map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
+) -> Triangulation:
+    """Every object by Eq. 1 at the camera poses (K, 4, 4); poses that are localised bring their own noise to the rays."""
+    origins, directions = rays.in_map(map_T_camera)
+    sigma, place = _pose_noise(rays, keyframes, settings)
+    return triangulate(
+        origins,
+        directions,
+        association.object,
+        association.count,
+        sigma,
+        settings.triangulation,
+        seed=settings.seed,
+        ranges=rays.range,
+        range_sigma=rays.range_sigma,
+        position_sigma=place,
+    )
+
+
+def solve_fixed(
+    keyframes: Keyframes, rays: Rays, association: Association, start: Triangulation, settings: Settings
+) -> Estimate:
+    """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
+
+    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's. The other losses weigh each ray by its noise
+    across at the object's distance, and take a measured range as a factor along the ray. Objects that the triangulation left
+    unresolved stay out.
+    """
+    loss = settings.fixed.loss
+    used = np.flatnonzero((association.object >= 0) & (start.weight > 0) & start.ok[association.object])
+    landmark = association.object[used]
+    origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
+    angle, place = _pose_noise(rays, keyframes, settings)
+    across = np.hypot(angle[used] * np.linalg.norm(start.positions[landmark] - origins, axis=1), place)
+    noise = factors.robust(loss, np.ones(len(used)) if loss == "l1" else across, 2)
+    groups = [factors.point_to_line_fixed(origins, n, landmark, noise)]
+    ranged = np.isfinite(rays.range[used]) & (loss != "l1")
+    groups.append(
+        factors.along_ray(
+            origins[ranged], n[ranged], rays.range[used][ranged], rays.range_sigma[used][ranged], landmark[ranged]
+        )
+    )
+    graph, landmarks = build_graph(*groups), np.unique(landmark)
+    values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
+    optimum = _solve(graph, values, loss, settings, range(len(used), graph.size()), tolerance=1e-12)
+    positions = start.positions.copy()
+    positions[landmarks] = read_points(optimum.values)
+    distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
+    weight = np.zeros(len(rays))
+    weight[used] = _weights(loss, distance / across, optimum)
+    covariance = start.covariance
+    if loss != "l1":
+        information = _across(n) * (weight[used] / across**2)[:, None, None]
+        along = np.where(ranged, 1 / rays.range_sigma[used] ** 2, 0.0)
+        information += n[:, :, None] * n[:, None, :] * np.where(ranged, along, 0.0)[:, None, None]
+        covariance = _inverse_sums(information, landmark, association.count)
+        covariance *= _widening(distance / across, landmark, association.count)[:, None, None]
+    return Estimate(
+        map_T_base=keyframes.map_T_base,
+        positions=positions,
+        covariance=covariance,
+        solved=np.isin(np.arange(association.count), landmarks),
+        weight=weight,
+        cost_before=optimum.cost_before,
+        cost_after=optimum.cost_after,
+        iterations=optimum.iterations,
+    )
+
+
+def solve_joint(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[Estimate, Triangulation]:
+    """Poses and objects together, from a start that holds: the localisation's poses, or the graph grown along the odometry.
+
+    After each solve, rays that no consensus of their object supports at the solved poses are rejected, and objects that now
+    carry a position enter, until nothing changes. Returned with the estimate: Eq. 1 at the solved poses, for comparison.
+    """
+    positions = np.full((association.count, 3), np.nan)
+    map_T_camera = keyframes.map_T_camera
+    if not keyframes.localized_every:
+        map_T_camera, positions = grow(keyframes, rays, association, settings, progress)
+    used = np.zeros(len(rays), dtype=bool)
+    optimum, iterations = None, 0
+    for _ in range(_REJECT_ROUNDS):
+        placed = triangulate_at(map_T_camera, keyframes, rays, association, settings)
+        positions = np.where(np.isnan(positions) & placed.ok[:, None], placed.positions, positions)
+        supported = (placed.weight > 0) & np.isfinite(positions[association.object, 0]) & (association.object >= 0)
+        if optimum is not None and (supported == used).all():
+            break
+        used = supported
+        graph, others = _joint_graph(keyframes, rays, association, positions, used, settings.joint.loss, settings)
+        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
+        values = make_values(map_T_camera, positions, landmarks)
+        optimum = _solve(graph, values, settings.joint.loss, settings, others)
+        iterations += optimum.iterations
+        map_T_camera = read_poses(optimum.values)
+        positions[landmarks] = read_points(optimum.values)
+    assert optimum is not None
+
+    origins, directions = (a[used] for a in rays.in_map(map_T_camera))
+    residual = angles_off(origins, directions, positions[association.object[used]]) / rays.sigma[used]
+    weight = np.zeros(len(rays))
+    weight[used] = _weights(settings.joint.loss, residual, optimum)
+    covariance = np.full((association.count, 3, 3), np.nan)
+    landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
+    gaussian, _ = _joint_graph(keyframes, rays, association, positions, used & (weight > 0), "gnc", settings)
+    covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
+    covariance *= _widening(residual, association.object[used], association.count)[:, None, None]
+    estimate = Estimate(
+        map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
+        positions=positions,
+        covariance=covariance,
+        solved=np.isfinite(covariance[:, 0, 0]),
+        weight=weight,
+        cost_before=optimum.cost_before,
+        cost_after=optimum.cost_after,
+        iterations=iterations,
+    )
+    return estimate, placed
+
+
+def _joint_graph(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    positions: Floats,
+    used: Bools,
+    loss: Loss,
+    settings: Settings,
+) -> tuple[gtsam.NonlinearFactorGraph, range]:
+    """The graph, its first factors those of the used rays in their order, and the indices of all others."""
+    which = np.flatnonzero(used)
+    groups = [
+        ray_factors(rays, association.object, which, loss, settings),
+        range_factors(rays, association.object, which),
+        landmark_priors(np.flatnonzero(np.isfinite(positions[:, 0])), positions, settings),
+    ]
+    if keyframes.odom_T_base is not None:
+        groups.append(factors.betweens(*factors.motions(keyframes, settings), 0))
+    if keyframes.localized_every:
+        groups.append(factors.localizations(keyframes, settings))
+    else:
+        groups.append([anchor(keyframes.map_T_camera[0])])
+    graph = build_graph(*groups)
+    return graph, range(len(which), graph.size())
+
+
+def _solve(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    loss: Loss,
+    settings: Settings,
+    known_inliers: Sequence[int],
+    tolerance: float = 1e-6,
+) -> Optimum:
+    if loss == "gnc":
+        return graduated(graph, values, settings.joint.max_iterations, known_inliers)
+    return levenberg_marquardt(graph, values, settings.joint.max_iterations, tolerance)
+
+
+def _pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
+    """The rays' angle noise (R,), rad, and that of their origins, m, with the localisation's own noise in it.
+
+    Keyframes that share a measured pose share its error: their rays count as the one.
+    """
+    share = keyframes.localized_every
+    of = settings.localization
+    return np.sqrt(rays.sigma**2 + of.yaw**2 * share), float(of.xy * np.sqrt(share))
+
+
+def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:
+    if loss == "gnc" and optimum.weights is not None:
+        return optimum.weights[: len(residual)]
+    if loss == "huber":
+        return np.minimum(1.0, factors.HUBER_K / np.maximum(residual, 1e-12))
+    if loss == "cauchy":
+        return 1 / (1 + (residual / factors.CAUCHY_K) ** 2)
+    return np.ones(len(residual))
+
+
+def _widening(residual: Floats, landmark: Ints, count: int) -> Floats:
+    """Factors (N,) >= 1 on the covariances: what the whitened residuals show beyond the noise that was assumed."""
+    order = np.lexsort((residual, landmark))
+    number = np.bincount(landmark, minlength=count)
+    middle = np.clip(np.cumsum(number) - number + number // 2, 0, max(len(residual) - 1, 0))
+    median = np.where(number > 5, residual[order][middle], 0.0) if len(residual) else np.zeros(count)
+    return np.maximum(1.0, median / _RAYLEIGH_MEDIAN) ** 2
+
+
+def _across(directions: Floats) -> Floats:
+    return np.eye(3) - directions[:, :, None] * directions[:, None, :]
+
+
+def _inverse_sums(information: Floats, landmark: Ints, count: int) -> Floats:
+    total = np.zeros((count, 3, 3))
+    np.add.at(total, landmark, information)
+    covariance = np.full((count, 3, 3), np.nan)
+    held = np.linalg.eigvalsh(total)[:, 0] > 0
+    covariance[held] = np.linalg.inv(total[held])
+    return covariance

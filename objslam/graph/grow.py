@@ -1,0 +1,127 @@
+"""A start that holds: the graph grown along the path, so that no solve ever begins far from its answer.
+
+From dead reckoning alone a batch solve can diverge by kilometres. Here a few keyframes are added at a time at the poses
+that the solved ones predict, and an object enters when the rays seen so far, at the poses of that moment, carry a position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from objslam.config import Loss, Settings
+from objslam.geometry import inverse
+from objslam.graph import factors
+from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
+from objslam.triangulation import triangulate
+from objslam.types import Association, Floats, Ints, Keyframes, Rays
+
+_ITERATIONS = 4  # a step: each begins close to its optimum, and the next one goes on from there
+_L1_RADIANS = 1e-4
+_EQ1_SIGMA = 0.05  # m; Eq. 1 knows no noise of its own: this weighs its metres against the odometry
+
+
+def grow(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    settings: Settings,
+    progress: Callable[[int, int], None],
+) -> tuple[Floats, Floats]:
+    """Camera poses (K, 4, 4) in map and landmark positions (N, 3), NaN where the rays never carried one.
+
+    The map is the odometry's frame: its first keyframe is held. progress(done, total) is called in keyframes.
+    """
+    motion, covariance = factors.motions(keyframes, settings)
+    map_T_camera = keyframes.map_T_camera.copy()
+    positions = np.full((association.count, 3), np.nan)
+    graph = build_graph([anchor(map_T_camera[0])])
+    end = 1
+    while end < len(keyframes):
+        begin, end = end, min(end + settings.joint.grow_step, len(keyframes))
+        # the new keyframes follow the last solved one by odometry
+        follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
+        map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
+
+        seen = np.flatnonzero((rays.keyframe < end) & (association.object >= 0))
+        known = np.isfinite(positions[:, 0])
+        fresh = seen[(rays.keyframe[seen] >= begin) | ((begin == 1) & (rays.keyframe[seen] == 0))]
+        fresh = fresh[known[association.object[fresh]]]
+        waiting = seen[~known[association.object[seen]]]
+        born = _births(rays, association, map_T_camera, waiting, settings)
+        positions[born[0]] = born[1]
+        fresh = np.concatenate([fresh, waiting[np.isin(association.object[waiting], born[0])]])
+
+        for group in (
+            factors.betweens(motion[begin - 1 : end - 1], covariance[begin - 1 : end - 1], begin - 1),
+            ray_factors(rays, association.object, fresh, "huber", settings),
+            range_factors(rays, association.object, fresh),
+            landmark_priors(born[0], born[1], settings),
+        ):
+            for factor in group:
+                graph.push_back(factor)
+        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
+        if len(landmarks):
+            values = make_values(map_T_camera[:end], positions, landmarks)
+            values = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values
+            map_T_camera[:end] = read_poses(values)
+            positions[landmarks] = read_points(values)
+        progress(end, len(keyframes))
+    return map_T_camera, positions
+
+
+def ray_factors(rays: Rays, landmark: Ints, which: Ints, loss: Loss, settings: Settings) -> list[gtsam.NonlinearFactor]:
+    """The factors of the rays `which` (n,) in their order: bearing, or point-to-line as set; landmark: (R,)."""
+    keyframe, directions, landmark = rays.keyframe[which], rays.direction[which], landmark[which]
+    if settings.joint.factor == "bearing":
+        return factors.bearing(keyframe, directions, landmark, factors.robust(loss, rays.sigma[which], 2, _L1_RADIANS))
+    metres = factors.robust(loss, np.full(len(which), _EQ1_SIGMA), 2)
+    return factors.point_to_line(keyframe, directions, landmark, metres)
+
+
+def range_factors(rays: Rays, landmark: Ints, which: Ints) -> list[gtsam.NonlinearFactor]:
+    """The factors of the ranges that came with the rays `which` (n,), under Huber's loss; landmark: (R,)."""
+    which = which[np.isfinite(rays.range[which])]
+    noise = factors.robust("huber", rays.range_sigma[which], 1)
+    return factors.ranges(rays.keyframe[which], rays.range[which], landmark[which], noise)
+
+
+def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> list[gtsam.NonlinearFactor]:
+    """A weak prior on each landmark, where it was first placed: it keeps the graph determined."""
+    weak = gtsam.noiseModel.Isotropic.Sigma(3, settings.joint.prior_sigma)
+    return [
+        gtsam.PriorFactorPoint3(factors.l_key(j), position, weak)
+        for j, position in zip(landmarks.tolist(), positions, strict=True)
+    ]
+
+
+def anchor(map_T_camera: Floats) -> gtsam.NonlinearFactor:
+    """Hold X(0) where the odometry starts: bearings and odometry alone do not say where the map lies."""
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+    return gtsam.PriorFactorPose3(factors.x_key(0), gtsam.Pose3(map_T_camera), tight)
+
+
+def _births(
+    rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
+) -> tuple[Ints, Floats]:
+    if len(waiting) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    labels, index = np.unique(association.object[waiting], return_inverse=True)
+    some = rays.take(waiting)
+    origins, directions = some.in_map(map_T_camera)
+    found = triangulate(
+        origins,
+        directions,
+        index,
+        len(labels),
+        some.sigma,
+        settings.triangulation,
+        seed=settings.seed,
+        ranges=some.range,
+        range_sigma=some.range_sigma,
+    )
+    ranged = np.bincount(index, np.isfinite(some.range), len(labels)) > 0
+    ready = found.ok & (ranged | (found.parallax >= np.radians(settings.joint.min_parallax_deg)))
+    return labels[ready], found.positions[ready]

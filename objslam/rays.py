@@ -1,0 +1,119 @@
+"""From boxes to bearing rays: each box's centre, undistorted, as a direction from its keyframe's camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.ledger import Ledger
+from objslam.types import Bools, Camera, Floats, Ints, Keyframes, Log, Rays, label_table
+
+
+def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
+    """Unit directions (N, 3) in the camera frame of raw pixels (N, 2), and which of them (N,) the lens model can invert.
+
+    plumb_bob and rational_polynomial by cv2.undistortPoints, equidistant (Kannala-Brandt) by cv2.fisheye.undistortPoints,
+    each iterated to the end; a pixel that does not come back to itself within 0.1 px has no ray.
+    """
+    import cv2
+
+    if len(pixels) == 0:
+        return np.zeros((0, 3)), np.zeros(0, dtype=bool)
+    points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    if camera.distortion_model == "equidistant":
+        # fisheye.undistortPoints works up to 90 degrees off the axis only: that is where a direction has no z = 1 form
+        flat = cv2.fisheye.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0]
+        again = cv2.fisheye.distortPoints(flat[:, None], camera.matrix, camera.distortion)[:, 0]
+    else:
+        flat = cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0]
+        homogeneous = np.column_stack([flat, np.ones(len(flat))])
+        again = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0]
+    with np.errstate(invalid="ignore", over="ignore"):
+        valid = np.isfinite(flat).all(axis=1) & (np.linalg.norm(again - pixels, axis=1) < 0.1)
+    directions = np.column_stack([np.where(valid[:, None], flat, 0.0), np.ones(len(flat))])
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True), valid
+
+
+def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
+    """One ray for each usable box of the keyframes, in their order.
+
+    Boxes below the score limit, with a centre outside the image, cut off by its edge, or where the lens model has no inverse
+    are dropped and counted.
+    """
+    label_names, _ = label_table([n for c in log.cameras if c.detections for n in c.detections.label_names])
+    columns: list[tuple[Floats | Ints, ...]] = []
+    for index, camera_log in enumerate(log.cameras):
+        detections, camera = camera_log.detections, camera_log.camera
+        if detections is None:
+            continue
+        keyframe_of_frame = np.full(len(detections.frame_stamps), -1)
+        mine = np.flatnonzero(keyframes.camera == index)
+        keyframe_of_frame[keyframes.frame[mine]] = mine
+        boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
+        boxes = boxes.take(_usable(boxes.boxes, boxes.scores, camera, settings, ledger))
+        directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
+        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+        boxes, directions = boxes.take(valid), directions[valid]
+        names = np.array([label_names.index(n) for n in detections.label_names], dtype=np.int64)
+        columns.append(
+            (
+                keyframe_of_frame[boxes.frame],
+                directions,
+                _angle_sigma(camera, directions, settings.rays.pixel_sigma),
+                boxes.depths,
+                names[boxes.label],
+                boxes.scores,
+                boxes.boxes,
+                boxes.track_ids,
+            )
+        )
+    keyframe, direction, sigma, depth, label, score, box, track_id = (np.concatenate(c) for c in zip(*columns, strict=True))
+    order = np.argsort(keyframe, kind="stable")
+    if not settings.depth.use:
+        depth = np.full(len(depth), np.nan)
+    ranges = (depth / direction[:, 2])[order]
+    return Rays(
+        keyframe=keyframe[order],
+        direction=direction[order],
+        sigma=sigma[order],
+        range=ranges,
+        range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * ranges,
+        label=label[order],
+        score=score[order],
+        box=box[order],
+        track_id=track_id[order],
+        label_names=label_names,
+    )
+
+
+def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger) -> Bools:
+    where = f"camera {camera.name}"
+    keep = scores >= settings.rays.min_score
+    ledger.drop(f"boxes below rays.min_score {settings.rays.min_score:g}", int((~keep).sum()), where)
+    size = np.array([camera.width, camera.height])
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    inside = ((centre >= 0) & (centre <= size)).all(axis=1)
+    ledger.drop("boxes with their centre outside the image", int((keep & ~inside).sum()), where)
+    keep &= inside
+    border = settings.rays.border
+    cut = (boxes[:, :2] <= border).any(axis=1) | (boxes[:, 2:] >= size - 1 - border).any(axis=1)
+    if border >= 0:
+        ledger.drop("boxes cut off by the image's edge (rays.border)", int((keep & cut).sum()), where)
+        keep &= ~cut
+    return keep
+
+
+def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: float) -> Floats:
+    # A small angle at `a` off the axis moves a pinhole image by f / cos(a)^2 along the radius and f / cos(a) across it: the
+    # (geometric) mean of the two keeps one sigma a ray. A fisheye keeps f throughout.
+    if camera.distortion_model == "equidistant":
+        return np.full(len(directions), pixel_sigma / camera.focal)
+    cos = directions[:, 2]
+    return pixel_sigma / camera.focal * cos**1.5
+
+
+def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
+    """The angle (R,), rad in [0, pi], between each ray, (R, 3) and (R, 3) unit, and the way to its point (R, 3)."""
+    to = points - origins
+    return np.arctan2(np.linalg.norm(np.cross(to, directions), axis=1), np.einsum("ri,ri->r", to, directions))

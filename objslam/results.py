@@ -1,0 +1,267 @@
+"""The result of a run on disk: a folder that is either whole or does not claim to be."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.config import Settings, dump_settings
+from objslam.errors import LogError, OutputError
+from objslam.ledger import Ledger
+from objslam.objects_file import dump_objects, read_objects
+from objslam.sources.trajectory_file import read_trajectory, write_trajectory
+from objslam.types import Association, Camera, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
+
+OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
+PICTURE, RECORDING, SUMMARY = "map.png", "recording.rrd", "summary.json"
+_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, PICTURE, RECORDING, "reconstruction.ply", "evaluation.json")
+"""Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
+_STAGING = ".objslam-staging"
+_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
+"""What network file systems answer that can neither lock nor sync a folder: there we go on without."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run has to show.
+
+    keyframes: before estimation. map_T_base: (K, 4, 4) after it (the keyframes' own in fixed mode). association: ray ->
+    index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
+    the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
+    path: the full path that the log brought, at its own rate, before estimation.
+    """
+
+    map: ObjectMap
+    keyframes: Keyframes
+    map_T_base: Floats
+    rays: Rays
+    association: Association
+    origins: Floats
+    directions: Floats
+    residual: Floats
+    weight: Floats
+    summary: dict[str, Any]
+    settings: Settings
+    cameras: tuple[Camera, ...]
+    path: Trajectory
+
+
+def prepare_output(out: Path) -> None:
+    """Make the folder for a result and try it, before the long work; OutputError when no result could be written there."""
+    with _disk(out):
+        if out.exists() and not out.is_dir():
+            raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
+        out.mkdir(parents=True, exist_ok=True)
+        for name in _OWN:
+            if (out / name).is_dir() and not (out / name).is_symlink():
+                raise OutputError("a folder stands where a file of the result goes", where=str(out / name))
+        with _staged(out) as staging:
+            _write(staging / "probe", b"objslam")
+
+
+def write_result(result: RunResult, out: Path, truth: Truth | None = None) -> None:
+    """Write the whole result into the folder `out`, in place of an older one; other files there stay.
+
+    Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
+    summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
+    only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is drawn
+    into the picture and the recording.
+    """
+    prepare_output(out)
+    with _disk(out), _staged(out) as staging:
+        for name, write in _writers(result, truth).items():
+            write(staging / name)
+            _sync(staging / name)
+        _sync(staging)
+        _swap(staging, out)
+
+
+def write_file(file: Path, data: bytes) -> None:
+    """Write one file under a temporary name and rename it; OutputError when the disk refuses."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    with _disk(file):
+        try:
+            _write(temporary, data)
+            temporary.replace(file)
+            _sync(file.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def load_map(out: Path) -> ObjectMap:
+    """The object map of the result in the folder `out`; OutputError says what is missing or malformed."""
+    return read_objects(_existing(out, OBJECTS))
+
+
+def load_trajectory(out: Path) -> Trajectory:
+    """map_T_base of the result in the folder `out`; OutputError, with file and line, says what is missing or malformed."""
+    file, ledger = _existing(out, TRAJECTORY), Ledger()
+    try:
+        trajectory = read_trajectory(file, ledger)
+    except LogError as error:
+        raise OutputError(error.message, where=error.where, hint=error.hint) from error
+    if ledger.dropped:  # a log may be damaged, a result of our own may not
+        raise OutputError(f"the trajectory is damaged: {ledger.lines()[0]}", where=str(file))
+    return trajectory
+
+
+def _existing(out: Path, name: str) -> Path:
+    if not out.is_dir():
+        raise OutputError("there is no such result folder", where=str(out))
+    if not (out / name).is_file():
+        hint = "was its run killed? run again" if (out / _STAGING).exists() else None
+        raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
+    return out / name
+
+
+def _writers(result: RunResult, truth: Truth | None) -> dict[str, Callable[[Path], None]]:
+    """What writes each file, by name."""
+    stamps, first = np.unique(result.keyframes.stamps, return_index=True)
+    path = Trajectory(stamps, result.map_T_base[first])
+    writers: dict[str, Callable[[Path], None]] = {
+        OBJECTS: lambda file: _write(file, _encode(dump_objects(result.map))),
+        TRAJECTORY: lambda file: write_trajectory(path, file),
+        RAYS: lambda file: _write(file, _rays_parquet(result)),
+        CONFIG: lambda file: _write(file, _encode(dump_settings(result.settings))),
+        SUMMARY: lambda file: _write(file, _encode(dump_json(result.summary))),
+    }
+    if result.settings.output.picture:
+        from objslam.picture import draw_map
+
+        writers[PICTURE] = lambda file: draw_map(result, file, truth)
+    if result.settings.output.recording:
+        from objslam.viewer import write_recording
+
+        writers[RECORDING] = lambda file: write_recording(result, file, truth)
+    return writers
+
+
+def dump_json(data: Any) -> str:
+    """Data as JSON text; arrays become lists, what is not finite null."""
+    return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def _plain(data: Any) -> Any:
+    if isinstance(data, np.ndarray | np.generic):
+        data = data.tolist()
+    if isinstance(data, dict):
+        return {str(key): _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data
+
+
+def _rays_parquet(result: RunResult) -> bytes:
+    """rays.parquet: one row a ray; object is the id in objects.json, null where none."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    ids = np.array([o.id for o in result.map.objects] or [0], dtype=np.int64)
+    index = result.association.object
+    names = np.array([_encode(name).decode() for name in result.rays.label_names], dtype=object)
+    table = pa.table(
+        {
+            "stamp": pa.array(result.keyframes.stamps[result.rays.keyframe]),
+            "object": pa.array(ids[index], mask=index < 0),
+            "origin": pa.FixedSizeListArray.from_arrays(pa.array(result.origins.ravel()), 3),
+            "direction": pa.FixedSizeListArray.from_arrays(pa.array(result.directions.ravel()), 3),
+            "residual": pa.array(result.residual, mask=np.isnan(result.residual)),
+            "weight": pa.array(result.weight),
+            "label": pa.array(names[result.rays.label], type=pa.string()),
+        }
+    )
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def _swap(staging: Path, out: Path) -> None:
+    """Put the staged files in the place of the old ones; the order is what keeps a killed run from a mix."""
+    for name in _OWN:
+        (out / name).unlink(missing_ok=True)
+        if name == SUMMARY:
+            _sync(out)
+    _sync(out)
+    for name in reversed(_OWN):
+        if (staging / name).exists():
+            if name == SUMMARY:
+                _sync(out)
+            (staging / name).replace(out / name)
+    _sync(out)
+
+
+def _write(file: Path, data: bytes) -> None:
+    with file.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _encode(text: str) -> bytes:
+    try:
+        return text.encode()
+    except UnicodeEncodeError as error:
+        bad = error.object[max(error.start - 20, 0) : error.end]
+        raise OutputError(f"text that cannot be written (half of a surrogate pair) near {bad!r}") from error
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """An empty staging folder in `out`, and `out` to ourselves as long as the process lives; gone afterwards.
+
+    OutputError when another run has it.
+    """
+    staging = out / _STAGING
+    handle = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError("another run is writing here", where=str(out), hint="name another folder with -o") from error
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                raise
+        if staging.exists():  # a killed run left it: the lock says that nobody is at it
+            shutil.rmtree(staging)
+        staging.mkdir()
+        try:
+            yield staging
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _disk(path: Path) -> Iterator[None]:
+    """What the disk refuses, as an OutputError of one line."""
+    try:
+        yield
+    except OSError as error:
+        where = str(error.filename) if error.filename is not None else str(path)
+        raise OutputError(f"cannot write or read: {error.strerror or error}", where=where) from error

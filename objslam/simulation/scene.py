@@ -1,0 +1,162 @@
+"""What stands and roams in the room."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count, islice
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from objslam.errors import ConfigError
+from objslam.geometry import lift_se2
+from objslam.simulation.motion import START, Path
+from objslam.simulation.settings import DriveSettings
+from objslam.simulation.sight import views
+from objslam.types import Bools, Floats, Ints, label_table
+
+EXTENTS = {
+    "cup": (0.09, 0.11),
+    "bottle": (0.08, 0.26),
+    "plant": (0.28, 0.38),
+    "book": (0.16, 0.23),
+    "clock": (0.25, 0.25),
+    "vase": (0.14, 0.24),
+    "backpack": (0.32, 0.42),
+    "teddy bear": (0.26, 0.32),
+    "laptop": (0.33, 0.23),
+    "ball": (0.22, 0.22),
+    "bowl": (0.18, 0.1),
+    "lamp": (0.22, 0.4),
+}
+"""Width and height, m, of the classes, in the order in which a drive takes them."""
+
+OTHER_EXTENT = (0.2, 0.2)
+WALL = 0.3
+"""m; random objects keep this off the walls."""
+CLEARANCE = 0.4
+"""m; random objects keep this off the path, seen from above."""
+CHECKED_FRAMES = 500
+"""frames of each camera, evenly spread, in which a place is looked at to see whether it is a good one."""
+ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Objects that stand: label (N,) index into classes; position (N, 3) m, in map; extent (N, 2) m."""
+
+    classes: tuple[str, ...]
+    label: Ints
+    position: Floats
+    extent: Floats
+
+
+@dataclass(frozen=True)
+class Roamers:
+    """Objects that swing through the room.
+
+    label: (K,). extent: (K, 2) m. middle, reach (m), rate (rad/s) and phase (rad) of the swing along each axis: (K, 3).
+    """
+
+    label: Ints
+    extent: Floats
+    middle: Floats
+    reach: Floats
+    rate: Floats
+    phase: Floats
+
+    def at(self, stamps: Floats) -> Floats:
+        """Positions (F, K, 3), m, in map at stamps (F,)."""
+        return self.middle + self.reach * np.sin(self.rate * (stamps - START)[:, None, None] + self.phase)
+
+
+def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Scene:
+    """The given objects and then the random ones, where the path sees them well; frame_stamps: (F, cameras).
+
+    ConfigError where there are not enough such places.
+    """
+    names = list(islice(_class_names(), settings.classes or settings.objects))
+    labels = [name for name, _ in settings.placed] + [names[i % len(names)] for i in range(settings.objects)]
+    classes, label = label_table(labels)
+    random_extent = _extents(labels[len(settings.placed) :])
+    positions = np.array([place for _, place in settings.placed]).reshape(-1, 3)
+    positions = np.concatenate([positions, _places(settings, path, frame_stamps, random_extent, rng)])
+    return Scene(classes, label, positions, _extents(labels))
+
+
+def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roamers:
+    """Objects of the scene's classes that swing through the whole room at some 0.3 m/s."""
+    moving = settings.moving
+    label = rng.integers(max(len(scene.classes), 1), size=moving)
+    low, high = _bounds(settings)
+    middle = np.column_stack([np.zeros((moving, 2)), rng.uniform(low[2], high[2], moving)])
+    reach = np.tile([high[0], high[1], 0.0], (moving, 1))
+    rate = rng.uniform(0.2, 0.4, (moving, 3)) / np.maximum(reach, 1.0)
+    extent = _extents([scene.classes[i] for i in label])
+    return Roamers(label, extent, middle, reach, rate, rng.uniform(0.0, 2 * np.pi, (moving, 3)))
+
+
+def _class_names() -> Iterator[str]:
+    yield from EXTENTS
+    for number in count(2):
+        yield from (f"{name} {number}" for name in EXTENTS)
+
+
+def _extents(labels: Sequence[str]) -> Floats:
+    return np.array([EXTENTS.get(label.rstrip(" 0123456789"), OTHER_EXTENT) for label in labels]).reshape(-1, 2)
+
+
+def _bounds(settings: DriveSettings) -> tuple[Floats, Floats]:
+    """The lowest and the highest corner of where random objects may be, (3,) m each."""
+    half = np.array(settings.room) / 2 - WALL
+    return np.array([*-half, settings.heights[0]]), np.array([*half, settings.heights[1]])
+
+
+def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: Floats, rng: np.random.Generator) -> Floats:
+    """Places (N, 3) for random objects of extents (N, 2): proposed at random, kept when good and apart."""
+    places = np.zeros((0, 3))
+    for _ in range(ROUNDS):
+        if len(places) == settings.objects:
+            break
+        proposed = rng.uniform(*_bounds(settings), (4 * settings.objects + 64, 3))
+        for place in proposed[_good(settings, path, frame_stamps, proposed, extent.max(axis=0))]:
+            if len(places) < settings.objects and (np.linalg.norm(places - place, axis=1) >= settings.min_distance).all():
+                places = np.vstack([places, place])
+    if len(places) < settings.objects:
+        raise ConfigError(
+            f"only {len(places)} of {settings.objects} objects find a place that the path sees well",
+            where=settings.name,
+            hint="fewer objects, a longer drive, or a lower min_distance, min_view_share or min_parallax_deg",
+        )
+    return places
+
+
+def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Floats, extent: Floats) -> Bools:
+    """Which places (C, 3) an object of `extent` could take: not on the path, and seen often enough, widely enough."""
+    way = path.at(START + np.linspace(0.0, path.lap, 1000))[:, :2]
+    free = cKDTree(way).query(places[:, :2])[0] >= CLEARANCE
+    checked = np.linspace(0, settings.frames - 1, min(settings.frames, CHECKED_FRAMES)).astype(int)
+    seen = np.zeros((len(checked), len(settings.cameras), len(places)), dtype=bool)
+    directions = np.zeros((*seen.shape, 3))
+    for i, camera in enumerate(settings.cameras):
+        map_T_camera = lift_se2(path.at(frame_stamps[checked, i])) @ camera.base_T_camera
+        view = views(settings, camera, map_T_camera, places, np.tile(extent, (len(places), 1)))
+        seen[view.frame, i, view.object] = True
+        directions[:, i] = places - map_T_camera[:, None, :3, 3]
+    often = seen.sum(axis=(0, 1)) >= settings.min_view_share * len(checked)
+    spread = _spread(directions.reshape(-1, len(places), 3), seen.reshape(-1, len(places)))
+    return np.asarray(free & often & (spread >= np.deg2rad(settings.min_parallax_deg)))
+
+
+def _spread(directions: Floats, seen: Bools) -> Floats:
+    """A lower bound (C,), rad, of the widest angle between lines of view (V, C, 3) where seen (V, C).
+
+    The direction furthest from the first one seen, and the one furthest from that: for the fan of a planar path, the widest.
+    """
+    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    pick = seen.argmax(axis=0)
+    for _ in range(2):
+        cosine = np.where(seen, np.abs(np.einsum("vci,ci->vc", unit, unit[pick, np.arange(len(pick))])), 1.0)
+        pick = cosine.argmin(axis=0)
+    return np.asarray(np.arccos(np.clip(cosine.min(axis=0), 0.0, 1.0)))

@@ -1,0 +1,187 @@
+"""How well rays fix their objects, for many objects at once, in torch: covariance, parallax, and ranges where rays do not.
+
+Imported when something is triangulated; `triangulation` is the way in.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from objslam.consensus import Bundle
+from objslam.eq1 import Lines, object_sum
+
+_ALL_PAIRS = 256  # rays of one object up to which every pair is looked at for the widest angle
+_CAUCHY = 2.385  # standard deviations; 95 % efficient on Gaussian noise
+_RANGE_ITERATIONS = 30
+_RAYLEIGH = math.sqrt(math.pi / 2)  # mean distance from a line under noise of 1 along both axes across it
+
+
+def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
+    """Covariances (N, 3, 3) m^2 of Eq. 1's points (N, 3) from the rays in use (R,); NaN where those do not fix a point.
+
+    Eq. 1 is an M-estimator: A^-1 B A^-1 with the expected Hessian A and gradient covariance B (Huber & Ronchetti, Robust
+    Statistics, ch. 6). Offsets are Gaussian of s_i along both axes across ray i: then the unit offset u has E[u u^T] =
+    P / 2, and E[1 / distance] = sqrt(pi / 2) / s_i is independent of it, so that a ray adds sqrt(pi / 2) / (2 s_i) P to
+    A and P / 2 to B. Residuals larger than s_i widen the result, smaller ones do not narrow it.
+    """
+    rays = _used(bundle, use)
+    lines, index, count = _lines(rays, point), rays.index, len(point)
+    s = _offset_sigma(rays, (point[index] - rays.origin).norm(dim=1))
+    projectors = lines.projectors()
+    a = lines.sum(0.5 * _RAYLEIGH / s[:, None, None] * projectors)
+    b = lines.sum(0.5 * projectors)
+    spread = (lines.foot.norm(dim=1) / s)[:, None]
+    number = rays.number.to(s.dtype)
+    # the mean is robust, and the fit takes 3 of the 2 n degrees of freedom
+    mean = object_sum(spread, index, count)[:, 0] / number.clamp(min=1) / _RAYLEIGH
+    factor = (mean.square() * number / (number - 1.5).clamp(min=0.5)).clamp(min=1)
+    inverse, regular = _inverse(a)
+    result = factor[:, None, None] * inverse @ b @ inverse
+    return torch.where(regular[:, None, None], result, torch.nan)
+
+
+def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (N, 3) and covariances (N, 3, 3) from rays in use and the distances measured along them (R,), NaN: none.
+
+    For objects whose rays alone do not carry a position. Least squares across the rays; along them a Cauchy loss, from the
+    median on, since a range may have hit what lies behind. NaN for objects without a range.
+    """
+    rays, count = _used(bundle, use), len(bundle.number)
+    ranges, range_sigma = ranges[use], range_sigma[use]
+    known = ranges.isfinite()
+    typical = object_median(ranges[known], rays.index[known], count)
+    usual = torch.where(known, ranges, typical[rays.index])
+    s = _offset_sigma(rays, usual)
+    has = typical.isfinite()
+    measured = torch.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
+    informed = has[rays.index]
+    zero = torch.zeros_like(rays.origin)
+    lines = Lines.through(torch.where(informed[:, None], rays.origin, zero), rays.direction, rays.index, count)
+    weight = torch.where(informed, 1 / s.square(), 0.0)[:, None]
+    across_matrix = lines.sum(weight[:, :, None] * lines.projectors())
+    across_vector = lines.sum(weight * lines.foot)
+    along = rays.direction[:, :, None] * rays.direction[:, None, :]
+    # start: the median of what the ranges say along the mean direction, since the rays alone leave just that open
+    heading = object_sum(rays.direction, rays.index, count)
+    heading = heading / heading.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    depth = object_median((measured * heading[rays.index]).sum(1)[known], rays.index[known], count)
+    depth = torch.where(has, depth, 0.0)
+    eye = torch.eye(3, dtype=s.dtype, device=s.device)
+    strength = across_matrix.diagonal(dim1=1, dim2=2).sum(1).clamp(min=1.0)
+    pin = (strength[:, None] * heading)[:, :, None] * heading[:, None, :]
+    empty = (~has).to(s.dtype)[:, None, None] * eye
+    point = _solve(across_matrix + pin + empty, across_vector + (strength * depth)[:, None] * heading)
+    information = across_matrix
+    for _ in range(_RANGE_ITERATIONS):
+        residual = ((point[rays.index] - measured) * rays.direction).sum(1) / range_sigma
+        robust = torch.where(known, 1 / (1 + (residual / _CAUCHY).square()) / range_sigma.square(), 0.0)[:, None]
+        information = across_matrix + lines.sum(robust[:, :, None] * along)
+        target = across_vector + lines.sum(robust * (measured * rays.direction).sum(1, keepdim=True) * rays.direction)
+        point = _solve(information + empty, target)
+    offset = lines.offset(point).norm(dim=1)
+    number = rays.number.to(s.dtype)
+    mean = object_sum((offset / s)[:, None], rays.index, count)[:, 0] / number.clamp(min=1) / _RAYLEIGH
+    factor = (mean.square() * number / (number - 1.0).clamp(min=0.5)).clamp(min=1)
+    inverse, regular = _inverse(information)
+    regular &= has
+    point = torch.where(regular[:, None], point, torch.nan)
+    return point, torch.where(regular[:, None, None], factor[:, None, None] * inverse, torch.nan)
+
+
+def precise(bundle: Bundle, use: Tensor, point: Tensor, covariances: Tensor, limit: float) -> Tensor:
+    """Objects (N,) whose largest standard deviation is at most limit times their median distance from the rays in use."""
+    index = bundle.index[use]
+    typical = object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
+    known = covariances.isfinite().all(dim=2).all(dim=1)
+    variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
+    return known & (variance.sqrt() <= limit * typical)
+
+
+def ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
+    """Objects (N,) that lie ahead of more than half of their rays in use."""
+    index = bundle.index[use]
+    towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1).sign()
+    return object_sum(towards, index, len(point)) > 0
+
+
+def parallax(bundle: Bundle, use: Tensor) -> Tensor:
+    """The widest angle (N,) rad between the lines of any two rays in use (R,): opposite directions are one line.
+
+    Of objects with many rays the extremes in 64 directions are looked at, which finds it to 1 %.
+    """
+    rays = _used(bundle, use)
+    widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
+    axes = _sphere(64, rays.direction)
+    few = torch.nonzero((rays.number > 1) & (rays.number <= _ALL_PAIRS))[:, 0]
+    many = torch.nonzero(rays.number > _ALL_PAIRS)[:, 0]
+    for objects, members, real in (*rays.chunks(few, _ALL_PAIRS), *rays.chunks(many, len(axes))):
+        direction = rays.direction[members]
+        if members.shape[1] > _ALL_PAIRS:
+            towards = torch.where(real[:, :, None], direction @ axes.T, -torch.inf).argmax(dim=1)
+            direction, real = (
+                direction.gather(1, towards[:, :, None].expand(-1, -1, 3)),
+                torch.ones_like(towards, dtype=torch.bool),
+            )
+        cos = (direction @ direction.mT).abs()
+        both = real[:, :, None] & real[:, None, :]
+        cos = torch.where(both, cos, 1.0).flatten(1)
+        pair = cos.argmin(dim=1)
+        n = direction.shape[1]
+        one = direction[torch.arange(len(pair)), pair // n]
+        two = direction[torch.arange(len(pair)), pair % n]
+        # the arccos of nearly 1 keeps half the digits
+        widest[objects] = torch.atan2(torch.linalg.cross(one, two, dim=1).norm(dim=1), (one * two).sum(1).abs())
+    return widest
+
+
+def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """Medians (N,) of each object's values (R,), NaN for none."""
+    if len(values) == 0:
+        return values.new_full((count,), torch.nan)
+    order = torch.argsort(values)
+    order = order[torch.argsort(index[order], stable=True)]
+    number = torch.bincount(index, minlength=count)
+    first = torch.cumsum(number, 0) - number
+    lower = (first + (number - 1).clamp(min=0) // 2).clamp(max=len(values) - 1)
+    upper = (first + number // 2).clamp(max=len(values) - 1)
+    return torch.where(number > 0, 0.5 * (values[order[lower]] + values[order[upper]]), torch.nan)
+
+
+def _used(bundle: Bundle, use: Tensor) -> Bundle:
+    number = torch.bincount(bundle.index[use], minlength=len(bundle.number))
+    position_sigma = bundle.position_sigma
+    return Bundle(bundle.origin[use], bundle.direction[use], bundle.sigma[use], position_sigma, bundle.index[use], number)
+
+
+def _lines(rays: Bundle, point: Tensor) -> Lines:
+    return Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point))
+
+
+def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
+    """Standard deviation (R,) m, along each axis across the ray, of how far a ray passes its object."""
+    return ((rays.sigma * distance).square() + rays.position_sigma**2).sqrt().clamp(min=1e-12)
+
+
+def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses of symmetric matrices (N, 3, 3), and which of them are regular."""
+    eye = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    finite = matrices.isfinite().all(dim=2).all(dim=1)
+    eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], matrices, eye))
+    regular = finite & (eigenvalues[:, 0] > 1e-10 * eigenvalues[:, 2]) & (eigenvalues[:, 2] > 0)
+    return torch.linalg.inv(torch.where(regular[:, None, None], matrices, eye)), regular
+
+
+def _solve(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return torch.linalg.solve(matrices, vectors)
+
+
+def _sphere(number: int, like: Tensor) -> Tensor:
+    """Directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
+    k = torch.arange(number, dtype=like.dtype, device=like.device) + 0.5
+    z = 1 - 2 * k / number
+    azimuth = k * (math.pi * (3 - math.sqrt(5)))
+    radius = (1 - z.square()).sqrt()
+    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)

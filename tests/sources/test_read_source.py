@@ -1,0 +1,116 @@
+import pytest
+
+from objslam.errors import ConfigError, LogError
+from objslam.ledger import Ledger
+from objslam.sources import SOURCES, SourceOptions, read
+
+_CAMERA = """\
+image_width: 640
+image_height: 480
+camera_matrix: [500, 0, 320, 0, 500, 240, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients: []
+base_T_camera: {translation: [0, 0, 0], rotation_xyzw: [0, 0, 0, 1]}
+"""
+_POSE = "1.5 1 2 3 0 0 0 1\n"
+
+
+def _write(folder, files):
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def _log(folder):
+    return _write(folder, {"camera.yaml": _CAMERA, "odometry.txt": _POSE})
+
+
+def _mrclam(folder):
+    names = ("Robot1_Odometry.dat", "Robot1_Measurement.dat")
+    return _write(folder, {"Barcodes.dat": "6 63\n", names[0]: "1 1 1\n2 1 1\n", names[1]: "1.5 63 2 0.1\n"})
+
+
+def _numbered(folder):
+    return _write(folder, {"truth_cam_poses.txt": _POSE, "boxes/0000.txt": "1 2 3 4 0.5\n"})
+
+
+def _stamped(folder):
+    return _write(folder, {"groundtruth.txt": _POSE, "boxes/1.5.txt": "41 1 2 3 4 0.5\n"})
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), [(_log, "log"), (_mrclam, "mrclam"), (_numbered, "tum_numbered"), (_stamped, "tum")]
+)
+def test_the_kind_is_guessed(tmp_path, make, name):
+    make(tmp_path)
+    assert [source.name for source in SOURCES if source.detects(tmp_path)] == [name]
+    options = SourceOptions(robot=1 if name == "mrclam" else None)
+    log = read(tmp_path, Ledger(), options)
+    assert log.odometry or log.localization
+    given = read(tmp_path, Ledger(), SourceOptions(format=name, robot=options.robot))
+    assert given.name == log.name
+
+
+def test_a_log_folder_comes_first(tmp_path):
+    _stamped(_log(tmp_path))
+    assert read(tmp_path, Ledger()).odometry is not None
+
+
+def test_options_reach_the_reader(tmp_path):
+    log = read(_mrclam(tmp_path / "a"), Ledger(), SourceOptions(robot=1, anonymous=True))
+    assert log.cameras[0].detections.label_names == ("landmark",)
+    log = read(_numbered(tmp_path / "b"), Ledger(), SourceOptions(label="cabinet"))
+    assert log.cameras[0].detections.label_names == ("cabinet",)
+
+
+def test_options_without_a_meaning_are_named(tmp_path):
+    ledger = Ledger()
+    read(_log(tmp_path), ledger, SourceOptions(robot=3, label="x", anonymous=True, with_range=False))
+    assert [
+        f"option {name} has no meaning" in w
+        for name, w in zip(("robot", "with_range", "anonymous", "label"), ledger.warnings, strict=True)
+    ] == [True] * 4
+    ledger = Ledger()
+    read(tmp_path, ledger, SourceOptions(format="log"))
+    assert not ledger.lines()
+
+
+def test_nothing_that_fits_lists_what_was_looked_for(tmp_path):
+    (tmp_path / "photo.jpg").touch()
+    for path in (tmp_path, tmp_path / "photo.jpg"):
+        with pytest.raises(LogError) as caught:
+            read(path, Ledger())
+        assert caught.value.where == str(path)
+        for source in SOURCES:
+            assert f"{source.name}: {source.looks_for}" in caught.value.hint
+
+
+def test_half_a_log_says_what_is_missing(tmp_path):
+    (tmp_path / "camera.yaml").write_text(_CAMERA)
+    with pytest.raises(LogError, match=r"neither odometry\.txt nor localization\.txt"):
+        read(tmp_path, Ledger())
+
+
+@pytest.mark.parametrize("name", ["missing", "x" * 300, "nul\0"])
+def test_no_such_path(tmp_path, name):
+    with pytest.raises(LogError, match="cannot be read"):
+        read(tmp_path / name, Ledger())
+
+
+def test_mrclam_needs_a_robot(tmp_path):
+    with pytest.raises(LogError, match="the folder has: 1"):
+        read(_mrclam(tmp_path), Ledger())
+
+
+def test_an_unknown_format(tmp_path):
+    with pytest.raises(ConfigError, match="there is no format 'bag'"):
+        read(tmp_path, Ledger(), SourceOptions(format="bag"))
+
+
+def test_a_format_that_does_not_fit(tmp_path):
+    (tmp_path / "file").touch()
+    for source in SOURCES:
+        for path in (tmp_path, tmp_path / "file"):
+            with pytest.raises(LogError):
+                read(path, Ledger(), SourceOptions(format=source.name, robot=1))
