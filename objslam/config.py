@@ -25,7 +25,7 @@ class Section(BaseModel):
 class Poses(Section):
     """How poses are read off the log."""
 
-    max_gap: Positive = 0.5
+    max_gap: Positive = 1.1
     """s; a frame in a longer gap of the path is dropped and counted."""
 
 
@@ -54,11 +54,11 @@ class Depth(Section):
 class Odometry(Section):
     """How far odometry drifts: standard deviations that grow with the square root of the way (a random walk)."""
 
-    x_per_m: NotNegative = 0.05
+    x_per_m: NotNegative = 0.02
     """m along the drive after 1 m of it."""
-    y_per_m: NotNegative = 0.01
+    y_per_m: NotNegative = 0.005
     """m sideways after 1 m; wheels hardly slip sideways, an omnidirectional base may need as much as for x."""
-    xy_per_rad: NotNegative = 0.01
+    xy_per_rad: NotNegative = 0.005
     """m after turning 1 rad on the spot."""
     yaw_per_m: NotNegative = 0.02
     """rad after 1 m of driving."""

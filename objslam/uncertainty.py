@@ -25,21 +25,22 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     Eq. 1 is an M-estimator: A^-1 B A^-1 with the expected Hessian A and gradient covariance B (Huber & Ronchetti, Robust
     Statistics, ch. 6). Offsets are Gaussian of s_i along both axes across ray i: then the unit offset u has E[u u^T] =
     P / 2, and E[1 / distance] = sqrt(pi / 2) / s_i is independent of it, so that a ray adds sqrt(pi / 2) / (2 s_i) P to
-    A and P / 2 to B. Residuals larger than s_i widen the result, smaller ones do not narrow it.
+    A and P / 2 to B. Residuals larger than s_i widen the result, smaller ones do not narrow it. Then there is Eq. 1's bias,
+    which no number of rays takes away: angular noise tilts the unit offset forward, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i
+    along ray i of length r_i, since a nearer object is missed by less. It adds its square.
     """
     rays = _used(bundle, use)
     lines, index, count = _lines(rays, point), rays.index, len(point)
-    s = _offset_sigma(rays, (point[index] - rays.origin).norm(dim=1))
+    distance = (point[index] - rays.origin).norm(dim=1)
+    s = _offset_sigma(rays, distance)
     projectors = lines.projectors()
     a = lines.sum(0.5 * _RAYLEIGH / s[:, None, None] * projectors)
     b = lines.sum(0.5 * projectors)
-    spread = (lines.foot.norm(dim=1) / s)[:, None]
-    number = rays.number.to(s.dtype)
-    # the mean is robust, and the fit takes 3 of the 2 n degrees of freedom
-    mean = object_sum(spread, index, count)[:, 0] / number.clamp(min=1) / _RAYLEIGH
-    factor = (mean.square() * number / (number - 1.5).clamp(min=0.5)).clamp(min=1)
+    tilt = lines.sum((_RAYLEIGH * rays.sigma.square() * distance / s)[:, None] * rays.direction)
+    factor = _variance_factor(lines.foot.norm(dim=1) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a)
-    result = factor[:, None, None] * inverse @ b @ inverse
+    bias = factor * (inverse @ tilt[:, :, None])  # the tilt grows with the noise, the Hessian falls with it
+    result = factor * inverse @ b @ inverse + bias @ bias.mT
     return torch.where(regular[:, None, None], result, torch.nan)
 
 
@@ -81,10 +82,7 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
         information = across_matrix + lines.sum(robust[:, :, None] * along)
         target = across_vector + lines.sum(robust * (measured * rays.direction).sum(1, keepdim=True) * rays.direction)
         point = _solve(information + empty, target)
-    offset = lines.offset(point).norm(dim=1)
-    number = rays.number.to(s.dtype)
-    mean = object_sum((offset / s)[:, None], rays.index, count)[:, 0] / number.clamp(min=1) / _RAYLEIGH
-    factor = (mean.square() * number / (number - 1.0).clamp(min=0.5)).clamp(min=1)
+    factor = _variance_factor(lines.offset(point).norm(dim=1) / s, rays, 2)
     inverse, regular = _inverse(information)
     regular &= has
     point = torch.where(regular[:, None], point, torch.nan)
@@ -163,6 +161,20 @@ def _lines(rays: Bundle, point: Tensor) -> Lines:
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
     """Standard deviation (R,) m, along each axis across the ray, of how far a ray passes its object."""
     return ((rays.sigma * distance).square() + rays.position_sigma**2).sqrt().clamp(min=1e-12)
+
+
+def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
+    """How much larger than expected the variance (N,) is, at least 1, from each ray's miss (R,) in standard deviations.
+
+    From the mean miss, which is robust; the fit took so many of the 2 n degrees of freedom. What exceeds 1 is stretched by
+    how uncertain an estimate with the rest of them is: 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest) over its
+    limit, to 3 % from 4 rays on.
+    """
+    number = rays.number.to(miss.dtype)
+    mean = object_sum(miss, rays.index, len(number)) / number.clamp(min=1) / _RAYLEIGH
+    rest = (2 * number - taken).clamp(min=1)
+    excess = mean.square() * 2 * number / rest - 1
+    return 1 + excess.clamp(min=0) * (1 + 3.2 / (rest - 2).clamp(min=1))
 
 
 def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:

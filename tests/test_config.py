@@ -20,7 +20,7 @@ def some_settings(draw):
             "poses": {"max_gap": draw(positive)},
             "rays": {"pixel_sigma": draw(positive), "border": draw(st.floats(-100, 100))},
             "depth": {"use": draw(st.booleans()), "sigma": draw(positive)},
-            "odometry": {"xy_per_m": draw(st.floats(0, 10)), "floor_yaw": draw(positive)},
+            "odometry": {"x_per_m": draw(st.floats(0, 10)), "floor_yaw": draw(positive)},
             "triangulation": {
                 "device": draw(st.sampled_from(["auto", "cpu", "cuda"])),
                 "hypotheses": draw(st.integers(1, 9999)),

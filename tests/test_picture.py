@@ -132,7 +132,9 @@ def test_few_of_many_rays_are_drawn(drawn: Any) -> None:
     assert len(rejected.get_segments()) == 400
 
 
-@pytest.mark.parametrize("label", ["a $x_1$ b $", "new\nline", "杯子", "\\frac{1}{2}", "x" * 300, "_hidden", "[red]"])
+@pytest.mark.parametrize(
+    "label", ["a $x_1$ b $", "$\\nope$", "new\nline", "杯子", "\\frac{1}{2}", "x" * 300, "_hidden", "[red]"]
+)
 def test_any_label_can_be_drawn(drawn: Any, label: str) -> None:
     result, truth = synthetic_result(np.array([[3.0, 4.0, 1.0]]), [label], keyframes=2)
     (text,) = texts(drawn(result, truth))

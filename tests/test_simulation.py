@@ -241,13 +241,11 @@ def test_odometry_errs_by_so_much_per_frame(rate):
 
 
 def test_odometry_drifts_as_a_random_walk_with_the_way():
-    noise = Odometry(xy_per_m=0.05, xy_per_rad=0.02, yaw_per_m=0.02, yaw_per_rad=0.05)
+    noise = Odometry(x_per_m=0.05, y_per_m=0.01, xy_per_rad=0.02, yaw_per_m=0.02, yaw_per_rad=0.05)
     errors, true = step_errors(simulate(DriveSettings(**EXACT | {"frames": 600}, odometry=noise, odometry_rate=None), 7))
     way, turn = np.hypot(true[:, 0], true[:, 1]), np.abs(true[:, 2])
-    xy, yaw = np.sqrt(0.05**2 * way + 0.02**2 * turn), np.sqrt(0.02**2 * way + 0.05**2 * turn)
-    assert sigma_fits(errors[:, 0] / xy, 1.0)
-    assert sigma_fits(errors[:, 1] / xy, 1.0)
-    assert sigma_fits(errors[:, 2] / yaw, 1.0)
+    for axis, (per_m, per_rad) in enumerate(((0.05, 0.02), (0.01, 0.02), (0.02, 0.05))):
+        assert sigma_fits(errors[:, axis] / np.sqrt(per_m**2 * way + per_rad**2 * turn), 1.0)
 
 
 def test_localization_errs_independently_at_each_pose():

@@ -60,7 +60,7 @@ def drive(rays_total: int, seed: int = 0) -> tuple[Keyframes, Rays, Association,
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     settings = Settings().odometry
     sigma = np.array(
-        [0, 0, np.hypot(settings.yaw_per_m, settings.yaw_per_rad / radius), settings.xy_per_m, settings.xy_per_m, 0]
+        [0, 0, np.hypot(settings.yaw_per_m, settings.yaw_per_rad / radius), settings.x_per_m, settings.y_per_m, 0]
     )
     steps = inverse(truth[:-1]) @ truth[1:] @ exp_se3(rng.normal(size=(k - 1, 6)) * sigma * np.sqrt(0.1))
     odom = np.empty_like(truth)

@@ -94,8 +94,9 @@ def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floa
     if isinstance(noise, PoseNoise):
         return np.sqrt(frames)[:, None] * np.array([noise.xy, noise.xy, noise.yaw])
     way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
-    xy = np.sqrt(noise.xy_per_m**2 * way + noise.xy_per_rad**2 * turn)
-    return np.column_stack([xy, xy, np.sqrt(noise.yaw_per_m**2 * way + noise.yaw_per_rad**2 * turn)])
+    per_m = np.array([noise.x_per_m, noise.y_per_m, noise.yaw_per_m])
+    per_rad = np.array([noise.xy_per_rad, noise.xy_per_rad, noise.yaw_per_rad])
+    return np.sqrt(way[:, None] * per_m**2 + turn[:, None] * per_rad**2)
 
 
 def localization(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Trajectory | None:

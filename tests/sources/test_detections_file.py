@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from objslam.errors import LogError
@@ -51,6 +51,7 @@ def _read(tmp_path, *frames):
     return read_detections(file, ledger), ledger, file
 
 
+@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.floats(0, 2e9), st.lists(_BOX, max_size=4)), min_size=1, max_size=8, unique_by=lambda frame: frame[0]

@@ -301,7 +301,7 @@ _PARTS = {
 }
 
 
-@settings(max_examples=150)
+@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damage_of_any_kind_ends_in_a_log_or_one_clear_error(data):
     name = data.draw(st.sampled_from(sorted(_PARTS)))

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,7 @@ from objslam.types import Trajectory
 _STAMPS = st.lists(st.floats(0, 2e9), min_size=1, max_size=20, unique=True).map(sorted)
 
 
+@settings(deadline=None)
 @given(_STAMPS, st.data())
 def test_written_trajectories_read_back(stamps, data):
     count = len(stamps)
