@@ -37,8 +37,8 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     from rich.table import Table
 
     data = evaluation.to_dict()
-    scores = Table(title=f"against the ground truth (align {evaluation.align}, radius {evaluation.radius:g} m)")
-    scores.add_column("measure")
+    scores = Table(title=f"align {evaluation.align}, radius {evaluation.radius:g} m")
+    scores.add_column("against the ground truth")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
     for key, name, unit in rows:

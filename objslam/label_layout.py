@@ -12,24 +12,23 @@ _DOT = 6.0  # px, half the side of the square that a dot keeps free
 _PAD = 2.0
 
 
-def place_labels(anchors: Floats, sizes: Floats, wanted: Bools, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
+def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
     """The lower left corners (N, 2) of labels of sizes (N, 2) for dots at anchors (N, 2), and which found room (N,); all px.
 
     Greedy, the most crowded dots first: each label takes the cheapest of a fan of places around its dot that stays in the
     frame (2, 2) (lower left, upper right corner) and covers no dot and no label set before; near is cheaper than far, and
-    off the points to avoid (P, 2) cheaper than on them. Labels not wanted get no place.
+    off the points to avoid (P, 2) cheaper than on them.
     """
     corners, found = np.zeros((len(anchors), 2)), np.zeros(len(anchors), dtype=bool)
-    index = np.flatnonzero(wanted)
-    if len(index) == 0:
+    if len(anchors) == 0:
         return corners, found
-    gaps = np.linalg.norm(anchors[index, None] - anchors[None, index], axis=2)
+    gaps = np.linalg.norm(anchors[:, None] - anchors[None], axis=2)
     crowd = (gaps < 60.0).sum(axis=1)
-    dots = np.concatenate([anchors[index] - _DOT, anchors[index] + _DOT], axis=1)
-    centre = anchors[index].mean(axis=0)
+    dots = np.concatenate([anchors - _DOT, anchors + _DOT], axis=1)
+    centre = anchors.mean(axis=0)
     taken = np.zeros((0, 4))
     leaders = np.zeros((0, 4))
-    for j in index[np.argsort(-crowd, kind="stable")]:
+    for j in np.argsort(-crowd, kind="stable"):
         boxes, reach = _candidates(anchors[j], sizes[j])
         padded = boxes + np.array([-_PAD, -_PAD, _PAD, _PAD])
         inside = np.all((boxes[:, :2] >= frame[0] + _PAD) & (boxes[:, 2:] <= frame[1] - _PAD), axis=1)
@@ -40,7 +39,7 @@ def place_labels(anchors: Floats, sizes: Floats, wanted: Bools, frame: Floats, a
         lines = np.concatenate([np.broadcast_to(anchors[j], near.shape), near], axis=1)
         covered = _contains(boxes, avoid).sum(axis=1)
         outward = ((boxes[:, :2] + boxes[:, 2:]) / 2 - anchors[j]) @ _unit(anchors[j] - centre)
-        others = dots[index != j]
+        others = np.delete(dots, j, axis=0)
         crossings = _cross(lines, leaders).sum(axis=1) + _hits(lines, taken).sum(axis=1) + _hits(lines, others).sum(axis=1)
         cost = reach + 1.5 * np.minimum(covered, 20) + 60.0 * crossings - 0.05 * outward
         best = int(np.argmin(np.where(free, cost, np.inf)))

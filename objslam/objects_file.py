@@ -28,10 +28,12 @@ def dump_objects(objects: ObjectMap) -> str:
 
     What is not finite becomes null: JSON has no NaN.
     """
-    entries = [_entry(o) for o in objects.objects]
-    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(objects.frame)}, "objects": ['
-    lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
-    return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
+    return _dump([_entry(o) for o in objects.objects], objects.frame)
+
+
+def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
+    """The text of a ground truth file; `read_truth_objects` gives the same objects back."""
+    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map")
 
 
 def read_objects(file: Path) -> ObjectMap:
@@ -62,6 +64,13 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
         return tuple(o for o in _each(data, _truth_object) if o is not None)
     except _Wrong as wrong:
         raise error(str(wrong), where=str(file)) from wrong
+
+
+def _dump(entries: list[dict[str, Any]], frame: str) -> str:
+    """One line an object, so that two files can be compared line by line."""
+    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": ['
+    lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
+    return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
 
 
 def _entry(o: MapObject) -> dict[str, Any]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _MAX_RAYS = 2000
 _MAX_REJECTED = 400
 _LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # inches
+_MAX_LABELS = 150
 _FONT = 8.0
 _USED, _REJECTED, _BEFORE, _AFTER = "#8fbfee", "#ef8f86", "#8a8a8a", "#30343b"
 
@@ -27,6 +28,14 @@ def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
 
     OSError when the file cannot be written.
     """
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # the user's own style may write in TeX, or in white
+        _draw(result, file, truth)
+
+
+def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -62,6 +71,7 @@ def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)  # a label in a script the font lacks
         figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # from here on pixels stay where they are
         left_out = _draw_labels(axes, canvas.get_renderer(), result, points, shown, crosses)
         if left_out:
             note = f"{left_out} labels have no room"
@@ -167,39 +177,41 @@ def _title(result: RunResult, outside: int) -> str:
 
 
 def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, shown: Bools, crosses: Floats) -> int:
-    """Write the objects' labels where they cover neither each other nor a dot; the count of those that found no room."""
+    """Write the objects' labels where they cover neither each other nor a dot; the count of those that found no room.
+
+    The objects with the most rays get theirs first, as long as there are few enough to read.
+    """
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.2, foreground="white", alpha=0.85)]
     colours = label_colours(result.map)
-    texts, sizes = [], []
-    for caption in captions(result.map):
-        text = axes.text(
-            0, 0, _short(caption), fontsize=_FONT, ha="left", va="bottom", parse_math=False, zorder=9, path_effects=halo
-        )
-        box = text.get_window_extent(renderer)
-        texts.append(text)
-        sizes.append((box.width, box.height))
+    style = {"fontsize": _FONT, "ha": "left", "va": "bottom", "parse_math": False, "zorder": 9, "path_effects": halo}
+    order = np.argsort([-o.rays for o in result.map.objects], kind="stable")
+    chosen = [int(j) for j in order if shown[j]][:_MAX_LABELS]
+    names = captions(result.map)
+    texts = [axes.text(0, 0, _short(names[j]), **style) for j in chosen]
+    boxes = [text.get_window_extent(renderer) for text in texts]
+    sizes = np.array([(box.width, box.height) for box in boxes]).reshape(-1, 2)
     to_pixels = axes.transData
-    anchors = to_pixels.transform(points) if len(points) else points
+    anchors = to_pixels.transform(points[chosen]) if chosen else np.zeros((0, 2))
     frame = axes.get_window_extent(renderer)
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), 1500), :2, 3]
     avoid = to_pixels.transform(np.concatenate([path, np.repeat(crosses, 5, axis=0)]))
-    corners, found = place_labels(
-        anchors, np.array(sizes).reshape(-1, 2), shown, np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]]), avoid
-    )
+    edges = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
+    corners, found = place_labels(anchors, sizes, edges, avoid)
     inverse = to_pixels.inverted()
-    for j, o in enumerate(result.map.objects):
-        if not found[j]:
-            texts[j].remove()
+    for j, text, anchor, corner, size, has_room in zip(chosen, texts, anchors, corners, sizes, found, strict=True):
+        if not has_room:
+            text.remove()
             continue
-        texts[j].set_position(inverse.transform(corners[j]))
-        texts[j].set_color(colours[o.label])
-        near = np.clip(anchors[j], corners[j], corners[j] + sizes[j])
-        if np.linalg.norm(near - anchors[j]) > 14:
-            ends = inverse.transform(np.stack([anchors[j], near]))
-            axes.plot(*ends.T, "-", color=colours[o.label], linewidth=0.6, alpha=0.8, zorder=8)
-    return int((shown & ~found).sum())
+        colour = colours[result.map.objects[j].label]
+        text.set_position(inverse.transform(corner))
+        text.set_color(colour)
+        near = np.clip(anchor, corner, corner + size)
+        if np.linalg.norm(near - anchor) > 14:
+            ends = inverse.transform(np.stack([anchor, near]))
+            axes.plot(*ends.T, "-", color=colour, linewidth=0.6, alpha=0.8, zorder=8)
+    return int(shown.sum() - found.sum())
 
 
 def _short(text: str, most: int = 28) -> str:

@@ -20,13 +20,16 @@ import numpy as np
 from objslam.config import Settings, dump_settings
 from objslam.errors import LogError, OutputError
 from objslam.ledger import Ledger
-from objslam.objects_file import dump_objects, read_objects
+from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
 from objslam.types import Association, Camera, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
 
 OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
 PICTURE, RECORDING, SUMMARY = "map.png", "recording.rrd", "summary.json"
-_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, PICTURE, RECORDING, "reconstruction.ply", "evaluation.json")
+GROUNDTRUTH = "groundtruth"
+TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth_objects.json", "groundtruth_trajectory.txt"
+_LATER = ("reconstruction.ply", "evaluation.json")
+_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, PICTURE, RECORDING, *_LATER)
 """Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
 _STAGING = ".objslam-staging"
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
@@ -77,7 +80,7 @@ def write_result(result: RunResult, out: Path, truth: Truth | None = None) -> No
     Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
     summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
     only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is drawn
-    into the picture and the recording.
+    into the picture and the recording, and kept beside the result for `load_truth`.
     """
     prepare_output(out)
     with _disk(out), _staged(out) as staging:
@@ -117,6 +120,29 @@ def load_trajectory(out: Path) -> Trajectory:
     return trajectory
 
 
+def load_truth(path: Path) -> Truth | None:
+    """The ground truth in `path`, None when a folder holds none; LogError when there is no such path, or it is malformed.
+
+    path: an objects file, a folder named groundtruth, a log folder with one, or a result whose log brought a truth. The
+    objects.json of a result folder is its estimate, never its truth: to compare two results, name that file itself.
+    """
+    if path.is_file():
+        return Truth(read_truth_objects(path))
+    if not path.is_dir():
+        raise LogError("no such ground truth", where=str(path), hint="give --truth FILE")
+    inner = path if path.resolve().name == GROUNDTRUTH else path / GROUNDTRUTH
+    for objects, trajectory in (
+        (path / TRUTH_OBJECTS, path / TRUTH_TRAJECTORY),
+        (inner / OBJECTS, inner / TRAJECTORY),
+    ):
+        if objects.is_file() or trajectory.is_file():
+            return Truth(
+                read_truth_objects(objects) if objects.is_file() else (),
+                read_trajectory(trajectory, Ledger()) if trajectory.is_file() else None,
+            )
+    return None
+
+
 def _existing(out: Path, name: str) -> Path:
     if not out.is_dir():
         raise OutputError("there is no such result folder", where=str(out))
@@ -137,6 +163,12 @@ def _writers(result: RunResult, truth: Truth | None) -> dict[str, Callable[[Path
         CONFIG: lambda file: _write(file, _encode(dump_settings(result.settings))),
         SUMMARY: lambda file: _write(file, _encode(dump_json(result.summary))),
     }
+    if truth is not None and truth.objects:
+        true = truth.objects
+        writers[TRUTH_OBJECTS] = lambda file: _write(file, _encode(dump_truth_objects(true)))
+    if truth is not None and truth.trajectory is not None:
+        true_path = truth.trajectory
+        writers[TRUTH_TRAJECTORY] = lambda file: write_trajectory(true_path, file)
     if result.settings.output.picture:
         from objslam.picture import draw_map
 

@@ -66,9 +66,9 @@ def triangulate(
     origins (R, 3) m; directions (R, 3) of any length but 0; object_index (R,), -1: no object; count N; sigma (R,) or one,
     rad, of a ray's angle along each axis across it; ranges (R,) m along the rays, NaN where unknown, and range_sigma (R,)
     or one, m; position_sigma m, of the origins. An object is ok if at least 2 rays agree, more closely than by chance, with
-    the parallax and the relative precision of the settings, and it lies ahead of most of them. Eq. 1's position stands
-    where it has both, even with ranges (a range ends on an object's surface, its rays meet inside); otherwise ranges are
-    fused with the rays. An object's answer does not depend on the other objects, nor on the order of the rays. ValueError
+    the parallax and the relative precision of the settings, and it lies ahead of most of them. Ranges are fused with the
+    rays where these miss that, or where a single range says more than all of them; else Eq. 1's position stands (a range
+    ends on an object's surface, its rays meet inside). An object's answer does not depend on the other objects, nor on the order of the rays. ValueError
     for arrays that do not fit or are not finite; ConfigError for a device that is not there.
     """
     import torch
@@ -98,12 +98,13 @@ def triangulate(
         spread = torch.from_numpy(_positive(range_sigma, len(m), "range_sigma", known)[where]).to(base.device)
         measured = torch.from_numpy(np.where(known > 0, known, np.nan)[where]).to(base.device)
         fused, fused_covariance = uncertainty.fuse_ranges(bundle, use, measured, spread)
-        taken = ~carried & fused[:, 0].isfinite()
+        one_range = uncertainty.object_median(spread[measured.isfinite()], bundle.index[measured.isfinite()], count)
+        taken = fused[:, 0].isfinite() & ~(carried & (uncertainty.largest_sigma(covariance) <= one_range))
         point = torch.where(taken[:, None], fused, point)
         covariance = torch.where(taken[:, None, None], fused_covariance, covariance)
         gradient = torch.where(taken, torch.nan, gradient)
         precise = uncertainty.precise(bundle, use, point, covariance, limit)
-        carried |= taken & precise & uncertainty.ahead(bundle, use, point)
+        carried = torch.where(taken, precise & uncertainty.ahead(bundle, use, point), carried)
     counts = torch.bincount(bundle.index[use], minlength=count)
     weight = np.zeros(len(m))
     weight[where] = use.double().cpu().numpy()

@@ -30,7 +30,7 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     along ray i of length r_i, since a nearer object is missed by less. It adds its square.
     """
     rays = _used(bundle, use)
-    lines, index, count = _lines(rays, point), rays.index, len(point)
+    lines, index = _lines(rays, point), rays.index
     distance = (point[index] - rays.origin).norm(dim=1)
     s = _offset_sigma(rays, distance)
     projectors = lines.projectors()
@@ -89,13 +89,18 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     return point, torch.where(regular[:, None, None], factor[:, None, None] * inverse, torch.nan)
 
 
+def largest_sigma(covariances: Tensor) -> Tensor:
+    """The largest standard deviation (N,) m in any direction of covariances (N, 3, 3); inf where NaN."""
+    known = covariances.isfinite().all(dim=2).all(dim=1)
+    variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
+    return torch.where(known, variance.sqrt(), torch.inf)
+
+
 def precise(bundle: Bundle, use: Tensor, point: Tensor, covariances: Tensor, limit: float) -> Tensor:
     """Objects (N,) whose largest standard deviation is at most limit times their median distance from the rays in use."""
     index = bundle.index[use]
     typical = object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
-    known = covariances.isfinite().all(dim=2).all(dim=1)
-    variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
-    return known & (variance.sqrt() <= limit * typical)
+    return largest_sigma(covariances) <= limit * typical
 
 
 def ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:

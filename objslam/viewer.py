@@ -36,7 +36,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     import rerun as rr
 
     recording = rr.RecordingStream("objslam")
-    # bytes in memory: a file sink of rerun's own swallows what the disk refuses
+    # bytes in memory: a file sink writes in a thread of its own, and what the disk refuses there is a line on stderr
     memory = recording.memory_recording()
     recording.send_blueprint(_blueprint(result))
     recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

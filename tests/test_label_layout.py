@@ -24,16 +24,13 @@ def test_no_label_covers_another_or_a_dot(seed: int, count: int, spread: float) 
     rng = np.random.default_rng(seed)
     anchors = np.clip(rng.normal([500, 450], spread, size=(count, 2)), FRAME[0] + 5, FRAME[1] - 5)
     sizes = np.column_stack([rng.uniform(20, 110, count), np.full(count, 14.0)])
-    wanted = rng.random(count) < 0.9
-    corners, found = place_labels(anchors, sizes, wanted, FRAME, rng.uniform(FRAME[0], FRAME[1], size=(300, 2)))
-    assert not found[~wanted].any()
+    corners, found = place_labels(anchors, sizes, FRAME, rng.uniform(FRAME[0], FRAME[1], size=(300, 2)))
     boxes = np.concatenate([corners, corners + sizes], axis=1)[found]
     assert (boxes[:, :2] >= FRAME[0]).all()
     assert (boxes[:, 2:] <= FRAME[1]).all()
     for i, box in enumerate(boxes):
         assert all(overlap(box, other) == 0 for other in boxes[:i])
-        dots = anchors[wanted]
-        assert not ((box[:2] < dots) & (dots < box[2:])).all(axis=1).any()
+        assert not ((box[:2] < anchors) & (anchors < box[2:])).all(axis=1).any()
 
 
 def test_every_label_of_fifteen_in_clusters_finds_room_near_its_dot() -> None:
@@ -41,7 +38,7 @@ def test_every_label_of_fifteen_in_clusters_finds_room_near_its_dot() -> None:
     centres = np.array([[200, 150], [800, 200], [500, 800], [250, 600], [900, 600.0]])
     anchors = (centres[:, None] + rng.uniform(-12, 12, size=(5, 3, 2))).reshape(-1, 2)
     sizes = np.tile([80.0, 14.0], (15, 1))
-    corners, found = place_labels(anchors, sizes, np.ones(15, dtype=bool), FRAME, NO_POINTS)
+    corners, found = place_labels(anchors, sizes, FRAME, NO_POINTS)
     assert found.all()
     off = np.linalg.norm(np.clip(anchors, corners, corners + sizes) - anchors, axis=1)
     assert off.max() < 60
@@ -49,24 +46,24 @@ def test_every_label_of_fifteen_in_clusters_finds_room_near_its_dot() -> None:
 
 def test_a_lone_label_stands_right_beside_its_dot() -> None:
     size = np.array([[60.0, 14.0]])
-    corners, found = place_labels(np.array([[500.0, 400.0]]), size, np.array([True]), FRAME, NO_POINTS)
+    corners, found = place_labels(np.array([[500.0, 400.0]]), size, FRAME, NO_POINTS)
     assert found[0]
     np.testing.assert_allclose(corners[0], [509.0, 393.0])
-    at_the_edge, _ = place_labels(np.array([[990.0, 400.0]]), size, np.array([True]), FRAME, NO_POINTS)
+    at_the_edge, _ = place_labels(np.array([[990.0, 400.0]]), size, FRAME, NO_POINTS)
     np.testing.assert_allclose(at_the_edge[0], [921.0, 393.0])
 
 
 def test_a_label_keeps_off_the_path() -> None:
     line = np.column_stack([np.linspace(500, 900, 200), np.full(200, 400.0)])
-    corners, _ = place_labels(np.array([[500.0, 400.0]]), np.array([[60.0, 14.0]]), np.array([True]), FRAME, line)
+    corners, _ = place_labels(np.array([[500.0, 400.0]]), np.array([[60.0, 14.0]]), FRAME, line)
     box = np.concatenate([corners[0], corners[0] + [60, 14]])
     assert not ((box[:2] <= line) & (line <= box[2:])).all(axis=1).any()
 
 
 def test_what_finds_no_room_is_said() -> None:
     tight = np.array([[0.0, 0.0], [50.0, 50.0]])
-    _, found = place_labels(np.full((1, 2), 25.0), np.array([[60.0, 14.0]]), np.array([True]), tight, NO_POINTS)
+    _, found = place_labels(np.full((1, 2), 25.0), np.array([[60.0, 14.0]]), tight, NO_POINTS)
     assert not found.any()
-    corners, found = place_labels(NO_POINTS, NO_POINTS, np.zeros(0, dtype=bool), tight, NO_POINTS)
+    corners, found = place_labels(NO_POINTS, NO_POINTS, tight, NO_POINTS)
     assert corners.shape == (0, 2)
     assert found.shape == (0,)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -158,16 +159,31 @@ def test_an_object_without_covariance_or_place_can_be_drawn(drawn: Any) -> None:
     assert len(figure.axes[0].patches) == 12
 
 
-def test_drawing_needs_no_screen_and_no_pyplot(tmp_path: Path) -> None:
+def test_of_a_great_many_objects_those_with_most_rays_are_named(drawn: Any) -> None:
+    rng = np.random.default_rng(0)
+    positions = np.column_stack([rng.uniform(0, 10, (400, 2)), np.ones(400)])
+    result, _ = synthetic_result(positions, [f"o{i}" for i in range(400)], keyframes=30)
+    objects = tuple(dataclasses.replace(o, rays=int(i % 4 == 0)) for i, o in enumerate(result.map.objects))
+    shown = texts(drawn(dataclasses.replace(result, map=dataclasses.replace(result.map, objects=objects))))
+    named, note = shown[:-1], shown[-1]
+    assert note == f"{400 - len(named)} labels have no room"
+    assert 70 < sum(int(name[1:]) % 4 == 0 for name in named) <= 100
+    assert len(named) <= 150
+
+
+def test_drawing_needs_no_screen_no_pyplot_and_not_the_style_of_the_user(tmp_path: Path) -> None:
+    style = tmp_path / "matplotlibrc"
+    style.write_text("text.usetex: True\nfigure.facecolor: black\n")
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "import objslam.picture; assert 'matplotlib' not in sys.modules\n"
         "from pathlib import Path; from synthetic_result import *\n"
         "objslam.picture.draw_map(synthetic_result(*clusters(), keyframes=3)[0], Path(sys.argv[2]))\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
+        "import matplotlib; assert matplotlib.rcParams['text.usetex']\n"
+        "from matplotlib.image import imread; assert imread(sys.argv[2])[0, 0].tolist() == [1, 1, 1, 1]\n"
     )
-    here = str(Path(__file__).parent)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code, here, str(tmp_path / "a.png")], capture_output=True, text=True
-    )
+    command = [sys.executable, "-W", "error", "-c", code, str(Path(__file__).parent), str(tmp_path / "a.png")]
+    environment = os.environ | {"MATPLOTLIBRC": str(style)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stderr) == (0, "")

@@ -23,9 +23,10 @@ from synthetic_result import clusters, synthetic_result
 from objslam import results
 from objslam.config import Output, Settings, load_settings
 from objslam.errors import LogError, ObjslamError, OutputError
-from objslam.objects_file import dump_objects, read_objects, read_truth_objects
-from objslam.results import RunResult, load_map, load_trajectory, prepare_output, write_file, write_result
-from objslam.types import Association, MapObject, ObjectMap
+from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
+from objslam.results import RunResult, load_map, load_trajectory, load_truth, prepare_output, write_file, write_result
+from objslam.sources.trajectory_file import write_trajectory
+from objslam.types import Association, MapObject, ObjectMap, Truth
 
 PLAIN = Settings(output=Output(recording=False, picture=False))
 PLAIN_FILES = {"objects.json", "trajectory.txt", "rays.parquet", "config.yaml", "summary.json"}
@@ -237,6 +238,47 @@ def test_a_result_holds_what_was_estimated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rays["weight"], result.weight)
     unresolved = strict_json(tmp_path / "objects.json")["objects"][2]  # type: ignore[index]
     assert set(unresolved["ray"]) == {"origin", "direction"}
+
+
+def test_the_truth_is_kept_beside_the_result(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=5, settings=PLAIN)
+    out = tmp_path / "out"
+    write_result(result, out, truth)
+    same_truth(load_truth(out), truth)
+    write_result(result, out, dataclasses.replace(truth, objects=()))
+    same_truth(load_truth(out), dataclasses.replace(truth, objects=()))
+    write_result(result, out)
+    assert load_truth(out) is None  # its own objects.json and trajectory.txt are no truth
+    assert {p.name for p in out.iterdir()} == PLAIN_FILES
+
+
+def test_a_truth_is_found_in_a_file_a_log_and_a_groundtruth_folder(tmp_path: Path) -> None:
+    _, truth = synthetic_result(*clusters(), keyframes=5)
+    inner = tmp_path / "log" / "groundtruth"
+    inner.mkdir(parents=True)
+    assert load_truth(inner) is None
+    assert load_truth(inner.parent) is None
+    (inner / "objects.json").write_text(dump_truth_objects(truth.objects))
+    same_truth(load_truth(inner / "objects.json"), dataclasses.replace(truth, trajectory=None))
+    write_trajectory(truth.trajectory, inner / "trajectory.txt")
+    same_truth(load_truth(inner), truth)
+    same_truth(load_truth(tmp_path / "log"), truth)
+    with pytest.raises(LogError, match="no such ground truth"):
+        load_truth(tmp_path / "none")
+    (inner / "objects.json").write_text("{}")
+    with pytest.raises(LogError, match="not an objects file"):
+        load_truth(tmp_path / "log")
+
+
+def same_truth(found: Truth | None, truth: Truth) -> None:
+    assert found is not None
+    assert [(o.id, o.label, o.position.tolist()) for o in found.objects] == [
+        (o.id, o.label, o.position.tolist()) for o in truth.objects
+    ]
+    assert (found.trajectory is None) == (truth.trajectory is None)
+    if found.trajectory is not None and truth.trajectory is not None:
+        np.testing.assert_array_equal(found.trajectory.stamps, truth.trajectory.stamps)
+        np.testing.assert_allclose(found.trajectory.poses, truth.trajectory.poses, atol=1e-12)
 
 
 def test_cameras_that_share_a_stamp_give_one_pose_of_the_path(tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Who may be whom, and the best choice: gated costs between sightings and points, one box per point and frame."""
+"""Who may be whom, and the best choice: gated costs between sightings and landmarks, one box per landmark and frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -10,21 +11,17 @@ from objslam.association.sightings import MIN_DEPTH, Sightings
 from objslam.types import Bools, Floats, Ints
 
 RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
-_CHUNK = 1 << 19
+"""What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
+has its range anywhere within some metres, a right box has a wrong range one time in ten or so."""
+TRACK_GAIN = 2.0
+"""What a match to the landmark of the other boxes of its track takes off the cost."""
+_CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
 
 
 @dataclass(frozen=True)
-class Edges:
-    """Possible matches: ray (E,), object (E,) and cost (E,): squared standard deviations against those of a stray box."""
-
-    ray: Ints
-    object: Ints
-    cost: Floats
-
-
-@dataclass(frozen=True)
-class Points:
-    """Objects as points: position (N, 3) m, covariance (N, 3, 3), noise (N,) factor on the rays' sigma, accepts (N, L)."""
+class Landmarks:
+    """Objects as points: position (N, 3) m, covariance (N, 3, 3) m^2, noise (N,) factor on the rays' noise, accepts (N, L)
+    whether a box of a label may be theirs."""
 
     position: Floats
     covariance: Floats
@@ -34,102 +31,169 @@ class Points:
     def __len__(self) -> int:
         return len(self.position)
 
+    def take(self, which: Bools | Ints) -> Self:
+        """A selection."""
+        return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
+
+    def placed(self, position: Floats, covariance: Floats) -> Self:
+        """The same landmarks elsewhere."""
+        return replace(self, position=position, covariance=covariance)
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Possible matches, by ray and landmark in increasing order.
+
+    ray, landmark: (E,). deviation: (E,) squared, in standard deviations of the bearing (2 degrees of freedom). vague: (E,) how
+    much less a landmark of uncertain place says: the logarithm of the area that it covers over the ray's own. cost: (E,) all
+    that together, with what the range says.
+    """
+
+    ray: Ints
+    landmark: Ints
+    deviation: Floats
+    vague: Floats
+    cost: Floats
+
 
 def across(direction: Floats) -> Floats:
     """Two unit vectors (R, 2, 3) across each unit direction (R, 3) and each other."""
-    # the axis least along the direction is safe to cross it with (Frisvad-like, without its singular pole)
-    helper = np.eye(3)[np.abs(direction).argmin(axis=1)]
+    helper = np.eye(3)[np.abs(direction).argmin(axis=1)]  # the axis that is furthest from parallel
     first = np.cross(direction, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(direction, first)], axis=1)
 
 
-def gated_edges(sightings: Sightings, points: Points, gate: float, pose: Floats | None = None) -> Edges:
-    ray, index = _near(sightings, points, gate, 0.0 if pose is None else 1.0)
-    s = sightings.take(ray)
-    to = points.position[index] - s.origin
+def variance(s: Sightings, distance: Floats, noise: Floats) -> Floats:
+    """Variance (R,), m^2, of the offset of a landmark at `distance` (R,) from its ray, per axis across."""
+    return np.asarray(noise**2 * ((s.sigma * distance) ** 2 + s.place**2))
+
+
+def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
+    """All pairs of a ray and a landmark that accepts its label whose bearing lies within the gate (squared deviations).
+
+    pose: (R, 6, 6) covariance of each ray's camera, rotation first, rotations about the map's axes (rad) and position (m).
+    """
+    ray, index = _near(s, landmarks, gate, pose)
+    r = s.take(ray)
+    to = landmarks.position[index] - r.origin
     distance = np.linalg.norm(to, axis=1)
-    b = across(s.direction)
-    e = np.einsum("eij,ej->ei", b, to)
-    cov = points.covariance[index]
-    S = np.einsum("eij,ejk,elk->eil", b, cov, b)
-    var = (s.sigma * points.noise[index] * distance) ** 2 + s.place**2
-    S[:, 0, 0] += var
-    S[:, 1, 1] += var
+    axes = across(r.direction)
+    offset = np.einsum("eij,ej->ei", axes, to)
+    covariance = landmarks.covariance[index]
     if pose is not None:
-        raise NotImplementedError
-    det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
-    m2 = (S[:, 1, 1] * e[:, 0] ** 2 - 2 * S[:, 0, 1] * e[:, 0] * e[:, 1] + S[:, 0, 0] * e[:, 1] ** 2) / det
-    cost = m2 + np.log(det / (s.sigma * distance) ** 4) * 0.0
-    along = np.einsum("ei,eij,ej->e", s.direction, cov, s.direction)
-    off = (distance - s.range) ** 2 / (s.range_sigma**2 + along)
-    cost += np.where(np.isfinite(off), np.minimum(off - RANGE_GAIN, RANGE_LOSS), 0.0)
-    keep = (m2 <= gate) & (cost < gate)
-    return Edges(ray[keep], index[keep], cost[keep])
+        covariance = covariance + _carried(to, pose[ray])
+    spread = np.einsum("eij,ejk,elk->eil", axes, covariance, axes)
+    own = variance(r, distance, landmarks.noise[index])
+    spread += own[:, None, None] * np.eye(2)
+    a, b, c = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]
+    determinant = a * c - b**2
+    deviation = (c * offset[:, 0] ** 2 - 2 * b * offset[:, 0] * offset[:, 1] + a * offset[:, 1] ** 2) / determinant
+    along = np.einsum("ei,eij,ej->e", r.direction, covariance, r.direction)
+    with np.errstate(invalid="ignore"):
+        wrong = (distance - r.range) ** 2 / (r.range_sigma**2 + along) - RANGE_GAIN
+    vague = np.log(determinant / own**2)
+    cost = deviation + vague + np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
+    keep = np.flatnonzero(deviation <= gate)
+    keep = keep[np.lexsort((index[keep], ray[keep]))]
+    return Edges(*(column[keep] for column in (ray, index, deviation, vague, cost)))
 
 
-def _near(s: Sightings, points: Points, gate: float, slack: float):
-    rays, objects = [], []
-    spread = np.linalg.eigvalsh(points.covariance)[:, -1] if len(points) else np.zeros(0)
-    centre = s.origin.mean(axis=0) if len(s) else np.zeros(3)
+def _carried(to: Floats, pose: Floats) -> Floats:
+    """What the covariance of the cameras (E, 6, 6) makes of landmarks `to` (E, 3) away: (E, 3, 3)."""
+    from objslam.geometry import skew
+
+    lever = skew(to)
+    jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
+    return np.asarray(jacobian @ pose @ np.swapaxes(jacobian, 1, 2))
+
+
+def _near(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
+    """Pairs that a bound on their deviation lets through; the bound takes matrix products only."""
+    rays, found = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    if len(s) == 0 or len(landmarks) == 0:
+        return rays[0], found[0]
+    spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
+    turn = move = np.zeros(len(s))
+    if pose is not None:  # twice each part bounds the two together with their correlation
+        turn, move = (2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
+    centre = s.origin.mean(axis=0)
     for label in np.unique(s.label):
-        mine = np.flatnonzero(s.label == label)
-        which = np.flatnonzero(points.accepts[:, label])
-        if not len(which):
-            continue
-        p = points.position[which] - centre
-        p2 = (p * p).sum(1)
-        step = max(1, _CHUNK // len(which))
-        for i in range(0, len(mine), step):
-            r = mine[i : i + step]
+        mine, which = np.flatnonzero(s.label == label), np.flatnonzero(landmarks.accepts[:, label])
+        p, noise2 = landmarks.position[which] - centre, landmarks.noise[which] ** 2
+        p2 = (p * p).sum(axis=1)
+        step = max(1, _CHUNK // max(len(which), 1))
+        for begin in range(0, len(mine), step):
+            r = mine[begin : begin + step]
             m, n = s.origin[r] - centre, s.direction[r]
-            depth = n @ p.T - (m * n).sum(1)[:, None]
-            d2 = (m * m).sum(1)[:, None] + p2 - 2 * m @ p.T
-            off2 = d2 - depth * depth
-            limit = (s.sigma[r] ** 2)[:, None] * points.noise[which] ** 2 * d2 + s.place**2 + spread[which]
-            a, o = np.nonzero((off2 <= gate * limit) & (depth > MIN_DEPTH))
+            depth = n @ p.T - (m * n).sum(axis=1)[:, None]
+            distance2 = (m * m).sum(axis=1)[:, None] + p2 - 2 * m @ p.T
+            limit = distance2 * ((s.sigma[r] ** 2)[:, None] * noise2 + turn[r, None]) + s.place**2 * noise2
+            limit += spread[which] + move[r, None] + 1e-9  # rounding of the products
+            a, b = np.nonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
             rays.append(r[a])
-            objects.append(which[o])
-    if not rays:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    return np.concatenate(rays), np.concatenate(objects)
+            found.append(which[b])
+    return np.concatenate(rays), np.concatenate(found)
 
 
-def choose(edges: Edges, frame: Ints, gate: float) -> Ints:
-    """The best choice (R,): object or -1; frame (R,)."""
-    chosen = np.full(len(frame), -1, dtype=np.int64)
-    if not len(edges.ray):
-        return chosen
-    gain = gate - edges.cost
-    keep = gain > 0
-    ray, obj, gain = edges.ray[keep], edges.object[keep], gain[keep]
-    count = int(obj.max(initial=0)) + 1
-    slot, slot_of = np.unique(frame[ray] * count + obj, return_inverse=True)
+def choose(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
+    """The landmark of each ray (R,), -1 for none: at most one ray a landmark and frame, with the least total cost.
+
+    cost: (E,) of the edges. frame: (R,). unmatched: what a ray without landmark costs. Frames are independent, and within
+    them parts that share no ray and no landmark; only parts with a real conflict go to the Hungarian method.
+    """
+    from scipy.optimize import linear_sum_assignment
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    n = len(frame)
-    graph = coo_array((np.ones(len(ray)), (ray, n + slot_of)), shape=(n + len(slot), n + len(slot)))
-    _, component = connected_components(graph, directed=False)
-    component = component[ray]
-    order = np.lexsort((obj, ray, -gain, component))
-    ray, obj, gain, component, slot_of = (a[order] for a in (ray, obj, gain, component, slot_of))
-    first = np.flatnonzero(np.diff(component, prepend=-1))
-    size = np.diff(np.append(first, len(component)))
-    # a component around one ray or one slot: the best edge is the choice
-    same_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)
-    same_slot = np.minimum.reduceat(slot_of, first) == np.maximum.reduceat(slot_of, first)
-    star = same_ray | same_slot
-    chosen[ray[first[star]]] = obj[first[star]]
-    from scipy.optimize import linear_sum_assignment
-
-    for begin, length in zip(first[~star].tolist(), size[~star].tolist(), strict=True):
-        end = begin + length
-        rows, r = np.unique(ray[begin:end], return_inverse=True)
-        columns, c = np.unique(obj[begin:end], return_inverse=True)
+    chosen = np.full(len(frame), -1, dtype=np.int64)
+    useful = np.flatnonzero(cost < unmatched)
+    if len(useful) == 0:
+        return chosen
+    ray, landmark, gain = edges.ray[useful], edges.landmark[useful], unmatched - cost[useful]
+    places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)
+    size = len(frame) + len(places)
+    graph = coo_array((np.ones(len(ray)), (ray, len(frame) + place)), shape=(size, size))
+    part = connected_components(graph, directed=False)[1][ray]
+    order = np.lexsort((landmark, ray, -gain, part))
+    ray, landmark, gain, part, place = (a[order] for a in (ray, landmark, gain, part, place))
+    first = np.flatnonzero(np.diff(part, prepend=-1))
+    end = np.append(first[1:], len(part))
+    one_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)
+    one_place = np.minimum.reduceat(place, first) == np.maximum.reduceat(place, first)
+    simple = one_ray | one_place  # the best edge is the answer
+    chosen[ray[first[simple]]] = landmark[first[simple]]
+    for i, j in zip(first[~simple].tolist(), end[~simple].tolist(), strict=True):
+        rows, r = np.unique(ray[i:j], return_inverse=True)
+        columns, c = np.unique(landmark[i:j], return_inverse=True)
         table = np.zeros((len(rows), len(columns)))
-        table[r, c] = gain[begin:end]
-        i, j = linear_sum_assignment(table, maximize=True)
-        real = table[i, j] > 0
-        chosen[rows[i[real]]] = columns[j[real]]
+        table[r, c] = gain[i:j]
+        best = linear_sum_assignment(table, maximize=True)
+        real = table[best] > 0
+        chosen[rows[best[0][real]]] = columns[best[1][real]]
     return chosen
+
+
+def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
+    """What tracks take off the cost of each edge (E,): where most other boxes of the ray's track are the landmark's.
+
+    track, matched: (R,) the track of each ray, and its landmark as far as it is known (-1 none).
+    """
+    bonus = np.zeros(len(edges.ray))
+    known = np.flatnonzero((track >= 0) & (matched >= 0))
+    if len(known) == 0:
+        return bonus
+    base = int(matched.max()) + 1
+    keys, counts = np.unique(track[known] * base + matched[known], return_counts=True)
+    tracks, start = np.unique(keys // base, return_index=True)
+    total = np.add.reduceat(counts, start)
+    which = np.flatnonzero((track[edges.ray] >= 0) & (edges.landmark < base))
+    ray, landmark = edges.ray[which], edges.landmark[which]
+    at = np.minimum(np.searchsorted(keys, track[ray] * base + landmark), len(keys) - 1)
+    same = keys[at] == track[ray] * base + landmark
+    own = (matched[ray] == landmark).astype(np.int64)
+    t = np.minimum(np.searchsorted(tracks, track[ray]), len(tracks) - 1)
+    others = np.where(same, counts[at], 0) - own
+    of = np.where(tracks[t] == track[ray], total[t], 0) - (matched[ray] >= 0)
+    bonus[which] = np.where((others >= 2) & (2 * others > of), TRACK_GAIN, 0.0)
+    return bonus

@@ -1,45 +1,49 @@
-"""Points from the rays that were given to them, all at once."""
+"""Points from the rays that were given to them, all at once: iterated weighted least squares of the bearing's deviations."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from objslam.association.matches import variance
 from objslam.association.sightings import Sightings
 from objslam.types import Floats, Ints
 
-_CAUCHY2 = 6.0
+_CAUCHY = 6.0  # squared deviations at which a ray counts half
+_RANGE_CAUCHY = 3.0
+_DAMPING = 1e-6  # of the information: along a direction that the rays do not fix, a point stays where it is
+_ITERATIONS = 6
 
 
-def refit(s: Sightings, index: Ints, start: Floats, noise: Floats, iterations: int = 6) -> tuple[Floats, Floats]:
-    """Positions (N,3), covariance (N,3,3)."""
-    held = np.flatnonzero(index >= 0)
-    order = held[np.argsort(index[held], kind="stable")]
-    r, o = s.take(order), index[order]
+def refit(s: Sightings, ray: Ints, index: Ints, start: Floats, noise: Floats) -> tuple[Floats, Floats]:
+    """Positions (N, 3) m and covariances (N, 3, 3) of points with pairs of a ray (P,) and the point (P,) that has it.
+
+    start: (N, 3) m. noise: (N,) factor on the noise of the rays. A ray may be given to several points. Points without rays stay,
+    with a covariance without bound.
+    """
     count = len(start)
+    if count == 0 or len(ray) == 0:
+        return start.copy(), np.broadcast_to(np.eye(3) / 1e-12, (count, 3, 3)).copy()
+    order = np.argsort(index, kind="stable")
+    r, index = s.take(ray[order]), index[order]
+    along = r.direction[:, :, None] * r.direction[:, None, :]
+    across = np.eye(3) - along
+    ranged = np.isfinite(r.range)
     position = start.copy()
-    P = np.eye(3) - r.direction[:, :, None] * r.direction[:, None, :]
-    N = r.direction[:, :, None] * r.direction[:, None, :]
-    for _ in range(iterations):
-        to = position[o] - r.origin
-        d2 = np.maximum((to * to).sum(1), 1e-4)
-        depth = (to * r.direction).sum(1)
-        off = to - depth[:, None] * r.direction
-        var = (r.sigma * noise[o]) ** 2 * d2 + r.place**2
-        m2 = (off * off).sum(1) / var
-        w = 1 / var / (1 + m2 / _CAUCHY2)
-        rr = (depth - r.range) / r.range_sigma
-        wr = np.where(np.isfinite(rr), 1 / r.range_sigma**2 / (1 + rr**2 / 3.0) ** 2, 0.0)
-        A = w[:, None, None] * P + wr[:, None, None] * N
-        b = -w[:, None] * off + (np.where(np.isfinite(rr), wr * (r.range - depth), 0.0))[:, None] * r.direction
-        A = _sums(A.reshape(-1, 9), o, count).reshape(-1, 3, 3)
-        b = _sums(b, o, count)
-        trace = np.trace(A, axis1=1, axis2=2)
-        damp = 1e-6 * trace + 1e-12
-        step = np.linalg.solve(A + damp[:, None, None] * np.eye(3), b[:, :, None])[:, :, 0]
-        position = position + step
-    cov = np.linalg.inv(A + damp[:, None, None] * np.eye(3))
-    return position, cov
+    for _ in range(_ITERATIONS):
+        to = position[index] - r.origin
+        depth = np.einsum("ri,ri->r", to, r.direction)
+        offset = to - depth[:, None] * r.direction
+        spread = variance(r, np.linalg.norm(to, axis=1), noise[index])
+        weight = 1 / (spread + np.einsum("ri,ri->r", offset, offset) / _CAUCHY)
+        beyond = np.where(ranged, r.range - depth, 0.0)
+        range_weight = np.where(ranged, 1 / r.range_sigma**2 / (1 + (beyond / r.range_sigma) ** 2 / _RANGE_CAUCHY) ** 2, 0.0)
+        information = weight[:, None, None] * across + range_weight[:, None, None] * along
+        pull = (range_weight * beyond)[:, None] * r.direction - weight[:, None] * offset
+        total = _sums(information.reshape(-1, 9), index, count).reshape(-1, 3, 3)
+        total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+        position = position + np.linalg.solve(total, _sums(pull, index, count)[:, :, None])[:, :, 0]
+    return position, np.linalg.inv(total)
 
 
 def _sums(values: Floats, index: Ints, count: int) -> Floats:
-    return np.stack([np.bincount(index, values[:, i], count) for i in range(values.shape[1])], axis=1)
+    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1)

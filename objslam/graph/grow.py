@@ -50,15 +50,15 @@ def grow(
         fresh = seen[(rays.keyframe[seen] >= begin) | ((begin == 1) & (rays.keyframe[seen] == 0))]
         fresh = fresh[known[association.object[fresh]]]
         waiting = seen[~known[association.object[seen]]]
-        born = _births(rays, association, map_T_camera, waiting, settings)
-        positions[born[0]] = born[1]
-        fresh = np.concatenate([fresh, waiting[np.isin(association.object[waiting], born[0])]])
+        born, places = _births(rays, association, map_T_camera, waiting, settings)
+        positions[born] = places
+        fresh = np.concatenate([fresh, waiting[np.isin(association.object[waiting], born)]])
 
         for group in (
             factors.betweens(motion[begin - 1 : end - 1], covariance[begin - 1 : end - 1], begin - 1),
             ray_factors(rays, association.object, fresh, "huber", settings),
             range_factors(rays, association.object, fresh),
-            landmark_priors(born[0], born[1], settings),
+            landmark_priors(born, positions, settings),
         ):
             for factor in group:
                 graph.push_back(factor)
@@ -89,12 +89,9 @@ def range_factors(rays: Rays, landmark: Ints, which: Ints) -> list[gtsam.Nonline
 
 
 def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> list[gtsam.NonlinearFactor]:
-    """A weak prior on each landmark, where it was first placed: it keeps the graph determined."""
+    """A weak prior on each of the landmarks at its place in positions (N, 3): it keeps the graph determined."""
     weak = gtsam.noiseModel.Isotropic.Sigma(3, settings.joint.prior_sigma)
-    return [
-        gtsam.PriorFactorPoint3(factors.l_key(j), position, weak)
-        for j, position in zip(landmarks.tolist(), positions, strict=True)
-    ]
+    return [gtsam.PriorFactorPoint3(factors.l_key(j), positions[j], weak) for j in landmarks.tolist()]
 
 
 def anchor(map_T_camera: Floats) -> gtsam.NonlinearFactor:
