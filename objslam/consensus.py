@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from objslam.eq1 import closed_form, object_sum, solve
+from objslam.eq1 import across, closed_form, object_sum, solve
 
 _VIEW = 1 - math.cos(math.radians(45))  # chance: a wrong box lies anywhere in a camera's view, a cone of this half-angle
 _NOISE = 3.0  # sigmas: agreement closer than this is not better agreement
@@ -65,7 +65,7 @@ class Fit:
 
 
 def fit(bundle: Bundle, use: Tensor, start: Tensor | None = None) -> Fit:
-    """Eq. 1 on the rays in use (R,), from a start (N, 3) or the closed form.
+    """Eq. 1 on the rays in use (R,), from the closed form, or from a start (N, 3) where that is better.
 
     Objects that their rays do not fix get the point of `closed_form` and a NaN gradient.
     """
@@ -75,8 +75,14 @@ def fit(bundle: Bundle, use: Tensor, start: Tensor | None = None) -> Fit:
     gradient = torch.full_like(point[:, 0], torch.nan)
     rays = determined[index]
     number = (torch.cumsum(determined, 0) - 1)[index[rays]]
-    begin = (point if start is None else start)[determined]
-    point[determined], iterations, gradient[determined] = solve(origin[rays], direction[rays], number, len(begin), begin)
+    origin, direction, begin = origin[rays], direction[rays], point[determined]
+    if start is not None:  # a start far from the lines would cost precision besides
+        mine = start[determined]
+        cost, own = (
+            object_sum(across(p[number] - origin, direction).norm(dim=1), number, len(begin)) for p in (begin, mine)
+        )
+        begin = torch.where((own < cost)[:, None], mine, begin)
+    point[determined], iterations, gradient[determined] = solve(origin, direction, number, len(begin), begin)
     return Fit(point, determined, gradient, iterations)
 
 
@@ -165,7 +171,8 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
             which = torch.arange(begin, min(begin + step, hypotheses), device=rays.device)
             first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
             candidates, valid = _midpoints(bundle, rays.gather(1, first), rays.gather(1, second))
-            nfa, _ = _least_chance(_chance(bundle, rays, real, candidates), bundle.number[chunk])
+            chance = _chance(bundle, rays, real, candidates).float()  # enough to rank them, and faster
+            nfa = _least_chance(chance, bundle.number[chunk])[0].double()
             nfa = torch.where(valid & exists, nfa, torch.inf)
             best = nfa.argmin(dim=1, keepdim=True)
             lowest = nfa.gather(1, best)[:, 0]
@@ -229,7 +236,7 @@ def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
     chance = chance.sort(dim=-1).values
     n = number.to(chance.dtype)[:, None]
     k = torch.arange(1, chance.shape[-1] + 1, device=chance.device, dtype=chance.dtype)
-    count = torch.lgamma(n + 1) - torch.lgamma(k - 1).clamp(max=1e300) - torch.lgamma((n - k + 1).clamp(min=1)) - math.log(2)
+    count = torch.lgamma(n + 1) - torch.lgamma((k - 1).clamp(min=1)) - torch.lgamma((n - k + 1).clamp(min=1)) - math.log(2)
     count = torch.where((k >= 2) & (k <= n), count + (n - 2).clamp(min=1).log(), torch.inf)
     log_nfa, share = (count[:, None] + (k - 1.5) * chance.log()).min(dim=-1)
     return log_nfa, chance.gather(-1, share[..., None])[..., 0]

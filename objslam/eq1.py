@@ -43,9 +43,17 @@ class Lines:
         """Offsets (R, 3) of each object's point (N, 3) from its lines, perpendicular to them: Eq. 1 sums their norms."""
         return across(points[self.index], self.direction) - self.foot
 
-    def projectors(self) -> Tensor:
-        """(R, 3, 3) I - n n^T of each line."""
-        return _projectors(self.direction)
+    def spread(self, weight: Tensor) -> Tensor:
+        """Sums (N, 3, 3) over each object's lines of weight (R,) times I - n n^T."""
+        eye = torch.eye(3, dtype=weight.dtype, device=weight.device)
+        return self.sum(weight)[:, None, None] * eye - self.outer(self.direction * weight[:, None], self.direction)
+
+    def outer(self, a: Tensor, b: Tensor) -> Tensor:
+        """Sums (N, 3, 3) over each object's lines of (a b^T + b a^T) / 2 of vectors (R, 3)."""
+        (a0, a1, a2), (b0, b1, b2) = a.T, b.T
+        off = (0.5 * (a0 * b1 + a1 * b0), 0.5 * (a0 * b2 + a2 * b0), 0.5 * (a1 * b2 + a2 * b1))
+        six = self.sum(torch.stack([a0 * b0, a1 * b1, a2 * b2, *off], dim=1))
+        return six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
 
     def scaled(self, factor: Tensor) -> Lines:
         """The lines with each object's coordinates multiplied by its factor (N,)."""
@@ -65,7 +73,12 @@ def object_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
 
 def across(vectors: Tensor, direction: Tensor) -> Tensor:
     """The parts (R, 3) of vectors perpendicular to unit directions (R, 3)."""
-    return vectors - direction * (vectors * direction).sum(-1, keepdim=True)
+    return vectors - direction * dot(vectors, direction)[:, None]
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Dot products (R,) of vectors (R, 3)."""
+    return (a * b) @ a.new_ones(3)  # a sum over so short a dimension takes ten times as long
 
 
 def closed_form(origin: Tensor, direction: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -77,7 +90,7 @@ def closed_form(origin: Tensor, direction: Tensor, index: Tensor, count: int) ->
     number = object_sum(torch.ones_like(origin[:, 0]), index, count)
     base = object_sum(origin, index, count) / number[:, None]  # map coordinates may be large, an object's spread is not
     lines = Lines.through(origin - base[index], direction, index, count)
-    eigenvalues, vectors = torch.linalg.eigh(lines.sum(lines.projectors()))
+    eigenvalues, vectors = torch.linalg.eigh(lines.spread(torch.ones_like(origin[:, 0])))
     # an eigenvalue is the sum of squared sines between the lines and its axis
     usable = eigenvalues > 1e-10 * number[:, None]
     pull = (vectors.mT @ lines.sum(lines.foot)[:, :, None])[:, :, 0]
@@ -85,7 +98,7 @@ def closed_form(origin: Tensor, direction: Tensor, index: Tensor, count: int) ->
     determined = usable.all(dim=1)
     heading = object_sum(direction, index, count)
     ahead = vectors[:, :, 0]
-    ahead = torch.where((ahead * heading).sum(1, keepdim=True) < 0, -ahead, ahead)
+    ahead = torch.where(dot(ahead, heading)[:, None] < 0, -ahead, ahead)
     return base + point + torch.where(determined[:, None], 0.0, ahead), determined
 
 
@@ -131,7 +144,6 @@ def _minimise(lines: Lines) -> tuple[Tensor, Tensor, int]:
     o, epsilon, late = point.clone(), torch.ones_like(zeros), torch.zeros_like(zeros)
     q = lines.offset(o)
     y = q / _radius(q, epsilon[lines.index])[:, None]
-    projectors = lines.projectors()
     for iteration in range(_MAX_ITERATIONS):
         distance = q.norm(dim=1).clamp(min=_TINY)
         gradient = lines.sum(q / distance[:, None]).norm(dim=1)
@@ -141,34 +153,31 @@ def _minimise(lines: Lines) -> tuple[Tensor, Tensor, int]:
         if finished.any():
             point[live], dual[live_rays] = o, y
             lines, rays = lines.select(~finished)
-            live, live_rays, projectors = live[~finished], live_rays[rays], projectors[rays]
+            live, live_rays = live[~finished], live_rays[rays]
             o, q, y, number = o[~finished], q[rays], y[rays], number[~finished]
             epsilon, late = epsilon[~finished], late[~finished]
-            if lines.count == 0:
-                return point, dual, iteration
+        if lines.count == 0:
+            return point, dual, iteration
         if iteration:
-            gap = lines.sum(q.norm(dim=1) - (y * q).sum(1)) / number
+            gap = lines.sum(q.norm(dim=1) - dot(y, q)) / number
             residual = lines.sum(y).norm(dim=1) / number
             epsilon = torch.minimum(epsilon, torch.maximum(0.1 * torch.maximum(gap, residual), 0.01 * epsilon))
             epsilon = epsilon.clamp(min=_FLOOR)
             late += epsilon <= _LATE
-        o, q, y = _newton_step(lines, projectors, o, q, y, epsilon)
+        o, q, y = _newton_step(lines, o, q, y, epsilon)
     point[live], dual[live_rays] = o, y
     return point, dual, _MAX_ITERATIONS
 
 
-def _newton_step(
-    lines: Lines, projectors: Tensor, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One damped primal-dual step from points o (N, 3) with offsets q and duals y (R, 3): the new o, q, y."""
     r = _radius(q, epsilon[lines.index])
-    outer = y[:, :, None] * (q / r[:, None])[:, None, :]
-    hessian = lines.sum((projectors - 0.5 * (outer + outer.mT)) / r[:, None, None])
+    hessian = lines.spread(1 / r) - lines.outer(y / r.square()[:, None], q)
     trace = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
     hessian = hessian + 1e-14 * trace[:, None, None] * torch.eye(3, dtype=o.dtype, device=o.device)
     gradient = lines.sum(q / r[:, None])
     step = -torch.linalg.solve(hessian, gradient)
-    slope, value, length = (gradient * step).sum(1), lines.sum(r), torch.ones_like(epsilon)
+    slope, value, length = dot(gradient, step), lines.sum(r), torch.ones_like(epsilon)
     for _ in range(40):  # halve each object's step until its cost falls (Armijo), up to rounding
         new = o + length[:, None] * step
         new_q = lines.offset(new)
@@ -177,10 +186,9 @@ def _newton_step(
             break
         length = torch.where(too_long, 0.5 * length, length)
     change = new_q - q
-    dual_step = (new_q - y * ((q * change).sum(1) / r)[:, None]) / r[:, None] - y
+    dual_step = (new_q - y * (dot(q, change) / r)[:, None]) / r[:, None] - y
     # as far as the unit ball allows
-    a, b = dual_step.square().sum(1), (y * dual_step).sum(1)
-    c = (y.square().sum(1) - 1).clamp(max=0)
+    a, b, c = dot(dual_step, dual_step), dot(y, dual_step), (dot(y, y) - 1).clamp(max=0)
     share = (0.999 * ((b.square() - a * c).clamp(min=0).sqrt() - b) / a.clamp(min=_TINY)).clamp(max=1)
     return new, new_q, y + share[:, None] * dual_step
 
@@ -193,7 +201,7 @@ def _settle(lines: Lines, point: Tensor, dual: Tensor, on_line: float) -> tuple[
     """
     on = lines.offset(point).norm(dim=1) <= on_line
     weight = on.to(point.dtype)[:, None]
-    eigenvalues, vectors = torch.linalg.eigh(lines.sum(lines.projectors() * weight[:, :, None]))
+    eigenvalues, vectors = torch.linalg.eigh(lines.spread(weight[:, 0]))
     fixed = eigenvalues > 1e-9 * eigenvalues[:, -1:].clamp(min=_TINY)
     inverse = _assemble(vectors, torch.where(fixed, 1 / torch.where(fixed, eigenvalues, 1.0), 0.0))
     free = _assemble(vectors, (~fixed).to(point.dtype))
@@ -205,8 +213,9 @@ def _settle(lines: Lines, point: Tensor, dual: Tensor, on_line: float) -> tuple[
         u = q / d * (1 - weight)
         pull = lines.sum(u)
         if newton:
-            curvature = (lines.projectors() - u[:, :, None] * u[:, None, :]) * ((1 - weight) / d)[:, :, None]
-            point = point - _short_newton(free @ lines.sum(curvature) @ free, _apply(free, pull))
+            inverse_d = (1 - weight) / d
+            curvature = lines.spread(inverse_d[:, 0]) - lines.outer(u * inverse_d, u)
+            point = point - _short_newton(free @ curvature @ free, _apply(free, pull))
     # the smallest subgradient: the lines on the point answer the pull of the others, each with at most 1
     answer = across(dual, lines.direction) * weight
     for _ in range(30 if bool(on.any()) else 0):
@@ -227,12 +236,7 @@ def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
 
 
 def _radius(offset: Tensor, epsilon: Tensor) -> Tensor:
-    return (offset.square().sum(1) + epsilon.square()).sqrt()
-
-
-def _projectors(direction: Tensor) -> Tensor:
-    eye = torch.eye(3, dtype=direction.dtype, device=direction.device)
-    return eye - direction[:, :, None] * direction[:, None, :]
+    return (dot(offset, offset) + epsilon.square()).sqrt()
 
 
 def _assemble(vectors: Tensor, eigenvalues: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from objslam import __version__
 from objslam.association.by_label import associate_by_label
 from objslam.config import Settings
 from objslam.errors import SolveError
+from objslam.geometry import widest_angle
 from objslam.keyframes import build_keyframes
 from objslam.ledger import Ledger
 from objslam.rays import angles_off, build_rays
@@ -23,7 +24,6 @@ from objslam.types import Association, Floats, Keyframes, Log, MapObject, Object
 
 if TYPE_CHECKING:
     from objslam.graph.batch import Estimate
-    from objslam.triangulation import Triangulation
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage's name, what is done and the total (0 when it is not known)."""
@@ -61,14 +61,14 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         else:
             if not keyframes.localized_every and keyframes.odom_T_base is None:
                 raise SolveError("the joint mode needs odometry or localisation", where=log.name)
-            estimate, placed = batch.solve_joint(
+            estimate = batch.solve_joint(
                 keyframes, rays, association, settings, ledger, lambda done, total: progress("solve", done, total)
             )
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     residual = np.full(len(rays), np.nan)
     held = association.object >= 0
     residual[held] = angles_off(origins[held], directions[held], estimate.positions[association.object[held]])
-    objects = _describe(estimate, placed, keyframes, rays, association, origins, directions, residual, settings)
+    objects = _describe(estimate, keyframes, rays, association, origins, directions, residual, settings)
     path = log.localization or log.odometry
     assert path is not None  # build_keyframes has refused such a log
     return RunResult(
@@ -105,7 +105,6 @@ def _seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
 
 def _describe(
     estimate: Estimate,
-    placed: Triangulation,
     keyframes: Keyframes,
     rays: Rays,
     association: Association,
@@ -123,7 +122,10 @@ def _describe(
         kept = mine[estimate.weight[mine] > 0] if (estimate.weight[mine] > 0).any() else mine
         position, covariance = estimate.positions[j], estimate.covariance[j]
         reach = np.median(np.linalg.norm(position - origins[kept], axis=1))
-        known = bool(estimate.solved[j] and placed.ok[j] and np.isfinite(covariance).all())
+        parallax = np.degrees(widest_angle(directions[kept]))
+        ranged = bool(np.isfinite(rays.range[kept]).any())
+        known = bool(estimate.solved[j] and np.isfinite(covariance).all())
+        known = known and (ranged or parallax >= settings.triangulation.min_parallax_deg)
         known = known and float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])) <= settings.triangulation.max_rel_sigma * reach
         stamps = keyframes.stamps[rays.keyframe[mine]]
         middle = kept[len(kept) // 2]
@@ -136,7 +138,7 @@ def _describe(
                 status="ok" if known else "unresolved",
                 rays=len(kept),
                 frames=len(np.unique(rays.keyframe[kept])),
-                parallax_deg=round(float(np.degrees(placed.parallax[j])), 3),
+                parallax_deg=round(float(parallax), 3),
                 rms_deg=round(float(np.degrees(np.sqrt(np.mean(residual[kept] ** 2)))), 4),
                 first_seen=float(stamps.min()),
                 last_seen=float(stamps.max()),

@@ -68,8 +68,8 @@ def triangulate(
     or one, m; position_sigma m, of the origins. An object is ok if at least 2 rays agree, more closely than by chance, with
     the parallax and the relative precision of the settings, and it lies ahead of most of them. Ranges are fused with the
     rays where these miss that, or where a single range says more than all of them; else Eq. 1's position stands (a range
-    ends on an object's surface, its rays meet inside). An object's answer does not depend on the other objects, nor on the order of the rays. ValueError
-    for arrays that do not fit or are not finite; ConfigError for a device that is not there.
+    ends on an object's surface, its rays meet inside). An object's answer does not depend on the other objects, nor on the
+    order of the rays. ValueError for arrays that do not fit or are not finite; ConfigError for a device that is not there.
     """
     import torch
 
@@ -87,6 +87,7 @@ def triangulate(
         by_chance = torch.zeros_like(result.determined)
     point, gradient = result.point, result.gradient
     covariance = uncertainty.covariance(bundle, use, point)
+    covariance = torch.where(result.determined[:, None, None], covariance, torch.nan)
     angle = uncertainty.parallax(bundle, use)
     limit = settings.max_rel_sigma
     carried = (angle >= np.radians(settings.min_parallax_deg)) & uncertainty.precise(bundle, use, point, covariance, limit)
@@ -151,9 +152,10 @@ def solve_eq1(
 ) -> tuple[Floats, int, Floats]:
     """Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
 
-    Arguments as in `triangulate`; start (N, 3) m, by default the `closed_form`. Returns the points (N, 3) m, the solver's
-    iterations, and the norm (N,) of the gradient: where rays pass through the solution, of the smallest subgradient, so
-    that 0 always proves the optimum. Objects that their rays do not fix get the closed form's point and NaN.
+    Arguments as in `triangulate`; start (N, 3) m, taken where it is better than the `closed_form`. Returns the points (N, 3)
+    m, the solver's iterations, and the norm (N,) of the gradient: where rays pass through the solution, of the smallest
+    subgradient, so that 0 always proves the optimum. Objects that their rays do not fix get the closed form's point and NaN.
+    Two rays leave their whole common perpendicular as optimum: its midpoint is returned.
     """
     import torch
 

@@ -15,6 +15,7 @@ from objslam.eq1 import Lines, object_sum
 
 _ALL_PAIRS = 256  # rays of one object up to which every pair is looked at for the widest angle
 _CAUCHY = 2.385  # standard deviations; 95 % efficient on Gaussian noise
+_MEDIAN_OF_NORMAL = 0.6745  # of its absolute value
 _RANGE_ITERATIONS = 30
 _RAYLEIGH = math.sqrt(math.pi / 2)  # mean distance from a line under noise of 1 along both axes across it
 
@@ -33,9 +34,8 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     lines, index = _lines(rays, point), rays.index
     distance = (point[index] - rays.origin).norm(dim=1)
     s = _offset_sigma(rays, distance)
-    projectors = lines.projectors()
-    a = lines.sum(0.5 * _RAYLEIGH / s[:, None, None] * projectors)
-    b = lines.sum(0.5 * projectors)
+    a = lines.spread(0.5 * _RAYLEIGH / s)
+    b = lines.spread(torch.full_like(s, 0.5))
     tilt = lines.sum((_RAYLEIGH * rays.sigma.square() * distance / s)[:, None] * rays.direction)
     factor = _variance_factor(lines.foot.norm(dim=1) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a)
@@ -61,10 +61,9 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     informed = has[rays.index]
     zero = torch.zeros_like(rays.origin)
     lines = Lines.through(torch.where(informed[:, None], rays.origin, zero), rays.direction, rays.index, count)
-    weight = torch.where(informed, 1 / s.square(), 0.0)[:, None]
-    across_matrix = lines.sum(weight[:, :, None] * lines.projectors())
-    across_vector = lines.sum(weight * lines.foot)
-    along = rays.direction[:, :, None] * rays.direction[:, None, :]
+    weight = torch.where(informed, 1 / s.square(), 0.0)
+    across_matrix = lines.spread(weight)
+    across_vector = lines.sum(weight[:, None] * lines.foot)
     # start: the median of what the ranges say along the mean direction, since the rays alone leave just that open
     heading = object_sum(rays.direction, rays.index, count)
     heading = heading / heading.norm(dim=1, keepdim=True).clamp(min=1e-12)
@@ -74,19 +73,25 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     strength = across_matrix.diagonal(dim1=1, dim2=2).sum(1).clamp(min=1.0)
     pin = (strength[:, None] * heading)[:, :, None] * heading[:, None, :]
     empty = (~has).to(s.dtype)[:, None, None] * eye
-    point = _solve(across_matrix + pin + empty, across_vector + (strength * depth)[:, None] * heading)
-    information = across_matrix
+
+    def along(weight: Tensor) -> Tensor:
+        return lines.outer(weight[:, None] * rays.direction, rays.direction)
+
+    point = torch.linalg.solve(across_matrix + pin + empty, across_vector + (strength * depth)[:, None] * heading)
+    ends = (measured * rays.direction).sum(1)
     for _ in range(_RANGE_ITERATIONS):
-        residual = ((point[rays.index] - measured) * rays.direction).sum(1) / range_sigma
-        robust = torch.where(known, 1 / (1 + (residual / _CAUCHY).square()) / range_sigma.square(), 0.0)[:, None]
-        information = across_matrix + lines.sum(robust[:, :, None] * along)
-        target = across_vector + lines.sum(robust * (measured * rays.direction).sum(1, keepdim=True) * rays.direction)
-        point = _solve(information + empty, target)
+        residual = ((point[rays.index] * rays.direction).sum(1) - ends) / range_sigma
+        robust = torch.where(known, 1 / (1 + (residual / _CAUCHY).square()) / range_sigma.square(), 0.0)
+        target = across_vector + lines.sum((robust * ends)[:, None] * rays.direction)
+        point = torch.linalg.solve(across_matrix + along(robust) + empty, target)
+    # ranges that scatter by more than their sigma count for less
+    scatter = object_median(residual.abs()[known], rays.index[known], count) / _MEDIAN_OF_NORMAL
+    along_matrix = along(robust / scatter.square().clamp(min=1)[rays.index])
     factor = _variance_factor(lines.offset(point).norm(dim=1) / s, rays, 2)
-    inverse, regular = _inverse(information)
+    inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
     regular &= has
     point = torch.where(regular[:, None], point, torch.nan)
-    return point, torch.where(regular[:, None, None], factor[:, None, None] * inverse, torch.nan)
+    return point, torch.where(regular[:, None, None], inverse, torch.nan)
 
 
 def largest_sigma(covariances: Tensor) -> Tensor:
@@ -133,8 +138,8 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
         cos = torch.where(both, cos, 1.0).flatten(1)
         pair = cos.argmin(dim=1)
         n = direction.shape[1]
-        one = direction[torch.arange(len(pair)), pair // n]
-        two = direction[torch.arange(len(pair)), pair % n]
+        row = torch.arange(len(pair), device=pair.device)
+        one, two = direction[row, pair // n], direction[row, pair % n]
         # the arccos of nearly 1 keeps half the digits
         widest[objects] = torch.atan2(torch.linalg.cross(one, two, dim=1).norm(dim=1), (one * two).sum(1).abs())
     return widest
@@ -189,10 +194,6 @@ def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
     eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], matrices, eye))
     regular = finite & (eigenvalues[:, 0] > 1e-10 * eigenvalues[:, 2]) & (eigenvalues[:, 2] > 0)
     return torch.linalg.inv(torch.where(regular[:, None, None], matrices, eye)), regular
-
-
-def _solve(matrices: Tensor, vectors: Tensor) -> Tensor:
-    return torch.linalg.solve(matrices, vectors)
 
 
 def _sphere(number: int, like: Tensor) -> Tensor:

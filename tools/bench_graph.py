@@ -134,7 +134,7 @@ def growth() -> None:
     for size in sizes:
         keyframes, rays, association, points = drive(size)
         begin = time.perf_counter()
-        estimate, _ = solve_joint(keyframes, rays, association, settings, Ledger())
+        estimate = solve_joint(keyframes, rays, association, settings, Ledger())
         table["joint from odometry"].append(time.perf_counter() - begin)
         error = np.linalg.norm(estimate.positions - points, axis=1)[estimate.solved]
         begin = time.perf_counter()

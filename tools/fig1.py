@@ -19,11 +19,9 @@ GOOD = 7
 
 
 def lines(outliers: int, noise: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions of 7 lines through the meeting point, noisy (rad), and of random ones, 2 to 4 m away."""
-    away = rng.normal(size=(GOOD + outliers, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    origins = MEETING + away * rng.uniform(2.0, 4.0, size=(len(away), 1)) * [1.0, 1.0, 0.5]
-    directions = rng.normal(size=away.shape)
+    """Origins and directions of 7 noisy lines (rad) through the meeting point and of random ones, all from the floor."""
+    origins = rng.uniform(-2.0, 2.0, size=(GOOD + outliers, 3)) * [1.0, 1.0, 0.0]
+    directions = rng.normal(size=origins.shape)
     good = MEETING - origins[:GOOD]
     directions[:GOOD] = good / np.linalg.norm(good, axis=1, keepdims=True) + noise * rng.normal(size=(GOOD, 3))
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)

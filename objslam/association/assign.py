@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.association.matches import RANGE_LOSS, Landmarks, choose, gated_edges
+from objslam.association.landmarks import Landmarks
+from objslam.association.matches import RANGE_LOSS, choose, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.types import Bools, Floats, Ints, Rays
 
@@ -40,7 +41,9 @@ def assign(
         range=rays.range,
         range_sigma=rays.range_sigma,
         size=np.zeros((len(rays), 2)),
+        box=rays.box,
         track=rays.track_id,
+        score=rays.score,
     )
     known = np.flatnonzero(np.isfinite(positions).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
     landmarks = Landmarks(positions[known], covariances[known], np.ones(len(known)), accepts[known])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.landmarks import Landmarks, variance
 from objslam.association.sightings import MIN_DEPTH, Sightings
-from objslam.types import Bools, Floats, Ints
+from objslam.geometry import skew
+from objslam.types import Floats, Ints
 
 RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
 """What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
@@ -16,28 +17,6 @@ has its range anywhere within some metres, a right box has a wrong range one tim
 TRACK_GAIN = 2.0
 """What a match to the landmark of the other boxes of its track takes off the cost."""
 _CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
-
-
-@dataclass(frozen=True)
-class Landmarks:
-    """Objects as points: position (N, 3) m, covariance (N, 3, 3) m^2, noise (N,) factor on the rays' noise, accepts (N, L)
-    whether a box of a label may be theirs."""
-
-    position: Floats
-    covariance: Floats
-    noise: Floats
-    accepts: Bools
-
-    def __len__(self) -> int:
-        return len(self.position)
-
-    def take(self, which: Bools | Ints) -> Self:
-        """A selection."""
-        return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
-
-    def placed(self, position: Floats, covariance: Floats) -> Self:
-        """The same landmarks elsewhere."""
-        return replace(self, position=position, covariance=covariance)
 
 
 @dataclass(frozen=True)
@@ -62,11 +41,6 @@ def across(direction: Floats) -> Floats:
     first = np.cross(direction, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(direction, first)], axis=1)
-
-
-def variance(s: Sightings, distance: Floats, noise: Floats) -> Floats:
-    """Variance (R,), m^2, of the offset of a landmark at `distance` (R,) from its ray, per axis across."""
-    return np.asarray(noise**2 * ((s.sigma * distance) ** 2 + s.place**2))
 
 
 def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
@@ -101,8 +75,6 @@ def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | 
 
 def _carried(to: Floats, pose: Floats) -> Floats:
     """What the covariance of the cameras (E, 6, 6) makes of landmarks `to` (E, 3) away: (E, 3, 3)."""
-    from objslam.geometry import skew
-
     lever = skew(to)
     jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
     return np.asarray(jacobian @ pose @ np.swapaxes(jacobian, 1, 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.association.matches import variance
+from objslam.association.landmarks import variance
 from objslam.association.sightings import Sightings
 from objslam.types import Floats, Ints
 

@@ -19,7 +19,8 @@ class Sightings:
 
     frame: (R,) number in the order of time. label: (R,). origin: (R, 3) m, direction: (R, 3) unit, in map. sigma: (R,) rad
     along each of two axes across. place: m, the noise of the origins. range: (R,) m, NaN where unknown; range_sigma: (R,).
-    size: (R, 2) width and height of the box over the focal length. track: (R,) -1 where unknown.
+    size: (R, 2) width and height of what the box holds for each metre of its distance. box: (R, 4) px. track: (R,) -1 where
+    unknown. score: (R,).
     """
 
     frame: Ints
@@ -31,7 +32,9 @@ class Sightings:
     range: Floats
     range_sigma: Floats
     size: Floats
+    box: Floats
     track: Ints
+    score: Floats
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -63,7 +66,6 @@ def sight(
     ray = np.lexsort(content)
     rays, frame = rays.take(ray), frame[ray]
     origin, direction = rays.in_map(map_T_camera)
-    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[keyframes.camera[rays.keyframe]]
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
     sightings = Sightings(
         frame=frame,
@@ -74,7 +76,18 @@ def sight(
         place=position_sigma,
         range=np.where(known, rays.range, np.nan),
         range_sigma=np.where(known, rays.range_sigma, np.nan),
-        size=(rays.box[:, 2:] - rays.box[:, :2]) / focal,
+        size=size_per_metre(rays, keyframes, cameras),
+        box=rays.box,
         track=rays.track_id,
+        score=rays.score,
     )
     return sightings, ray, keyframe
+
+
+def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
+    """Width and height (R, 2) of what each box holds, in metres for each metre of its distance."""
+    of = keyframes.camera[rays.keyframe]
+    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
+    pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
+    depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # a pinhole's image grows with z, not with the distance
+    return np.asarray((rays.box[:, 2:] - rays.box[:, :2]) / focal * depth[:, None])

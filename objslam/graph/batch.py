@@ -27,8 +27,14 @@ from objslam.rays import angles_off
 from objslam.triangulation import Triangulation, triangulate
 from objslam.types import Association, Bools, Floats, Ints, Keyframes, Rays
 
-_REJECT_ROUNDS = 4
+_ROUNDS = 4
 """Outliers are looked for again at the solved poses until nothing changes, this often at the most."""
+_OUTLIER = 4.0
+"""A ray that misses its object by so many standard deviations is an outlier: 3e-4 of the good ones are."""
+_LOST = 0.4
+"""An object that fewer than this share of its rays support is placed anew."""
+_WIDEST = 5.0
+"""An object's rays may be so many times as noisy as assumed (a large object's box centres are)."""
 _RAYLEIGH_MEDIAN = 1.1774
 """The median norm of a standard Gaussian in the plane."""
 
@@ -38,8 +44,8 @@ class Estimate:
     """What a solve found.
 
     map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN where not solved. solved: (N,) whether the
-    object was part of the graph. weight: (R,) each ray's robust weight in [0, 1], 0 without object or when rejected. The costs
-    are the errors of the graph that was solved last, at its start and at its optimum.
+    object was part of the graph. weight: (R,) each ray's robust weight in [0, 1], 0 without object or when rejected. The
+    costs are the errors of the graph that was solved last, at its start and at its optimum.
     """
 
     map_T_base: Floats
@@ -66,7 +72,7 @@ def triangulate_at(
         sigma,
         settings.triangulation,
         seed=settings.seed,
-        ranges=rays.range,
+        ranges=rays.range if np.isfinite(rays.range).any() else None,
         range_sigma=rays.range_sigma,
         position_sigma=place,
     )
@@ -129,22 +135,24 @@ def solve_joint(
     settings: Settings,
     ledger: Ledger,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Estimate, Triangulation]:
+) -> Estimate:
     """Poses and objects together, from a start that holds: the localisation's poses, or the graph grown along the odometry.
 
-    After each solve, rays that no consensus of their object supports at the solved poses are rejected, and objects that now
-    carry a position enter, until nothing changes. Returned with the estimate: Eq. 1 at the solved poses, for comparison.
+    After each solve, rays that miss their object by far more than its others do are rejected, or taken back; objects that
+    the poses now carry enter, and those that hardly any ray supports are placed anew, until nothing changes.
     """
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
         map_T_camera, positions = grow(keyframes, rays, association, settings, progress)
+    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     used = np.zeros(len(rays), dtype=bool)
-    optimum, iterations = None, 0
-    for _ in range(_REJECT_ROUNDS):
-        placed = triangulate_at(map_T_camera, keyframes, rays, association, settings)
-        positions = np.where(np.isnan(positions) & placed.ok[:, None], placed.positions, positions)
-        supported = (placed.weight > 0) & np.isfinite(positions[association.object, 0]) & (association.object >= 0)
+    optimum, cost_before, iterations = None, np.nan, 0
+    for _ in range(_ROUNDS):
+        supported = _supported(rays, association, map_T_camera, positions, used)
+        lost = np.bincount(association.object[supported], minlength=association.count) < _LOST * number
+        positions = _place(lost, map_T_camera, keyframes, rays, association, positions, settings)
+        supported = _supported(rays, association, map_T_camera, positions, used)
         if optimum is not None and (supported == used).all():
             break
         used = supported
@@ -152,31 +160,64 @@ def solve_joint(
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         values = make_values(map_T_camera, positions, landmarks)
         optimum = _solve(graph, values, settings.joint.loss, settings, others)
+        cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
         positions[landmarks] = read_points(optimum.values)
     assert optimum is not None
 
+    landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
     origins, directions = (a[used] for a in rays.in_map(map_T_camera))
     residual = angles_off(origins, directions, positions[association.object[used]]) / rays.sigma[used]
     weight = np.zeros(len(rays))
     weight[used] = _weights(settings.joint.loss, residual, optimum)
     covariance = np.full((association.count, 3, 3), np.nan)
-    landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
     gaussian, _ = _joint_graph(keyframes, rays, association, positions, used & (weight > 0), "gnc", settings)
     covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
     covariance *= _widening(residual, association.object[used], association.count)[:, None, None]
-    estimate = Estimate(
+    return Estimate(
         map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
         positions=positions,
         covariance=covariance,
         solved=np.isfinite(covariance[:, 0, 0]),
         weight=weight,
-        cost_before=optimum.cost_before,
+        cost_before=cost_before,
         cost_after=optimum.cost_after,
         iterations=iterations,
     )
-    return estimate, placed
+
+
+def _place(
+    lost: Bools,
+    map_T_camera: Floats,
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    positions: Floats,
+    settings: Settings,
+) -> Floats:
+    """Positions (N, 3) with those of the lost objects (N,) from a consensus of their rays, NaN where there is none."""
+    positions = np.where(lost[:, None], np.nan, positions)
+    which = (association.object >= 0) & lost[association.object]
+    if which.any():
+        objects, index = np.unique(association.object[which], return_inverse=True)
+        some = Association(index, association.label[objects])
+        placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, settings)
+        positions[objects[placed.ok]] = placed.positions[placed.ok]
+    return positions
+
+
+def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
+    """Which rays (R,) agree with their object, by how noisy those of its rays are that agreed so far (at first all)."""
+    placed = (association.object >= 0) & np.isfinite(positions[association.object, 0])
+    landmark = association.object[placed]
+    origins, directions = (a[placed] for a in rays.in_map(map_T_camera))
+    miss = angles_off(origins, directions, positions[landmark]) / rays.sigma[placed]
+    before = used[placed] if used.any() else np.ones(len(miss), dtype=bool)
+    noise = np.minimum(np.sqrt(_widening(miss[before], landmark[before], association.count)), _WIDEST)
+    supported = np.zeros(len(rays), dtype=bool)
+    supported[placed] = miss <= _OUTLIER * noise[landmark]
+    return supported
 
 
 def _joint_graph(

@@ -1,0 +1,90 @@
+"""What is believed at a moment: objects as points, and which ray is whose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from objslam.association.sightings import Sightings
+from objslam.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Objects as points: position (N, 3) m, covariance (N, 3, 3) m^2, noise (N,) factor on the rays' noise, accepts (N, L)
+    whether a box of a label may be theirs."""
+
+    position: Floats
+    covariance: Floats
+    noise: Floats
+    accepts: Bools
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @classmethod
+    def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
+        """Landmarks of one label each, label: (N,) of `labels`, with nothing known about their precision."""
+        accepts = np.zeros((len(position), labels), dtype=bool)
+        accepts[np.arange(len(position)), label] = True
+        return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
+
+    def take(self, which: Bools | Ints) -> Self:
+        """A selection."""
+        return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
+
+    def and_also(self, other: Self) -> Self:
+        """These, and then the others."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("position", "covariance", "noise", "accepts"))
+        return type(self)(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class State:
+    """Landmarks, and matched (R,): the landmark of each sighting, -1 none."""
+
+    landmarks: Landmarks
+    matched: Ints
+
+    @property
+    def number(self) -> Ints:
+        """(N,) rays of each landmark."""
+        return np.bincount(self.matched[self.matched >= 0], minlength=len(self.landmarks))
+
+    def labels(self, s: Sightings) -> Ints:
+        """How many rays of each label each landmark has, (N, L)."""
+        count, labels = self.landmarks.accepts.shape
+        held = self.matched >= 0
+        return np.bincount(self.matched[held] * labels + s.label[held], minlength=count * labels).reshape(count, labels)
+
+    def kind(self, s: Sightings) -> Ints:
+        """The label (N,) that most rays of each landmark have."""
+        return self.labels(s).argmax(axis=1)
+
+    def keep(self, which: Bools) -> State:
+        """Only some of the landmarks (N,); the rays of the others go free."""
+        number = np.append(np.cumsum(which) - 1, -1)
+        kept = np.append(which, False)
+        return State(self.landmarks.take(which), np.where(kept[self.matched], number[self.matched], -1))
+
+    def merge(self, target: Ints) -> State:
+        """Each landmark made part of another, or of itself: target (N,)."""
+        accepts = np.zeros_like(self.landmarks.accepts)
+        np.logical_or.at(accepts, target, self.landmarks.accepts)
+        merged = State(replace(self.landmarks, accepts=accepts), np.append(target, -1)[self.matched])
+        return merged.keep(target == np.arange(len(target)))
+
+
+def variance(s: Sightings, distance: Floats, noise: Floats) -> Floats:
+    """Variance (R,), m^2 per axis across, of the offset of a landmark at `distance` (R,) m from its ray."""
+    return np.asarray(noise**2 * ((s.sigma * distance) ** 2 + s.place**2))
+
+
+def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
+    """How far each ray passes its point (R, 3): squared, m^2, inf where the point is behind, and the distance to it, m: (R,)."""
+    to = position - s.origin
+    depth = np.einsum("ri,ri->r", to, s.direction)
+    distance2 = np.einsum("ri,ri->r", to, to)
+    return np.where(depth > 0, np.maximum(distance2 - depth**2, 0.0), np.inf), np.sqrt(distance2)

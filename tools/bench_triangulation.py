@@ -1,0 +1,90 @@
+"""How fast objects are triangulated: one batch against a loop of scipy over the objects, in the same run.
+
+    python tools/bench_triangulation.py [--objects 1000] [--rays 50] [--outliers 0.2] [--device cpu]
+
+prints time and rays per second of Eq. 1 in one batch, of scipy (BFGS with the analytic gradient, from the same start), their
+ratio and how far apart the solutions are; then of the whole triangulation (consensus, Eq. 1, covariance).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+from scipy.optimize import minimize
+
+from objslam import config
+from objslam.triangulation import closed_form, solve_eq1, triangulate
+
+
+def scene(objects: int, rays: int, outliers: float, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays (origins, directions, object index) from 2 to 5 m around each object; a share of them points elsewhere."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-20, 20, size=(objects, 1, 3))
+    away = rng.normal(size=(objects, rays, 3)) * [1, 1, 0.2]
+    away *= rng.uniform(2, 5, size=(objects, rays, 1)) / np.linalg.norm(away, axis=2, keepdims=True)
+    directions = -away / np.linalg.norm(away, axis=2, keepdims=True) + noise * rng.normal(size=away.shape)
+    wrong = rng.random((objects, rays, 1)) < outliers
+    directions += np.where(wrong, 0.5, 0.0) * rng.normal(size=away.shape)
+    return (places + away).reshape(-1, 3), directions.reshape(-1, 3), np.repeat(np.arange(objects), rays)
+
+
+def scipy_loop(origins: np.ndarray, directions: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Eq. 1 with scipy, one object after the other: rays (N, K, 3), start (N, 3); solutions (N, 3)."""
+    unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    solutions = np.empty_like(start)
+    for i, (m, n) in enumerate(zip(origins, unit, strict=True)):
+
+        def cost(o: np.ndarray, m: np.ndarray = m, n: np.ndarray = n) -> tuple[float, np.ndarray]:
+            offset = o - m
+            offset = offset - n * (offset * n).sum(axis=1, keepdims=True)
+            distance = np.linalg.norm(offset, axis=1)
+            return float(distance.sum()), (offset / distance[:, None]).sum(axis=0)
+
+        solutions[i] = minimize(cost, start[i], jac=True, method="BFGS", options={"gtol": 1e-8}).x
+    return solutions
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--objects", type=int, default=1000)
+    parser.add_argument("--rays", type=int, default=50)
+    parser.add_argument("--outliers", type=float, default=0.2, help="share of rays that point elsewhere")
+    parser.add_argument("--noise", type=float, default=0.006, help="rad")
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+    parser.add_argument("--repeat", type=int, default=5, help="the fastest of so many runs counts (scipy: one run)")
+    args = parser.parse_args()
+    rays = scene(args.objects, args.rays, args.outliers, args.noise)
+    number = args.objects * args.rays
+    start, _ = closed_form(*rays, args.objects)
+    settings = config.Triangulation(device=args.device)
+
+    def fastest(work) -> float:
+        work()  # the first call imports torch
+        times = []
+        for _ in range(args.repeat):
+            begin = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - begin)
+        return min(times)
+
+    batch = fastest(lambda: solve_eq1(*rays, args.objects, device=args.device))
+    whole = fastest(lambda: triangulate(*rays, args.objects, args.noise, settings))
+    begin = time.perf_counter()
+    shape = (args.objects, args.rays, 3)
+    reference = scipy_loop(rays[0].reshape(shape), rays[1].reshape(shape), start)
+    loop = time.perf_counter() - begin
+    points, _, gradient = solve_eq1(*rays, args.objects, device=args.device)
+    apart = np.linalg.norm(points - reference, axis=1)
+    print(f"{args.objects} objects x {args.rays} rays, {100 * args.outliers:g} % of them wrong, device {args.device}")
+    for name, seconds in (("Eq. 1, one batch", batch), ("Eq. 1, scipy loop", loop), ("whole triangulation", whole)):
+        print(f"{name:<22}{seconds:9.3f} s{number / seconds:14,.0f} rays/s")
+    print(f"the batch is {loop / batch:.1f} times as fast as the loop")
+    print(
+        f"solutions apart: median {np.median(apart):.1e} m, most {apart.max():.1e} m; gradient at most {gradient.max():.1e}"
+    )
+
+
+if __name__ == "__main__":
+    main()
