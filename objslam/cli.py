@@ -262,7 +262,7 @@ def main() -> NoReturn:
     except MemoryError:
         _say("objslam: out of memory", stderr=True)
         sys.exit(1)
-    except Exception as error:  # noqa: BLE001 - the last resort: no traceback reaches a user
+    except Exception as error:  # the last resort: no traceback reaches a user
         if debug:
             raise
         _say(

@@ -34,11 +34,16 @@ class RayNoise(Section):
 
     pixel_sigma: Positive = 3.0
     """px; one standard deviation of a box centre, per axis."""
+    box_sigma: NotNegative = 0.05
+    """share of a box's size (geometric mean of width and height) by which its centre wanders besides."""
     min_score: NotNegative = 0.0
     """boxes with a lower score are dropped and counted."""
     border: Annotated[float, Field(allow_inf_nan=False)] = 1.0
     """px; a box that comes this close to the image's edge is cut off there, its centre is not the object's: dropped and
     counted. A negative number keeps such boxes."""
+    border_share: NotNegative = 0.05
+    """share of a box's own width or height that counts as close to the edge as well: detectors let cut boxes end short of
+    it."""
 
 
 class Depth(Section):
@@ -49,6 +54,9 @@ class Depth(Section):
     """m; the part of the noise that does not depend on the distance."""
     sigma_per_m: NotNegative = 0.02
     """m per m; the part that grows with it."""
+    bias: NotNegative = 0.05
+    """m; the error that all ranges of one object share (they end on its surface, or were calibrated a little long), which no
+    number of them averages out."""
 
 
 class Odometry(Section):
@@ -86,6 +94,22 @@ class Localization(Section):
     """m."""
     yaw: Positive = 0.005
     """rad."""
+
+
+class AssociationSettings(Section):
+    """Which ray belongs to which object."""
+
+    method: Literal["auto", "global", "by_label"] = "auto"
+    """by_label: every label is one object. global: several objects may share a label. auto: by_label where no frame has two
+    boxes of one label, else global."""
+    hypotheses: Annotated[int, Field(ge=16)] = 1024
+    """points tried at a time for each label, from pairs of rays."""
+    gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
+    """share of the right boxes that pass the gate on how far a ray may pass its object."""
+    min_existence: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """objects that exist less likely than this, by where they were detected and where not, are dropped."""
+    fuse_labels: bool = True
+    """objects of different labels that are one thing become one object with several labels."""
 
 
 class Triangulation(Section):
@@ -141,6 +165,7 @@ class Settings(Section):
     odometry: Odometry = Odometry()
     planar: Planar = Planar()
     localization: Localization = Localization()
+    association: AssociationSettings = AssociationSettings()
     triangulation: Triangulation = Triangulation()
     fixed: Fixed = Fixed()
     joint: Joint = Joint()

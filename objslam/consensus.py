@@ -199,7 +199,10 @@ def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tu
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Midpoints (B, H, 3) of closest approach of two rays (B, H), and whether they lie ahead of both."""
+    """Midpoints (B, H, 3) of closest approach of two rays (B, H), and whether they have one: parallel rays do not.
+
+    Behind a ray it is no less a candidate, but that ray does not agree with it.
+    """
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
     cos = (n1 * n2).sum(-1)
@@ -210,7 +213,7 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
     along1, along2 = (a - cos * b) / sin2, (cos * a - b) / sin2
     one = bundle.origin[first] + along1[..., None] * n1
     two = bundle.origin[second] + along2[..., None] * n2
-    return 0.5 * (one + two), valid & (along1 > 0) & (along2 > 0)
+    return 0.5 * (one + two), valid
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:

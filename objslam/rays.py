@@ -60,7 +60,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
             (
                 keyframe_of_frame[boxes.frame],
                 directions,
-                _angle_sigma(camera, directions, settings.rays.pixel_sigma),
+                _angle_sigma(camera, directions, _centre_sigma(boxes.boxes, settings)),
                 boxes.depths,
                 names[boxes.label],
                 boxes.scores,
@@ -96,19 +96,25 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     inside = ((centre >= 0) & (centre <= size)).all(axis=1)
     ledger.drop("boxes with their centre outside the image", int((keep & ~inside).sum()), where)
     keep &= inside
-    border = settings.rays.border
+    border = np.maximum(settings.rays.border, settings.rays.border_share * (boxes[:, 2:] - boxes[:, :2]))
     cut = (boxes[:, :2] <= border).any(axis=1) | (boxes[:, 2:] >= size - 1 - border).any(axis=1)
-    if border >= 0:
+    if settings.rays.border >= 0:
         ledger.drop("boxes cut off by the image's edge (rays.border)", int((keep & cut).sum()), where)
         keep &= ~cut
     return keep
 
 
-def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: float) -> Floats:
+def _centre_sigma(boxes: Floats, settings: Settings) -> Floats:
+    """One standard deviation (M,), px, of the centres of boxes (M, 4)."""
+    size = np.sqrt(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0).prod(axis=1))
+    return np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * size)
+
+
+def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: Floats) -> Floats:
     # A small angle at `a` off the axis moves a pinhole image by f / cos(a)^2 along the radius and f / cos(a) across it: the
     # (geometric) mean of the two keeps one sigma a ray. A fisheye keeps f throughout.
     if camera.distortion_model == "equidistant":
-        return np.full(len(directions), pixel_sigma / camera.focal)
+        return pixel_sigma / camera.focal
     cos = directions[:, 2]
     return pixel_sigma / camera.focal * cos**1.5
 

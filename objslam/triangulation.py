@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from objslam.consensus import Bundle
 
-# Rays from which CUDA is taken when it is there: fewer are solved on the CPU in less time than CUDA takes to start.
+# Rays from which "auto" takes CUDA. One CPU core solves Eq. 1 for 50,000 rays in 0.12 s and triangulates them in 0.6 s:
+# well below this, CUDA's start alone takes longer. The crossing point itself depends on the card and was not measured.
 _CUDA_PAYS = 200_000
 
 

@@ -242,10 +242,16 @@ class Rays:
 
 @dataclass(frozen=True)
 class Association:
-    """Which ray belongs to which object: object (R,) index or -1; label: (N,) index into the rays' label_names."""
+    """Which ray belongs to which object: object (R,) index or -1; label: (N,) index into the rays' label_names.
+
+    label_weights: (N, L) share of each label in an object's boxes. existence: (N,) probability that there is such an object.
+    Both None where nobody asked.
+    """
 
     object: Ints
     label: Ints
+    label_weights: Floats | None = None
+    existence: Floats | None = None
 
     @property
     def count(self) -> int:

@@ -12,6 +12,7 @@ from objslam import config
 from objslam.triangulation import consensus, solve_eq1, triangulate
 
 TOOLS = Path(__file__).parents[1] / "tools"
+SETTINGS = config.Triangulation()
 VIEW = 1 - math.cos(math.radians(45))
 
 
@@ -59,19 +60,35 @@ def with_wrong(m, n, wrong, rng):
     return np.vstack([m, origins]), np.vstack([n, directions / np.linalg.norm(directions, axis=1, keepdims=True)])
 
 
-def test_the_selection_is_the_best_by_the_criterion_over_all_pairs():
-    rng = np.random.default_rng(0)
-    sigma = 0.004
-    for size, wrong in ((3, 2), (6, 4), (8, 8)):
-        m, n = with_wrong(*view_of(rng.normal(size=3), rng, size, sigma), wrong, rng)
-        inlier, nfa = consensus(m, n, np.zeros(len(m), dtype=int), 1, sigma, config.Triangulation())
-        points = [midpoint(m, n, i, j) for i, j in combinations(range(len(m)), 2)]
-        best = min(log_nfa(p, m, n, sigma)[0] for p in points if p is not None)
-        assert nfa[0] <= best + 1e-9  # Eq. 1 and a new selection may improve on the best pair
-        point, _, _ = solve_eq1(m[inlier], n[inlier], np.zeros(inlier.sum(), dtype=int), 1)
-        value, chosen = log_nfa(point[0], m, n, sigma)
-        assert value == pytest.approx(nfa[0], abs=1e-6)
-        np.testing.assert_array_equal(inlier, chosen)
+def scenes(count, size, wrong, sigma):
+    """Views of objects at the origin with wrong rays among them: a list of (origins, directions), and as one batch."""
+    rng = np.random.default_rng(size)
+    parts = [with_wrong(*view_of(np.zeros(3), rng, size, sigma), wrong, rng) for _ in range(count)]
+    m, n = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return parts, (m, n, np.repeat(np.arange(count), size + wrong))
+
+
+@pytest.mark.parametrize(("size", "wrong"), [(3, 2), (5, 2), (6, 4), (8, 3), (8, 8), (12, 8)])
+def test_the_selection_is_at_least_as_good_as_that_of_any_pair(size, wrong):
+    sigma, count = 0.004, 5
+    parts, batch = scenes(count, size, wrong, 2 * sigma)
+    _, nfa = consensus(*batch, count, sigma, SETTINGS)
+    for j, (m, n) in enumerate(parts):
+        points = [midpoint(m, n, *pair) for pair in combinations(range(len(m)), 2)]
+        assert nfa[j] <= min(log_nfa(p, m, n, sigma)[0] for p in points if p is not None) + 1e-6
+
+
+@pytest.mark.parametrize(("size", "wrong"), [(8, 8), (58, 20), (100, 100)])
+def test_the_selection_and_eq_1_agree_in_the_end(size, wrong):
+    sigma, count = 0.004, 10
+    parts, batch = scenes(count, size, wrong, 4 * sigma)
+    inlier, nfa = consensus(*batch, count, sigma, SETTINGS)
+    for j, (m, n) in enumerate(parts):
+        chosen = inlier[batch[2] == j]
+        point, _, _ = solve_eq1(m[chosen], n[chosen], np.zeros(chosen.sum(), dtype=int), 1)
+        value, again = log_nfa(point[0], m, n, sigma)
+        assert value >= nfa[j] - 1e-6  # nothing left to gain
+        assert value > nfa[j] + 1e-6 or (again == chosen).all()
 
 
 def test_fig_1_of_the_paper():
@@ -93,7 +110,7 @@ def test_a_large_object_keeps_its_rays(residual):
     views = [view_of(np.zeros(3), rng, size, residual * sigma / math.sqrt(2)) for _ in range(count)]
     m, n = np.concatenate([v[0] for v in views]), np.concatenate([v[1] for v in views])
     index = np.repeat(np.arange(count), size)
-    result = triangulate(m, n, index, count, sigma, config.Triangulation())
+    result = triangulate(m, n, index, count, sigma, SETTINGS)
     plain, _, _ = solve_eq1(m, n, index, count)
     assert result.ok.all()
     assert result.counts.min() >= 0.9 * size
@@ -112,7 +129,7 @@ def test_wrong_rays_do_not_move_an_object(wrong):
     mixed = [with_wrong(*view, wrong, rng) for view in views]
     index = np.repeat(np.arange(count), good + wrong)
     m, n = (np.concatenate(part) for part in zip(*mixed, strict=True))
-    result = triangulate(m, n, index, count, sigma, config.Triangulation())
+    result = triangulate(m, n, index, count, sigma, SETTINGS)
     clean = np.concatenate([v[0] for v in views]), np.concatenate([v[1] for v in views])
     plain, _, _ = solve_eq1(*clean, np.repeat(np.arange(count), good), count)
     assert result.ok.all()
@@ -126,7 +143,7 @@ def test_a_ray_that_points_away_is_no_inlier():
     rng = np.random.default_rng(3)
     m, n = view_of(np.zeros(3), rng, 10, 0.002)
     n[4] *= -1
-    inlier, nfa = consensus(m, n, np.zeros(10, dtype=int), 1, 0.002, config.Triangulation())
+    inlier, nfa = consensus(m, n, np.zeros(10, dtype=int), 1, 0.002, SETTINGS)
     np.testing.assert_array_equal(np.flatnonzero(~inlier), [4])
     assert nfa[0] < 0
 
@@ -134,17 +151,19 @@ def test_a_ray_that_points_away_is_no_inlier():
 def test_rays_at_random_are_no_object():
     rng = np.random.default_rng(4)
     m, n = rng.uniform(-2, 2, (100 * 10, 3)), rng.normal(size=(100 * 10, 3))
-    result = triangulate(m, n, np.repeat(np.arange(100), 10), 100, 0.005, config.Triangulation())
+    result = triangulate(m, n, np.repeat(np.arange(100), 10), 100, 0.005, SETTINGS)
     assert result.ok.mean() < 0.03
 
 
-def test_a_near_parallel_bundle_keeps_its_rays():
-    """No pair of such rays meets anywhere definite: what they agree on is their direction."""
+@pytest.mark.parametrize("opening", [0.0, 0.01])
+def test_a_bundle_that_meets_nowhere_keeps_its_rays(opening):
+    """Parallel or slightly opening rays: what they agree on is their direction."""
     rng = np.random.default_rng(5)
-    m = np.column_stack([0.02 * rng.normal(size=(12, 2)), rng.uniform(0, 1, 12)])
-    n = np.array([0, 0, 1.0]) + 0.004 * rng.normal(size=(12, 3))
-    inlier, _ = consensus(m, n, np.zeros(12, dtype=int), 1, 0.004, config.Triangulation())
-    assert inlier.all()
+    m = np.column_stack([rng.uniform(-0.3, 0.3, (12, 2)), rng.uniform(0, 1, 12)])
+    n = np.column_stack([opening * m[:, :2], np.ones(12)])
+    m, n = with_wrong(m, n, 3, rng)
+    inlier, _ = consensus(m, n, np.zeros(15, dtype=int), 1, 0.004, SETTINGS)
+    np.testing.assert_array_equal(inlier, np.arange(15) < 12)
 
 
 def test_an_answer_depends_on_neither_order_nor_frame_nor_the_other_objects():

@@ -103,6 +103,19 @@ def test_exact_rays_meet_in_their_point():
     assert norm.max() < 1e-9
 
 
+@pytest.mark.parametrize("noise", [1e-12, 1e-9, 1e-6])
+def test_nearly_exact_rays_are_solved_as_precisely(noise):
+    """Distances 1e12 times smaller than the scene: rounding of its size must stay out of them."""
+    rng = np.random.default_rng(11)
+    m, n, index, _ = rays_around(rng, 100, rng.integers(3, 40, 100), noise=noise)
+    points, _, norm = solve_eq1(m, n, index, 100)
+    start, _ = closed_form(m, n, index, 100)
+    assert norm.max() < 1e-9
+    assert all(
+        cost(points[j], m[index == j], n[index == j]) <= cost(start[j], m[index == j], n[index == j]) for j in range(100)
+    )
+
+
 def test_an_exact_majority_holds_the_point_against_wrong_rays():
     rng = np.random.default_rng(3)
     m, n, _, places = rays_around(rng, 1, [12], noise=0.0)

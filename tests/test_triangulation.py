@@ -172,11 +172,38 @@ def test_ranges_leave_a_position_that_the_rays_carry():
     np.testing.assert_array_equal(ranged.covariance, plain.covariance)
 
 
-def test_one_ray_with_a_range_stands_there_but_is_not_ok():
-    result = triangulate([[1.0, 2, 3]], [[0, 2.0, 0]], [0], 1, 0.01, SETTINGS, ranges=[3.0], range_sigma=0.1)
+def test_ranges_help_where_one_says_more_than_all_rays():
+    """Enough parallax to be ok, but Eq. 1's bias towards the cameras is larger than a range's error."""
+    rng = np.random.default_rng(10)
+    m, n, index, truth = approaching(rng, 50, 40, 0.006, width=0.4)
+    assert triangulate(m, n, index, 50, 0.006, SETTINGS).ok.mean() > 0.9
+    ranges = np.linalg.norm(truth - m, axis=1) + 0.08 * rng.normal(size=len(m))
+    result = triangulate(m, n, index, 50, 0.006, SETTINGS, ranges=ranges, range_sigma=0.08)
+    assert result.ok.all()
+    assert np.linalg.norm(result.positions - truth, axis=1).max() < 0.08
+
+
+@pytest.mark.parametrize("agreeing", [True, False])
+def test_one_ray_with_a_range_stands_there_but_is_not_ok(agreeing):
+    settings = config.Triangulation(consensus=agreeing)
+    result = triangulate([[1.0, 2, 3]], [[0, 2.0, 0]], [0], 1, 0.01, settings, ranges=[3.0], range_sigma=0.1)
     np.testing.assert_allclose(result.positions, [[1, 5, 3]], atol=1e-12)
     np.testing.assert_allclose(result.covariance[0], np.diag([0.03**2, 0.1**2, 0.03**2]), atol=1e-9)
     assert not result.ok[0]
+
+
+def test_map_coordinates_far_from_the_origin_change_nothing():
+    """Coordinates as of a UTM grid: the square of their size has no room for a millimetre."""
+    rng = np.random.default_rng(11)
+    m, n, index = passing(rng, 20, 20, 0.001)
+    n[::4] += 0.5 * rng.normal(size=(100, 3))
+    shift = np.array([4e5, 5e6, 100.0])
+    far = m + shift
+    near = triangulate(far - shift, n, index, 20, 0.001, SETTINGS)
+    result = triangulate(far, n, index, 20, 0.001, SETTINGS)
+    np.testing.assert_array_equal(result.weight, near.weight)
+    np.testing.assert_allclose(result.positions - shift, near.positions, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(result.covariance, near.covariance, rtol=1e-6, atol=1e-15)
 
 
 def test_nothing_to_do():

@@ -1,185 +1,241 @@
-"""Global association with known poses: which box is of which object, when nobody says how many objects there are."""
+"""Global association with known poses: which box is of which object, when nobody says how many objects there are.
+
+Per label, points where rays of different frames meet are scored against all its rays at once; the best are refitted, their rays
+taken out, and what is left is searched again. Then objects are merged, fused across labels and dropped, each by what explains
+the boxes, and the misses, more cheaply.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam import config
 from objslam.association.assign import gate_limit
 from objslam.association.evidence import Rates, chance_odds, detection_rates
 from objslam.association.extent import grouped_median
-from objslam.association.matches import Landmarks, choose, gated_edges, track_bonus, variance
+from objslam.association.landmarks import Landmarks, State, offsets, variance
+from objslam.association.matches import choose, gated_edges, track_bonus
 from objslam.association.refit import refit
 from objslam.association.sightings import Sightings, sight
-from objslam.association.structure import merges
+from objslam.association.structure import RAYLEIGH_MEDIAN, merges
 from objslam.association.visibility import View, Visits, visits
 from objslam.ledger import Ledger
 from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
 
-_SEARCHES = 8
-_SETTLES = 3
-_ROUNDS = 10
-_SUBSAMPLE = 4096
-_NOISE_LIMITS = (0.3, 3.0)
-_POOLED = 30.0
-_RAYLEIGH_MEDIAN = 1.1774
+_TURNS = 8  # searches among the rays that are left
+_ROUNDS = 12  # of merging, and of dropping, at the most
+_SETTLED = 3  # times that assignment and refit take turns after a change
+_SAMPLE = 4096  # rays of one label that a search looks at
+_MIN_RAYS = 3
+_MIN_SUPPORT = 2.5  # of a point in a search, where a ray that fits perfectly counts 1
+_PARALLAX = np.radians(2.0)  # of two rays that make a point
+_NOISE = (0.3, 3.0)
+_POOLED = 30.0  # rays of an object that weigh its own noise as much as that of its class
 
 
 @dataclass(frozen=True)
-class State:
-    """What is believed at the moment: landmarks, and matched (R,), the landmark of each sighting or -1."""
+class _Work:
+    s: Sightings
+    view: View
+    labels: int
+    gate: float
+    settings: config.AssociationSettings
+    device: str
+    seed: int
 
-    landmarks: Landmarks
-    matched: Ints
-
-    @property
-    def number(self) -> Ints:
-        """(N,) rays of each landmark."""
-        return np.bincount(self.matched[self.matched >= 0], minlength=len(self.landmarks))
-
-    def keep(self, which: Bools) -> State:
-        """Only some of the landmarks (N,); the others' rays go free."""
-        number = np.append(np.cumsum(which) - 1, -1)
-        kept = np.append(which, False)
-        return State(self.landmarks.take(which), np.where(kept[self.matched], number[self.matched], -1))
-
-
-def labels_of(s: Sightings, state: State) -> Ints:
-    """How many rays of each label each landmark has, (N, L)."""
-    n, labels = state.landmarks.accepts.shape
-    held = state.matched >= 0
-    return np.bincount(state.matched[held] * labels + s.label[held], minlength=n * labels).reshape(n, labels)
-
-
-def settle(s: Sightings, state: State, gate: float, times: int = _SETTLES) -> State:
-    """Assignment and refit in turns until nothing changes, or for some times."""
-    for _ in range(times):
-        edges = gated_edges(s, state.landmarks, gate)
-        cost = edges.cost - track_bonus(edges, s.track, state.matched)
-        matched = choose(edges, cost, s.frame, gate)
-        same = np.array_equal(matched, state.matched)
-        held = np.flatnonzero(matched >= 0)
-        position, covariance = refit(s, held, matched[held], state.landmarks.position, state.landmarks.noise)
-        landmarks = state.landmarks.placed(position, covariance)
-        state = State(landmarks, matched)
-        state = replace(state, landmarks=replace(landmarks, noise=_noise(s, state)))
-        state = state.keep((state.number >= 3) & np.isfinite(position).all(axis=1))
-        if same:
-            break
-    return state
-
-
-def _noise(s: Sightings, state: State) -> Floats:
-    held = np.flatnonzero(state.matched >= 0)
-    index = state.matched[held]
-    n = len(state.landmarks)
-    to = state.landmarks.position[index] - s.origin[held]
-    depth = np.einsum("ri,ri->r", to, s.direction[held])
-    offset = np.sqrt(np.maximum((to * to).sum(axis=1) - depth**2, 0))
-    rel = offset / np.sqrt(variance(s.take(held), np.linalg.norm(to, axis=1), np.ones(len(held)))) / _RAYLEIGH_MEDIAN
-    kind = labels_of(s, state).argmax(axis=1)
-    L = state.landmarks.accepts.shape[1]
-    number = np.bincount(index, minlength=n)
-    pooled = grouped_median(rel, kind[index], L)
-    num_c = np.bincount(kind[index], minlength=L)
-    pooled = np.where(num_c > 0, (num_c * np.nan_to_num(pooled) + _POOLED) / (num_c + _POOLED), 1.0)
-    own = np.nan_to_num(grouped_median(rel, index, n), nan=1.0)
-    noise = (number * own + _POOLED * pooled[kind]) / (number + _POOLED)
-    return np.clip(noise, *_NOISE_LIMITS)
-
-
-def explore(s: Sightings, state: State, gate: float, parallax: float, settings, seed: int, turn: int) -> State:
-    from objslam.association.hypotheses import Search, discover
-
-    labels = state.landmarks.accepts.shape[1]
-    found, kinds = [], []
-    for label in np.unique(s.label):
-        free = np.flatnonzero((s.label == label) & (state.matched < 0))
-        if len(free) < 3:
-            continue
-        rng = np.random.default_rng([seed, turn, int(label)])
-        if len(free) > _SUBSAMPLE:
-            frames = np.unique(s.frame[free])
-            some = rng.permutation(frames)[: int(len(frames) * _SUBSAMPLE / len(free))]
-            free = free[np.isin(s.frame[free], some)]
-        search = Search(1024, 2.5, gate, parallax, "cpu")
-        points = discover(s.take(free), search, rng)
-        found.append(points)
-        kinds.append(np.full(len(points), label))
-    kind = np.concatenate(kinds) if kinds else np.zeros(0, dtype=np.int64)
-    if not len(kind):
-        return state
-    accepts = np.zeros((len(kind), labels), dtype=bool)
-    accepts[np.arange(len(kind)), kind] = True
-    old = state.landmarks
-    n = len(kind)
-    joined = Landmarks(
-        np.concatenate([old.position, *found]),
-        np.concatenate([old.covariance, np.zeros((n, 3, 3))]),
-        np.concatenate([old.noise, np.ones(n)]),
-        np.concatenate([old.accepts, accepts]),
-    )
-    return State(joined, state.matched)
+    def visits(self, state: State) -> Visits:
+        return visits(self.s, state.matched, state.landmarks.position, state.kind(self.s), self.view)
 
 
 def associate(
     rays: Rays,
     keyframes: Keyframes,
     cameras: tuple[Camera, ...],
-    settings,
+    settings: config.Settings,
     *,
     map_T_camera: Floats,
     sigma: Floats,
-    position_sigma: float,
+    position_sigma: float = 0.0,
     seed: int = 0,
     ledger: Ledger | None = None,
-    debug: bool = False,
-    share: float = 0.0,
-):
+) -> Association:
+    """Which ray belongs to which object, at the camera poses (K, 4, 4) of the keyframes.
+
+    keyframes: all frames that were looked at, those without any box too: what was not seen counts as well. sigma: (R,) rad and
+    position_sigma: m, the noise of the rays with that of the poses. Objects come sorted by label, then by the frame that saw
+    them first; nothing else depends on the order of rays and keyframes. Rays that no object at rest explains have no object;
+    the ledger counts them.
+    """
     s, ray, keyframe = sight(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = View(cameras, keyframes.camera[keyframe], map_T_camera[keyframe], settings.rays.border, share)
-    gate = gate_limit(0.999)
-    labels = len(rays.label_names)
-    state = State(Landmarks(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, labels), dtype=bool)), np.full(len(s), -1))
-    for turn in range(_SEARCHES):
+    view = View(cameras, keyframes.camera[keyframe], map_T_camera[keyframe], settings.rays.border, settings.rays.border_share)
+    gate = gate_limit(settings.association.gate)
+    work = _Work(s, view, len(rays.label_names), gate, settings.association, _device(settings), seed)
+    nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), work.labels)
+    state = State(nothing, np.full(len(s), -1, dtype=np.int64))
+    for turn in range(_TURNS):
         before = len(state.landmarks)
-        state = explore(s, state, gate, np.radians(2.0), settings, seed, turn)
+        state = _merge_round(work, _not_by_chance(work, _settle(work, _explore(work, state, turn, _PARALLAX), 2)))
+        if len(state.landmarks) <= before:
+            break
+    state = _merge_all(work, state, across_labels=False)
+    if settings.association.fuse_labels:
+        state = _merge_all(work, state, across_labels=True)
+    state, existence = _drop_phantoms(work, state)
+    return _result(work, state, existence, rays, ray, ledger)
+
+
+def _device(settings: config.Settings) -> str:
+    """Scoring pays on CUDA whenever it is there."""
+    if settings.triangulation.device != "auto":
+        return settings.triangulation.device
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _explore(work: _Work, state: State, turn: int, parallax: float) -> State:
+    """Landmarks added where the rays that no landmark has agree, label by label."""
+    from objslam.association.hypotheses import Search, discover
+
+    noise = _class_noise(work, state)
+    landmarks = state.landmarks
+    for label in np.unique(work.s.label[state.matched < 0]).tolist():
+        free = np.flatnonzero((work.s.label == label) & (state.matched < 0))
+        if len(free) < _MIN_RAYS:
+            continue
+        rng = np.random.default_rng([work.seed, turn, label])
+        if len(free) > _SAMPLE:
+            frames = np.unique(work.s.frame[free])
+            some = rng.permutation(frames)[: int(len(frames) * _SAMPLE / len(free))]
+            free = free[np.isin(work.s.frame[free], some)]
+        pool = work.s.take(free)
+        pool = replace(pool, sigma=pool.sigma * noise[label], place=pool.place * noise[label])
+        search = Search(work.settings.hypotheses, _MIN_SUPPORT, work.gate, parallax, work.device)
+        points = discover(pool, search, rng)
+        new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), work.labels)
+        landmarks = landmarks.and_also(new)
+    return State(landmarks, state.matched)
+
+
+def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
+    """Assignment and refit in turns, until nothing changes or for some times."""
+    for _ in range(times):
+        edges = gated_edges(work.s, state.landmarks, work.gate)
+        matched = choose(edges, edges.cost - track_bonus(edges, work.s.track, state.matched), work.s.frame, work.gate)
+        same = np.array_equal(matched, state.matched)
+        held = np.flatnonzero(matched >= 0)
+        old = state.landmarks
+        position, covariance = refit(work.s, held, matched[held], old.position, old.noise)
+        state = State(replace(old, position=position, covariance=covariance), matched)
+        state = State(replace(state.landmarks, noise=_noise(work, state)), matched)
+        state = state.keep((state.number >= _MIN_RAYS) & np.isfinite(position).all(axis=1))
+        if same:
+            break
+    return state
+
+
+def _deviations(work: _Work, state: State) -> tuple[Floats, Ints]:
+    """By how many (assumed) standard deviations each ray with a landmark passes it, and which landmark that is: (P,)."""
+    held = np.flatnonzero(state.matched >= 0)
+    index, r = state.matched[held], work.s.take(held)
+    off2, distance = offsets(r, state.landmarks.position[index])
+    return np.sqrt(off2 / variance(r, distance, np.ones(len(r)))), index
+
+
+def _class_noise(work: _Work, state: State) -> Floats:
+    """By what factor (L,) the rays of each label are noisier than assumed, drawn to 1 where they are few."""
+    deviation, index = _deviations(work, state)
+    kind = state.kind(work.s)[index]
+    number = np.bincount(kind, minlength=work.labels)
+    middle = np.nan_to_num(grouped_median(deviation, kind, work.labels)) / RAYLEIGH_MEDIAN
+    return np.clip((number * middle + _POOLED) / (number + _POOLED), *_NOISE)
+
+
+def _noise(work: _Work, state: State) -> Floats:
+    """The same factor for each landmark (N,), drawn to that of its class."""
+    deviation, index = _deviations(work, state)
+    own = np.minimum(np.nan_to_num(grouped_median(deviation, index, len(state.landmarks))) / RAYLEIGH_MEDIAN, _NOISE[1])
+    of_class = _class_noise(work, state)[state.kind(work.s)]
+    return np.clip((state.number * own + _POOLED * of_class) / (state.number + _POOLED), *_NOISE)
+
+
+def _not_by_chance(work: _Work, state: State) -> State:
+    """Only landmarks whose rays are more than strays that meet."""
+    return state.keep(chance_odds(work.s, state, state.kind(work.s), work.visits(state), work.view, work.gate) >= 0)
+
+
+def _merge_round(work: _Work, state: State, across_labels: bool = False) -> State:
+    if len(state.landmarks) < 2:
+        return state
+    kind, seen = state.kind(work.s), work.visits(state)
+    rates = detection_rates(seen, kind, work.labels)
+    target = merges(work.s, state, kind, seen, rates, work.gate, across_labels)
+    if (target == np.arange(len(target))).all():
+        return state
+    return _settle(work, state.merge(target))
+
+
+def _merge_all(work: _Work, state: State, across_labels: bool) -> State:
+    for _ in range(_ROUNDS):
+        before = len(state.landmarks)
+        state = _merge_round(work, state, across_labels)
         if len(state.landmarks) == before:
             break
-        state = settle(s, state, gate, 2)
-        kind = labels_of(s, state).argmax(axis=1)
-        seen = visits(s, state.matched, state.landmarks.position, kind, view)
-        o2 = chance_odds(s, state.matched, state.landmarks.noise, state.landmarks.position, kind, seen, view, gate)
-        if debug: print("turn", turn, len(state.landmarks), (o2<0).sum(), (state.matched < 0).sum())
-        state = state.keep(o2 >= 0)
-        if len(state.landmarks) <= before: break
-    for fuse in (False, True):
-        for round_ in range(_ROUNDS):
-            kind = labels_of(s, state).argmax(axis=1)
-            seen = visits(s, state.matched, state.landmarks.position, kind, view)
-            rates = detection_rates(seen, kind)
-            target = merges(s, state.landmarks, state.matched, kind, seen, rates, gate, fuse)
-            gone = target != np.arange(len(target))
-            if debug: print("round", fuse, round_, len(state.landmarks), "merged", gone.sum(), "rates", rates.mean.round(2), rates.concentration)
-            if not gone.any():
-                break
-            accepts = state.landmarks.accepts.copy()
-            np.logical_or.at(accepts, target, state.landmarks.accepts)
-            state = State(replace(state.landmarks, accepts=accepts), np.append(target, -1)[state.matched])
-            state = state.keep(~gone)
-            state = settle(s, state, gate)
-    for _ in range(_ROUNDS):
-        kind = labels_of(s, state).argmax(axis=1)
-        seen = visits(s, state.matched, state.landmarks.position, kind, view)
-        rates = detection_rates(seen, kind)
-        o1 = rates.log_odds(seen, kind)
-        o2 = chance_odds(s, state.matched, state.landmarks.noise, state.landmarks.position, kind, seen, view, gate)
-        exist = 1 / (1 + np.exp(-o1)) / (1 + np.exp(-o2))
-        if debug: print("exist", len(exist), (exist < 0.5).sum(), rates.concentration)
-        if (exist >= 0.5).all():
-            break
-        state = state.keep(exist >= 0.5)
-        state = settle(s, state, gate)
-    return s, ray, state, seen, rates, kind, exist
+    return state
+
+
+def _drop_phantoms(work: _Work, state: State) -> tuple[State, Floats]:
+    """Only landmarks that exist more likely than the settings ask for, and that likelihood (N,)."""
+    while True:
+        existence = _existence(work, state)
+        failing = existence < work.settings.min_existence
+        if not failing.any():
+            return state, existence
+        state = _settle(work, state.keep(~(failing & ~_has_weaker(work, state, failing))))
+
+
+def _existence(work: _Work, state: State) -> Floats:
+    kind, seen = state.kind(work.s), work.visits(state)
+    rates = detection_rates(seen, kind, work.labels)
+    by_rate = rates.log_odds(seen, kind)
+    by_chance = chance_odds(work.s, state, kind, seen, work.view, work.gate)
+    return np.asarray(1 / (1 + np.exp(-by_rate)) / (1 + np.exp(-by_chance)))
+
+
+def _has_weaker(work: _Work, state: State, failing: Bools) -> Bools:
+    """Whether a weaker failing landmark (N,) stands so near that it may hold boxes of this one: it has to go first."""
+    from scipy.spatial import cKDTree
+
+    which = np.flatnonzero(failing)
+    kind, number, position = state.kind(work.s), state.number, state.landmarks.position
+    held = np.flatnonzero(state.matched >= 0)
+    r, index = work.s.take(held), state.matched[held]
+    distance = np.linalg.norm(position[index] - r.origin, axis=1)
+    blur = grouped_median(np.sqrt(variance(r, distance, state.landmarks.noise[index])), index, len(number))
+    result = np.zeros(len(failing), dtype=bool)
+    reach = 2 * np.sqrt(work.gate) * np.nan_to_num(blur)
+    pairs = cKDTree(position[which]).query_pairs(float(reach[which].max(initial=0.0)), output_type="ndarray")
+    a, b = which[pairs[:, 0]], which[pairs[:, 1]]
+    near = (np.linalg.norm(position[a] - position[b], axis=1) <= reach[a] + 0 * reach[b]) & (kind[a] == kind[b])
+    a, b = a[near], b[near]
+    result[np.where(number[a] > number[b], a, b)] = True
+    return result
+
+
+def _result(work: _Work, state: State, existence: Floats, rays: Rays, ray: Ints, ledger: Ledger | None) -> Association:
+    counts, kind = state.labels(work.s), state.kind(work.s)
+    count = len(kind)
+    first = np.full(count, len(work.s))
+    held = np.flatnonzero(state.matched >= 0)
+    np.minimum.at(first, state.matched[held], held)
+    order = np.lexsort((first, kind))
+    number = np.append(np.empty(count, dtype=np.int64), -1)
+    number[order] = np.arange(count)
+    matched = np.empty(len(rays), dtype=np.int64)
+    matched[ray] = number[state.matched]
+    if ledger is not None:
+        ledger.drop("boxes that no object at rest explains", int((matched < 0).sum()))
+    weights = counts[order] / np.maximum(counts[order].sum(axis=1, keepdims=True), 1)
+    return Association(matched, kind[order], weights, existence[order])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -31,8 +31,8 @@ _ROUNDS = 4
 """Outliers are looked for again at the solved poses until nothing changes, this often at the most."""
 _OUTLIER = 4.0
 """A ray that misses its object by so many standard deviations is an outlier: 3e-4 of the good ones are."""
-_LOST = 0.4
-"""An object that fewer than this share of its rays support is placed anew."""
+_SURE = 0.95
+"""An object that fewer than this share of its rays agree with is asked for a second time."""
 _WIDEST = 5.0
 """An object's rays may be so many times as noisy as assumed (a large object's box centres are)."""
 _RAYLEIGH_MEDIAN = 1.1774
@@ -83,12 +83,13 @@ def solve_fixed(
 ) -> Estimate:
     """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
 
-    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's. The other losses weigh each ray by its noise
-    across at the object's distance, and take a measured range as a factor along the ray. Objects that the triangulation left
-    unresolved stay out.
+    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's, which also places the objects that need
+    their ranges for it. The other losses weigh each ray by its noise across at the object's distance, and take a measured
+    range as a factor along the ray. Objects that the triangulation left unresolved stay out.
     """
     loss = settings.fixed.loss
-    used = np.flatnonzero((association.object >= 0) & (start.weight > 0) & start.ok[association.object])
+    member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
+    used = np.flatnonzero((association.object >= 0) & (start.weight > 0) & member[association.object])
     landmark = association.object[used]
     origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
     angle, place = _pose_noise(rays, keyframes, settings)
@@ -107,7 +108,7 @@ def solve_fixed(
     positions = start.positions.copy()
     positions[landmarks] = read_points(optimum.values)
     distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
-    weight = np.zeros(len(rays))
+    weight = start.weight.copy()
     weight[used] = _weights(loss, distance / across, optimum)
     covariance = start.covariance
     if loss != "l1":
@@ -120,7 +121,7 @@ def solve_fixed(
         map_T_base=keyframes.map_T_base,
         positions=positions,
         covariance=covariance,
-        solved=np.isin(np.arange(association.count), landmarks),
+        solved=start.ok,
         weight=weight,
         cost_before=optimum.cost_before,
         cost_after=optimum.cost_after,
@@ -138,21 +139,18 @@ def solve_joint(
 ) -> Estimate:
     """Poses and objects together, from a start that holds: the localisation's poses, or the graph grown along the odometry.
 
-    After each solve, rays that miss their object by far more than its others do are rejected, or taken back; objects that
-    the poses now carry enter, and those that hardly any ray supports are placed anew, until nothing changes.
+    After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
+    that the poses now carry, or place better, enter or move, until nothing changes.
     """
+    rays = _share_bias(rays, association, settings)
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
         map_T_camera, positions = grow(keyframes, rays, association, settings, progress)
-    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     used = np.zeros(len(rays), dtype=bool)
     optimum, cost_before, iterations = None, np.nan, 0
     for _ in range(_ROUNDS):
-        supported = _supported(rays, association, map_T_camera, positions, used)
-        lost = np.bincount(association.object[supported], minlength=association.count) < _LOST * number
-        positions = _place(lost, map_T_camera, keyframes, rays, association, positions, settings)
-        supported = _supported(rays, association, map_T_camera, positions, used)
+        positions, supported = _second_opinion(map_T_camera, keyframes, rays, association, positions, used, settings)
         if optimum is not None and (supported == used).all():
             break
         used = supported
@@ -187,24 +185,37 @@ def solve_joint(
     )
 
 
-def _place(
-    lost: Bools,
+def _second_opinion(
     map_T_camera: Floats,
     keyframes: Keyframes,
     rays: Rays,
     association: Association,
     positions: Floats,
+    used: Bools,
     settings: Settings,
-) -> Floats:
-    """Positions (N, 3) with those of the lost objects (N,) from a consensus of their rays, NaN where there is none."""
-    positions = np.where(lost[:, None], np.nan, positions)
-    which = (association.object >= 0) & lost[association.object]
-    if which.any():
-        objects, index = np.unique(association.object[which], return_inverse=True)
-        some = Association(index, association.label[objects])
-        placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, settings)
-        positions[objects[placed.ok]] = placed.positions[placed.ok]
-    return positions
+) -> tuple[Floats, Bools]:
+    """Positions (N, 3), NaN where there is none, and the rays (R,) that agree with them.
+
+    An object that some of its rays disagree with, or that has no place yet, is asked for by consensus of all its rays at
+    these poses, and moved where more of them agree.
+    """
+    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
+    supported = _supported(rays, association, map_T_camera, positions, used)
+    support = np.bincount(association.object[supported], minlength=association.count)
+    doubtful = support < _SURE * number
+    which = (association.object >= 0) & doubtful[association.object]
+    if not which.any():
+        return positions, supported
+    objects, index = np.unique(association.object[which], return_inverse=True)
+    some = Association(index, association.label[objects])
+    placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, settings)
+    other = positions.copy()
+    other[objects[placed.ok]] = placed.positions[placed.ok]
+    gained = np.bincount(
+        association.object[_supported(rays, association, map_T_camera, other, used)], minlength=len(support)
+    )
+    positions = np.where((gained > support)[:, None], other, positions)
+    return positions, _supported(rays, association, map_T_camera, positions, used)
 
 
 def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
@@ -257,6 +268,18 @@ def _solve(
     if loss == "gnc":
         return graduated(graph, values, settings.joint.max_iterations, known_inliers)
     return levenberg_marquardt(graph, values, settings.joint.max_iterations, tolerance)
+
+
+def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
+    """The rays with the noise of ranges widened so that all of an object's together say no more than their shared bias lets.
+
+    n ranges of noise s that share a bias b have a mean of variance b^2 + s^2 / n: that of n independent ones of s^2 + n b^2.
+    """
+    ranged = np.isfinite(rays.range) & (association.object >= 0)
+    number = np.bincount(association.object[ranged], minlength=association.count)
+    sigma = rays.range_sigma.copy()
+    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * settings.depth.bias**2)
+    return replace(rays, range_sigma=sigma)
 
 
 def _pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:

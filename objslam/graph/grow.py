@@ -25,6 +25,9 @@ _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 step twice as long; above, a step is taken back and tried again shorter. The MRCLAM robots converge to the same map with
 anything from 1 and 3 to 5 and 15 degrees, and with iSAM2 in place of full solves they do not (settings of it that took half
 the time lost robot 1 or 5)."""
+_GATE, _GATE_SHARE = np.radians(5.0), 3.0
+"""A ray off by more than this, and than so many times what is usual in its step, is left out while the graph grows."""
+_FEWEST = 4  # rays that must agree on a landmark before it enters: with fewer, false boxes agree by chance too often
 _SHORTEST = 4  # of joint.grow_step, the part that a step is never shorter than
 _L1_RADIANS = 1e-4
 _EQ1_SIGMA = 0.05  # m; Eq. 1 knows no noise of its own: this weighs its metres against the odometry
@@ -56,16 +59,23 @@ def grow(
 
         known = np.append(np.isfinite(positions[:, 0]), False)  # object -1 is the last
         so_far = association.object[: first_ray[end]]
-        waiting = np.flatnonzero((so_far >= 0) & ~known[so_far])
-        born, places = _births(rays, association, map_T_camera, waiting, settings)
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
-        fresh = np.concatenate([new[known[association.object[new]]], waiting[np.isin(so_far[waiting], born)]])
+        fresh = new[known[so_far[new]]]
+        off = _off(rays, association, map_T_camera, positions, fresh)
+        born, places, agreeing = _births(
+            rays, association, map_T_camera, np.flatnonzero((so_far >= 0) & ~known[so_far]), settings
+        )
         expected = positions.copy()
         expected[born] = places
-        surprise = _surprise(rays, association, map_T_camera, expected, fresh)
+        surprise = (
+            np.median(np.concatenate([off, _off(rays, association, map_T_camera, expected, agreeing)]))
+            if len(off) + len(agreeing)
+            else _HOLDS
+        )
         if surprise > _FAILS and step > shortest:
             step = max(step // 4, shortest)
             continue
+        fresh = np.concatenate([fresh[off <= max(_GATE, _GATE_SHARE * np.median(off))], agreeing]) if len(off) else agreeing
         positions = expected
         for group in (
             factors.betweens(motion[begin - 1 : end - 1], covariance[begin - 1 : end - 1], begin - 1),
@@ -88,12 +98,9 @@ def grow(
     return map_T_camera, positions
 
 
-def _surprise(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, which: Ints) -> float:
-    """The median angle (rad) between rays and their landmarks as expected; nothing seen is neither good nor bad."""
-    if len(which) == 0:
-        return float(_HOLDS)
+def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, which: Ints) -> Floats:
     origins, directions = rays.take(which).in_map(map_T_camera)
-    return float(np.median(angles_off(origins, directions, positions[association.object[which]])))
+    return angles_off(origins, directions, positions[association.object[which]])
 
 
 def ray_factors(rays: Rays, landmark: Ints, which: Ints, loss: Loss, settings: Settings) -> list[gtsam.NonlinearFactor]:
@@ -126,23 +133,25 @@ def anchor(map_T_camera: Floats) -> gtsam.NonlinearFactor:
 
 def _births(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
-) -> tuple[Ints, Floats]:
+) -> tuple[Ints, Floats, Ints]:
+    """Landmarks (n,) that the waiting rays carry now, where (n, 3), and which of the rays agree on them."""
     if len(waiting) == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    labels, index = np.unique(association.object[waiting], return_inverse=True)
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), waiting
+    landmarks, index = np.unique(association.object[waiting], return_inverse=True)
     some = rays.take(waiting)
     origins, directions = some.in_map(map_T_camera)
     found = triangulate(
         origins,
         directions,
         index,
-        len(labels),
+        len(landmarks),
         some.sigma,
         settings.triangulation,
         seed=settings.seed,
         ranges=some.range if np.isfinite(some.range).any() else None,
         range_sigma=some.range_sigma,
     )
-    ranged = np.bincount(index, np.isfinite(some.range), len(labels)) > 0
-    ready = found.ok & (ranged | (found.parallax >= np.radians(settings.joint.min_parallax_deg)))
-    return labels[ready], found.positions[ready]
+    ranged = np.bincount(index, np.isfinite(some.range), len(landmarks)) > 0
+    ready = found.ok & (found.counts >= _FEWEST)
+    ready &= ranged | (found.parallax >= np.radians(settings.joint.min_parallax_deg))
+    return landmarks[ready], found.positions[ready], waiting[ready[index] & (found.weight > 0)]
