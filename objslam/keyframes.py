@@ -94,6 +94,17 @@ def _sharing(localization: Trajectory, stamps: Floats) -> float:
     return max(1.0, len(stamps) / max(float(measured), 1.0))
 
 
+def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats) -> Trajectory:
+    """The whole path, moved as its keyframes were: at their stamps (K,) from poses before to poses after, (K, 4, 4) each.
+
+    Between two keyframes the correction goes over from the one's to the other's; beyond the first and last it stays.
+    """
+    stamps, first = np.unique(stamps, return_index=True)
+    correction = after[first] @ inverse(before[first])
+    at, _ = interpolate(stamps, correction, np.clip(path.stamps, stamps[0], stamps[-1]), np.inf)
+    return Trajectory(path.stamps, at @ path.poses)
+
+
 def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> Floats:
     """Covariance (Q, 6, 6) that the odometry has gathered by each of the stamps (Q,), in the frame of its first pose.
 

@@ -16,7 +16,7 @@ from objslam.association.by_label import associate_by_label
 from objslam.config import Settings
 from objslam.errors import SolveError
 from objslam.geometry import widest_angle
-from objslam.keyframes import build_keyframes
+from objslam.keyframes import build_keyframes, correct_path
 from objslam.ledger import Ledger
 from objslam.rays import angles_off, build_rays
 from objslam.results import RunResult
@@ -85,6 +85,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         settings=settings,
         cameras=tuple(c.camera for c in log.cameras),
         path=path,
+        path_after=correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base),
     )
 
 

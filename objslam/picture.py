@@ -116,7 +116,7 @@ def _draw_rays(axes: Any, result: RunResult) -> None:
 
 
 def _draw_paths(axes: Any, result: RunResult) -> None:
-    before, after = result.path.poses[:, :2, 3], result.map_T_base[:, :2, 3]
+    before, after = result.path.poses[:, :2, 3], result.path_after.poses[:, :2, 3]
     moved = not np.array_equal(result.map_T_base, result.keyframes.map_T_base)
     if moved:
         axes.plot(*before.T, "--", color=_BEFORE, linewidth=1.0, zorder=2, label="path before")

@@ -43,7 +43,7 @@ class RunResult:
     keyframes: before estimation. map_T_base: (K, 4, 4) after it (the keyframes' own in fixed mode). association: ray ->
     index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
     the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
-    path: the full path that the log brought, at its own rate, before estimation.
+    path: the full path that the log brought, at its own rate, before estimation; path_after: the same path after it.
     """
 
     map: ObjectMap
@@ -59,6 +59,7 @@ class RunResult:
     settings: Settings
     cameras: tuple[Camera, ...]
     path: Trajectory
+    path_after: Trajectory
 
 
 def prepare_output(out: Path) -> None:

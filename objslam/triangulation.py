@@ -5,6 +5,8 @@ Arrays go in and come out as numpy float64; torch does the work and is imported 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -72,6 +74,40 @@ def triangulate(
     ends on an object's surface, its rays meet inside). An object's answer does not depend on the other objects, nor on the
     order of the rays. ValueError for arrays that do not fit or are not finite; ConfigError for a device that is not there.
     """
+    with _one_thread():
+        return _triangulate(
+            origins, directions, object_index, count, sigma, settings, seed, ranges, range_sigma, position_sigma
+        )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for torch: these batches are small, and a pool of threads spins beside other busy processes.
+
+    On a machine of two cores with one of them busy, a run that one thread does in 4 s took two threads up to 18 s.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _triangulate(
+    origins: ArrayLike,
+    directions: ArrayLike,
+    object_index: ArrayLike,
+    count: int,
+    sigma: ArrayLike,
+    settings: config.Triangulation,
+    seed: int,
+    ranges: ArrayLike | None,
+    range_sigma: ArrayLike | None,
+    position_sigma: float,
+) -> Triangulation:
     import torch
 
     from objslam import consensus, uncertainty

@@ -61,7 +61,7 @@ def time_column(stamps: Floats) -> Any:
 def _log_paths(recording: Any, result: RunResult, truth: Truth | None) -> None:
     import rerun as rr
 
-    paths = {"before": (result.path.poses, _BEFORE, 1.0), "after": (result.map_T_base, _AFTER, 2.0)}
+    paths = {"before": (result.path.poses, _BEFORE, 1.0), "after": (result.path_after.poses, _AFTER, 2.0)}
     if truth is not None and truth.trajectory is not None:
         paths["truth"] = (truth.trajectory.poses, _TRUTH, 0.7)
     for name, (poses, colour, width) in paths.items():

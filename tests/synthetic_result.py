@@ -118,6 +118,7 @@ def synthetic_result(
         settings=settings or Settings(mode="joint"),
         cameras=(Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), base_T_camera=OPTICAL),),
         path=Trajectory(stamps, before),
+        path_after=Trajectory(stamps, after),
     )
     truth = Truth(
         tuple(TruthObject(j, labels[j], positions[j]) for j in range(n)),

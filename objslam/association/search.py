@@ -30,6 +30,7 @@ _SETTLED = 3  # times that assignment and refit take turns after a change
 _SAMPLE = 4096  # rays of one label that a search looks at
 _MIN_RAYS = 3
 _MIN_SUPPORT = 2.5  # of a point in a search, where a ray that fits perfectly counts 1
+_CHANCE = 3.0  # log odds against strays that a point needs to be kept in the search
 _PARALLAX = np.radians(2.0)  # of two rays that make a point
 _NOISE = (0.3, 3.0)
 _POOLED = 30.0  # rays of an object that weigh its own noise as much as that of its class
@@ -69,20 +70,24 @@ def associate(
     the ledger counts them.
     """
     s, ray, keyframe = sight(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = View(cameras, keyframes.camera[keyframe], map_T_camera[keyframe], settings.rays.border, settings.rays.border_share)
+    view = View(
+        cameras, keyframes.camera[keyframe], map_T_camera[keyframe], settings.rays.border, settings.rays.border_share
+    )
     gate = gate_limit(settings.association.gate)
     work = _Work(s, view, len(rays.label_names), gate, settings.association, _device(settings), seed)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), work.labels)
     state = State(nothing, np.full(len(s), -1, dtype=np.int64))
     for turn in range(_TURNS):
         before = len(state.landmarks)
-        state = _merge_round(work, _not_by_chance(work, _settle(work, _explore(work, state, turn, _PARALLAX), 2)))
+        state = _settle(work, _explore(work, state, turn, _PARALLAX), 2)
+        state = _merge_round(work, _not_by_chance(work, state))
+        state, _ = _drop_phantoms(work, state, 1)
         if len(state.landmarks) <= before:
             break
     state = _merge_all(work, state, across_labels=False)
     if settings.association.fuse_labels:
         state = _merge_all(work, state, across_labels=True)
-    state, existence = _drop_phantoms(work, state)
+    state, existence = _drop_phantoms(work, state, 1000)
     return _result(work, state, existence, rays, ray, ledger)
 
 
@@ -163,7 +168,7 @@ def _noise(work: _Work, state: State) -> Floats:
 
 def _not_by_chance(work: _Work, state: State) -> State:
     """Only landmarks whose rays are more than strays that meet."""
-    return state.keep(chance_odds(work.s, state, state.kind(work.s), work.visits(state), work.view, work.gate) >= 0)
+    return state.keep(chance_odds(work.s, state, state.kind(work.s), work.visits(state), work.view, work.gate) >= _CHANCE)
 
 
 def _merge_round(work: _Work, state: State, across_labels: bool = False) -> State:
@@ -186,14 +191,15 @@ def _merge_all(work: _Work, state: State, across_labels: bool) -> State:
     return state
 
 
-def _drop_phantoms(work: _Work, state: State) -> tuple[State, Floats]:
+def _drop_phantoms(work: _Work, state: State, times: int) -> tuple[State, Floats]:
     """Only landmarks that exist more likely than the settings ask for, and that likelihood (N,)."""
-    while True:
+    for _ in range(times):
         existence = _existence(work, state)
         failing = existence < work.settings.min_existence
         if not failing.any():
-            return state, existence
+            break
         state = _settle(work, state.keep(~(failing & ~_has_weaker(work, state, failing))))
+    return state, existence
 
 
 def _existence(work: _Work, state: State) -> Floats:

@@ -152,7 +152,8 @@ def _expected_together(visits: Visits, a: Ints, b: Ints) -> Floats:
     """In how many frames (P,) two things should have been detected both, had they been detected independently."""
     every, seen = _table(visits, None), _table(visits, visits.detected)
     both, of_a, of_b = (
-        np.asarray(one[a].multiply(other[b]).sum(axis=1)).ravel() for one, other in ((every, every), (seen, every), (every, seen))
+        np.asarray(one[a].multiply(other[b]).sum(axis=1)).ravel()
+        for one, other in ((every, every), (seen, every), (every, seen))
     )
     return np.asarray(of_a * of_b / np.maximum(both, 1.0))
 

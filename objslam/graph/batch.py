@@ -45,7 +45,7 @@ class Estimate:
 
     map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN where not solved. solved: (N,) whether the
     object was part of the graph. weight: (R,) each ray's robust weight in [0, 1], 0 without object or when rejected. The
-    costs are the errors of the graph that was solved last, at its start and at its optimum.
+    costs are the graph's error at the first start and at the last optimum; for Eq. 1 its sum of distances, m.
     """
 
     map_T_base: Floats
@@ -105,6 +105,7 @@ def solve_fixed(
     graph, landmarks = build_graph(*groups), np.unique(landmark)
     values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
     optimum = _solve(graph, values, loss, settings, range(len(used), graph.size()), tolerance=1e-12)
+    unit = factors.L1_METRES if loss == "l1" else 1.0  # Huber's slope: Eq. 1's sum of distances in metres
     positions = start.positions.copy()
     positions[landmarks] = read_points(optimum.values)
     distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
@@ -123,8 +124,8 @@ def solve_fixed(
         covariance=covariance,
         solved=start.ok,
         weight=weight,
-        cost_before=optimum.cost_before,
-        cost_after=optimum.cost_after,
+        cost_before=optimum.cost_before / unit,
+        cost_after=optimum.cost_after / unit,
         iterations=optimum.iterations,
     )
 
