@@ -162,6 +162,8 @@ def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Align
     warnings = []
     if objects is not None and kind != "none" and 0 < len(objects.matches) < 3:
         warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only: their errors say little")
+    if objects is not None and kind == "none" and objects.false and 2 * len(objects.matches) < len(objects.missed):
+        warnings.append("hardly an object is where the truth has it: is the map in a frame of its own? then --align se2")
     if objects is not None and not 0.5 <= objects.transform.scale <= 2.0:
         warnings.append(f"the map is scaled by {objects.transform.scale:.3g} to fit the truth: do they show the same place?")
     if path is not None and not len(path.errors):

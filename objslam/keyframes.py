@@ -34,12 +34,15 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     order = np.lexsort((camera, stamps))
     camera, frame, stamps, boxes = camera[order], frame[order], stamps[order], boxes[order]
 
-    map_T_base, valid = _on_path(path, stamps, boxes, max_gap, ledger, "localisation" if log.localization else "odometry")
+    valid = np.ones(len(stamps), dtype=bool)
+    what = "localisation" if log.localization else "odometry"
+    map_T_base, on_path = _on_path(path, stamps, valid, boxes, max_gap, ledger, what)
+    valid &= on_path
     odom_T_base, drift = None, None
     if odometry is not None:
         odom_T_base, drift = map_T_base, gathered_drift(odometry, stamps, settings.odometry)
         if log.localization is not None:
-            odom_T_base, on_odometry = _on_path(odometry, stamps, boxes * valid, max_gap, ledger, "odometry")
+            odom_T_base, on_odometry = _on_path(odometry, stamps, valid, boxes, max_gap, ledger, "odometry")
             valid &= on_odometry
         odom_T_base = inverse(odometry.poses[0]) @ odom_T_base
     base_T_camera = np.empty((len(stamps), 4, 4))
@@ -48,7 +51,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         base_T_camera[mine] = camera_log.camera.base_T_camera
         if camera_log.mount is not None:
             what = f"camera_poses of {camera_log.camera.name}"
-            poses, on_mount = _on_path(camera_log.mount, stamps[mine], boxes[mine] * valid[mine], max_gap, ledger, what)
+            poses, on_mount = _on_path(camera_log.mount, stamps[mine], valid[mine], boxes[mine], max_gap, ledger, what)
             base_T_camera[mine] = poses
             valid[mine] &= on_mount
     if not valid.any():
@@ -78,11 +81,13 @@ def _boxes_per_frame(camera_log: CameraLog) -> Floats:
 
 
 def _on_path(
-    path: Trajectory, stamps: Floats, boxes: Floats, max_gap: float, ledger: Ledger, what: str
+    path: Trajectory, stamps: Floats, wanted: Bools, boxes: Floats, max_gap: float, ledger: Ledger, what: str
 ) -> tuple[Floats, Bools]:
+    """The poses of a path at the stamps, and where it has one; frames that were still wanted are counted where not."""
     poses, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
     outside = (stamps < path.stamps[0]) | (stamps > path.stamps[-1])
-    for mask, why in ((~valid & outside, f"before or after the {what}"), (~valid & ~outside, f"in a gap of the {what}")):
+    lost = wanted & ~valid
+    for mask, why in ((lost & outside, f"before or after the {what}"), (lost & ~outside, f"in a gap of the {what}")):
         where = f"stamp {stamps[mask][0]:.3f}" if mask.any() else None
         ledger.drop(f"boxes {why}", int(boxes[mask].sum()), where)
         ledger.drop(f"frames {why}", int(mask.sum()), where)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from objslam.geometry import align, lift_se2
-from objslam.types import Bools, Floats, Ints
+from objslam.geometry import align, inverse, lift_se2
+from objslam.types import Bools, Floats, Ints, ObjectMap, Trajectory, Truth
 
 Alignment = Literal["none", "se2", "sim2"]
 
@@ -138,3 +138,27 @@ def _random_pairs(count: int, seed: int) -> tuple[Ints, Ints]:
     pairs = np.random.default_rng(seed).integers(count, size=(200_000, 2))
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     return pairs[:, 0], pairs[:, 1]
+
+
+def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
+    """The truth as it lies on the map, to be drawn there.
+
+    A map from odometry alone has a frame of its own. Where fewer than half of what could match does within the radius (m) as
+    the two stand, and more does after an alignment in the plane, the truth is moved by that alignment; else it stays.
+    """
+    mapped, true = objects.resolved(), truth.objects
+    ours = np.array([o.position for o in mapped]).reshape(-1, 3)
+    theirs = np.array([o.position for o in true]).reshape(-1, 3)
+    same = np.array([[o.label == t.label for t in true] for o in mapped], dtype=bool).reshape(len(ours), len(theirs))
+    matched = len(match(ours, theirs, same, radius)[0])
+    if 2 * matched >= min(len(ours), len(theirs)):
+        return truth
+    transform = align_objects(ours, theirs, same, radius, "se2")
+    if len(match(transform.apply(ours), theirs, same, radius)[0]) <= matched:
+        return truth
+    back = Transform(inverse(transform.pose))
+    path = truth.trajectory
+    return Truth(
+        objects=tuple(replace(t, position=back.apply(t.position)) for t in true),
+        trajectory=None if path is None else Trajectory(path.stamps, back.pose @ path.poses),
+    )

@@ -20,6 +20,7 @@ import numpy as np
 from objslam.config import Settings, dump_settings
 from objslam.errors import LogError, OutputError
 from objslam.ledger import Ledger
+from objslam.matching import lay_truth
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
 from objslam.types import Association, Camera, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
@@ -80,8 +81,8 @@ def write_result(result: RunResult, out: Path, truth: Truth | None = None) -> No
 
     Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
     summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
-    only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is drawn
-    into the picture and the recording, and kept beside the result for `load_truth`.
+    only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is kept
+    beside the result for `load_truth`, and drawn as it lies on the map.
     """
     prepare_output(out)
     with _disk(out), _staged(out) as staging:
@@ -170,14 +171,15 @@ def _writers(result: RunResult, truth: Truth | None) -> dict[str, Callable[[Path
     if truth is not None and truth.trajectory is not None:
         true_path = truth.trajectory
         writers[TRUTH_TRAJECTORY] = lambda file: write_trajectory(true_path, file)
+    drawn = lay_truth(result.map, truth) if truth is not None else None
     if result.settings.output.picture:
         from objslam.picture import draw_map
 
-        writers[PICTURE] = lambda file: draw_map(result, file, truth)
+        writers[PICTURE] = lambda file: draw_map(result, file, drawn)
     if result.settings.output.recording:
         from objslam.viewer import write_recording
 
-        writers[RECORDING] = lambda file: write_recording(result, file, truth)
+        writers[RECORDING] = lambda file: write_recording(result, file, drawn)
     return writers
 
 

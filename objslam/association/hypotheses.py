@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +42,23 @@ def discover(s: Sightings, search: Search, rng: np.random.Generator) -> Floats:
     points = _propose(s, search, rng)
     if len(points) == 0:
         return points
-    scorer = _Scorer(s, search)
+    with _one_thread():
+        return _best(points, _Scorer(s, search), search.support)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """The work comes in chunks that fit the cache: more threads gain little, and wait for each other on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _best(points: Floats, scorer: _Scorer, least: float) -> Floats:
+    """The points that rays agree on, refined, best first; each has at least `least` support that no better one took."""
     moved = scorer.load(points)
     for _ in range(_REFINED):
         moved = scorer.refine(moved, scorer.supports(moved))
@@ -49,7 +67,7 @@ def discover(s: Sightings, search: Search, rng: np.random.Generator) -> Floats:
     left, found = whole.clone(), []
     for _ in range(len(moved)):
         best = int(torch.where(left >= _COMPETES * whole, left, 0.0).argmax())
-        if float(left[best]) < max(search.support, _COMPETES * float(whole[best])):
+        if float(left[best]) < max(least, _COMPETES * float(whole[best])):
             break
         found.append(best)
         taken = support[best] > 0

@@ -19,7 +19,7 @@ from objslam.association.landmarks import Landmarks, State, offsets, variance
 from objslam.association.matches import choose, gated_edges, track_bonus
 from objslam.association.refit import refit
 from objslam.association.sightings import Sightings, sight
-from objslam.association.structure import RAYLEIGH_MEDIAN, merges
+from objslam.association.structure import RAYLEIGH_MEDIAN, close_pairs, merges
 from objslam.association.visibility import View, Visits, visits
 from objslam.ledger import Ledger
 from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
@@ -212,20 +212,11 @@ def _existence(work: _Work, state: State) -> Floats:
 
 def _has_weaker(work: _Work, state: State, failing: Bools) -> Bools:
     """Whether a weaker failing landmark (N,) stands so near that it may hold boxes of this one: it has to go first."""
-    from scipy.spatial import cKDTree
-
-    which = np.flatnonzero(failing)
-    kind, number, position = state.kind(work.s), state.number, state.landmarks.position
-    held = np.flatnonzero(state.matched >= 0)
-    r, index = work.s.take(held), state.matched[held]
-    distance = np.linalg.norm(position[index] - r.origin, axis=1)
-    blur = grouped_median(np.sqrt(variance(r, distance, state.landmarks.noise[index])), index, len(number))
+    number, kind = state.number, state.kind(work.s)
+    a, b = close_pairs(work.s, state, work.gate)
+    rivals = failing[a] & failing[b] & (kind[a] == kind[b])
+    a, b = a[rivals], b[rivals]
     result = np.zeros(len(failing), dtype=bool)
-    reach = 2 * np.sqrt(work.gate) * np.nan_to_num(blur)
-    pairs = cKDTree(position[which]).query_pairs(float(reach[which].max(initial=0.0)), output_type="ndarray")
-    a, b = which[pairs[:, 0]], which[pairs[:, 1]]
-    near = (np.linalg.norm(position[a] - position[b], axis=1) <= reach[a] + 0 * reach[b]) & (kind[a] == kind[b])
-    a, b = a[near], b[near]
     result[np.where(number[a] > number[b], a, b)] = True
     return result
 

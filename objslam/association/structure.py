@@ -23,6 +23,7 @@ _EXPECTED = 5.0  # frames with both that two things should have, for their absen
 _SIZE_RATIO = 2.0  # what has two labels has one size
 _DUPLICATE = 0.5  # boxes of one frame that overlap as much (intersection over union) are of one thing
 _NEIGHBOURS = 8
+_REACH = 2.0  # gates: rays seen under little parallax put one thing at two distances
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,12 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     count, number = len(state.landmarks), state.number
     target = np.arange(count)
     diameter, blur = _sizes(s, state)
-    pairs = _candidates(state, kind, diameter, blur, gate, across_labels)
-    if len(pairs) == 0:
+    a, b = _close(state, diameter, blur, gate)
+    wanted = (kind[a] == kind[b]) != across_labels
+    a, b = a[wanted], b[wanted]
+    if len(a) == 0:
         return target
-    a, b = pairs.a, pairs.b
+    pairs = _with_rays(a, b, state)
     gain = _gains(s, state, kind, visits, rates, gate, pairs)
     apart = _seen_apart(s, pairs, state.matched)
     should = _expected_together(visits, a, b)
@@ -80,24 +83,34 @@ def _sizes(s: Sightings, state: State) -> tuple[Floats, Floats]:
     return np.nan_to_num(diameter), np.nan_to_num(blur)
 
 
-def _candidates(state: State, kind: Ints, diameter: Floats, blur: Floats, gate: float, across_labels: bool) -> _Pairs:
-    """Pairs close enough to be one: within each other's gate, or within their size."""
+def close_pairs(s: Sightings, state: State, gate: float) -> tuple[Ints, Ints]:
+    """Pairs of landmarks a < b (P,) that stand so close that they could be one: within reach of each other's rays, or within
+    their size."""
+    return _close(state, *_sizes(s, state), gate)
+
+
+def _close(state: State, diameter: Floats, blur: Floats, gate: float) -> tuple[Ints, Ints]:
     from scipy.spatial import cKDTree
 
     count, position = len(state.landmarks), state.landmarks.position
     near = min(_NEIGHBOURS + 1, count)
     gap, other = cKDTree(position).query(position, k=np.arange(1, near + 1))
     a, b, gap = np.repeat(np.arange(count), near), other.ravel(), gap.ravel()
-    close = gap < np.maximum(np.sqrt(gate) * (blur[a] + blur[b]), 0.5 * (diameter[a] + diameter[b]))
-    keep = close & (a != b) & ((kind[a] == kind[b]) != across_labels)
-    pairs = np.unique(np.sort(np.stack([a[keep], b[keep]], axis=1), axis=1), axis=0)
+    reach = np.maximum(_REACH * np.sqrt(gate) * (blur[a] + blur[b]), 0.5 * (diameter[a] + diameter[b]))
+    close = (gap < reach) & (a != b)
+    pairs = np.unique(np.sort(np.stack([a[close], b[close]], axis=1), axis=1), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
+    count = len(state.landmarks)
     order = np.argsort(state.matched, kind="stable")
     begin, end = (np.searchsorted(state.matched[order], np.arange(count), side=side) for side in ("left", "right"))
-    which = pairs.ravel()
+    which = np.stack([a, b], axis=1).ravel()
     length = (end - begin)[which]
     step = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)
     ray = order[np.repeat(begin[which], length) + step]
-    return _Pairs(pairs[:, 0], pairs[:, 1], ray, np.repeat(np.arange(len(pairs)).repeat(2), length))
+    return _Pairs(a, b, ray, np.repeat(np.arange(len(a)).repeat(2), length))
 
 
 def _gains(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates, gate: float, pairs: _Pairs) -> Floats:
