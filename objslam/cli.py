@@ -113,7 +113,7 @@ def demo(
 
     prepare_output(out)
     log = out / "log"
-    write_log_folder(simulate(preset("demo", objects=8, classes=8), seed), log, overwrite=True)
+    write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
     _say(f"simulated a drive: {log}")
     for mode in ("fixed", "joint"):
         ledger = Ledger()

@@ -14,12 +14,71 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Device = Literal["auto", "cpu", "cuda"]
 Loss = Literal["l1", "huber", "cauchy", "gnc"]
+Layout = Literal["ssd", "yolov8", "yolov5", "end_to_end", "yolox", "yolox_decoded", "detr"]
+Role = Literal["boxes", "labels", "scores", "logits", "predictions"]
+Share = Annotated[float, Field(ge=0, le=1)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Section(BaseModel):
     """A part of the settings: frozen, unknown keys refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Detector(Section):
+    """The CNN detector, an ONNX model, that finds the boxes in a log's images. What is null is taken from the model: its
+    metadata, the shapes of its outputs, the habits of its family."""
+
+    layout: Layout | None = None
+    """what the outputs are. ssd: boxes, labels and scores (SSD, torchvision, TensorFlow; boxes and scores may be one).
+    yolov8: 4 + classes a box (v8, v11, v12). yolov5: 4 + objectness + classes (v5, v7). end_to_end: x1, y1, x2, y2, score, class
+    (v10, v26). yolox: the raw grid; yolox_decoded: as exported with the decoding inside. detr: boxes and logits."""
+    outputs: dict[Role, str] | None = None
+    """the name of the output that holds each role: boxes, labels and scores (ssd), boxes and logits (detr), predictions (the
+    others)."""
+    names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
+    """the classes in the model's order: a list, a file (one a line, or YAML with `names`; beside the settings or the model),
+    coco (80) or coco91 (numbered with its gaps)."""
+    first_label: Annotated[int, Field(ge=0)] | None = None
+    """the number that the model gives to the first name: 1 where 0 is the background and the names leave it out."""
+    classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """the classes that count; null: all."""
+    min_score: Share = 0.25
+    """boxes that the network is less sure of are not taken."""
+    iou: Share = 0.5
+    """of two boxes of one class that overlap by more, the better stays (see nms)."""
+    nms: bool | None = None
+    """whether such boxes are dropped; null: where the family needs it, the YOLOs but end_to_end."""
+    max_boxes: Annotated[int, Field(ge=1)] = 300
+    """the best so many of an image are kept."""
+    size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
+    """width and height, px, that an image is fitted into, for models that take any."""
+    resize: Literal["letterbox", "corner", "stretch", "none"] | None = None
+    """how an image is fitted: letterbox keeps its shape and pads all round, corner pads right and below, stretch does not keep
+    its shape, none leaves it as it is."""
+    pad: Annotated[int, Field(ge=0, le=255)] | None = None
+    """the grey that is padded with; null: 114."""
+    colour: Literal["rgb", "bgr"] | None = None
+    """the order of the channels."""
+    divide_by: Positive | None = None
+    """values of 0 to 255 are divided by it, then by mean and std: (value / divide_by - mean) / std."""
+    mean: tuple[Finite, Finite, Finite] | None = None
+    """for each channel, in the network's order."""
+    std: tuple[Positive, Positive, Positive] | None = None
+    """for each channel."""
+    box_form: Literal["xyxy", "yxyx", "cxcywh"] | None = None
+    """two corners, or centre and size."""
+    box_units: Literal["pixels", "fractions"] | None = None
+    """pixels or fractions of the network's input."""
+    activation: Literal["none", "sigmoid", "softmax"] | None = None
+    """what makes scores of the outputs. After softmax the last class is "nothing"."""
+    device: Device = "auto"
+    """auto: CUDA where this onnxruntime has it, else the CPU."""
+    threads: Annotated[int, Field(ge=0)] = 0
+    """of onnxruntime on the CPU; 0: as many as there are cores."""
+    batch: Annotated[int, Field(ge=1)] = 1
+    """images at a time, for models that take any number."""
 
 
 class Poses(Section):
@@ -144,6 +203,10 @@ class Joint(Section):
     """m; a weak prior on each landmark that keeps the graph determined."""
     grow_step: Annotated[int, Field(ge=2)] = 60
     """keyframes added at a time when there is odometry alone."""
+    explore_step: Annotated[int, Field(ge=1)] = 10
+    """the same while it is not known which ray belongs to which object: short, for recognition needs good predictions."""
+    max_rounds: Annotated[int, Field(ge=1)] = 6
+    """association and solve take turns until nothing changes, this often at the most."""
     max_iterations: Annotated[int, Field(ge=1)] = 100
 
 
@@ -159,6 +222,7 @@ class Settings(Section):
 
     mode: Literal["fixed", "joint"] = "fixed"
     seed: Annotated[int, Field(ge=0)] = 0
+    detector: Detector = Detector()
     poses: Poses = Poses()
     rays: RayNoise = RayNoise()
     depth: Depth = Depth()
@@ -180,7 +244,7 @@ def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> 
     data: dict[str, Any] = {}
     if file is not None:
         data = _read_yaml(file)
-        _validate(data, str(file))
+        _find_names(_validate(data, str(file)), data, file.parent)
     for text in overrides:
         key, sign, value = text.partition("=")
         if not sign or not key:
@@ -212,6 +276,13 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigError("the settings must be a mapping of keys to values", where=str(file))
     return data
+
+
+def _find_names(settings: Settings, data: dict[str, Any], folder: Path) -> None:
+    """A names file that lies beside the settings file is meant, wherever the run is started."""
+    names = settings.detector.names
+    if isinstance(names, str) and (folder / names).is_file():
+        data["detector"]["names"] = str((folder / names).resolve())
 
 
 def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:

@@ -27,6 +27,10 @@ class SolveError(ObjslamError):
     """The estimation has no answer to give: nothing to solve, or no solver found one."""
 
 
+class DetectorError(ObjslamError):
+    """A detector model cannot be loaded, understood or run."""
+
+
 class OutputError(ObjslamError):
     """A result cannot be written or read back."""
 

@@ -88,6 +88,10 @@ def _entry(o: MapObject) -> dict[str, Any]:
         "first_seen": _null(o.first_seen),
         "last_seen": _null(o.last_seen),
     }
+    if o.labels is not None:
+        entry["labels"] = {name: float(share) for name, share in o.labels.items()}
+    if o.existence is not None:
+        entry["existence"] = float(o.existence)
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
     return entry
@@ -154,6 +158,11 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         if not isinstance(ray, dict):
             raise _Wrong("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
+    labels, existence = entry.get("labels"), entry.get("existence")
+    if labels is not None:
+        if not isinstance(labels, dict):
+            raise _Wrong("labels must be a mapping of labels to shares")
+        labels = {_text(name, "a name in labels"): _number(share, "a share in labels") for name, share in labels.items()}
     return MapObject(
         id=_integer(entry, "id"),
         label=_text(entry.get("label"), "label"),
@@ -168,6 +177,8 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         last_seen=_number(entry.get("last_seen"), "last_seen", null=True),
         extent=extent,
         ray=ray,
+        labels=labels,
+        existence=None if existence is None else _number(existence, "existence"),
     )
 
 

@@ -41,7 +41,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     Boxes below the score limit, with a centre outside the image, cut off by its edge, or where the lens model has no inverse
     are dropped and counted.
     """
-    label_names, _ = label_table([n for c in log.cameras if c.detections for n in c.detections.label_names])
+    label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
+    place = {name: i for i, name in enumerate(label_names)}
     columns: list[tuple[Floats | Ints, ...]] = []
     for index, camera_log in enumerate(log.cameras):
         detections, camera = camera_log.detections, camera_log.camera
@@ -55,7 +56,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
         ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
         boxes, directions = boxes.take(valid), directions[valid]
-        names = np.array([label_names.index(n) for n in detections.label_names], dtype=np.int64)
+        names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         columns.append(
             (
                 keyframe_of_frame[boxes.frame],

@@ -264,7 +264,8 @@ class MapObject:
     """One object of the map, as objects.json holds it.
 
     position: (3,) m. covariance: (3, 3) m^2, None where unresolved. extent: width and height in m. A ray (origin,
-    direction) stands for an unresolved object: its best guess lies on it.
+    direction) stands for an unresolved object: its best guess lies on it. labels: the share of each label among its boxes,
+    None where one label is taken for one object. existence: the probability that there is such an object, likewise.
     """
 
     id: int
@@ -280,6 +281,8 @@ class MapObject:
     last_seen: float
     extent: tuple[float, float] | None = None
     ray: tuple[Floats, Floats] | None = None
+    labels: dict[str, float] | None = None
+    existence: float | None = None
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def test_every_frame_is_kept_in_place_or_counted(frames, path_stamps):
     ledger, path = Ledger(), line(path_stamps)
     total = sum(map(len, frames))
     log = Log("log", cameras, localization=path)
-    on_path = interpolate(path.stamps, path.poses, np.array(sum(frames, [])), FIXED.poses.max_gap)[1].sum()
+    on_path = interpolate(path.stamps, path.poses, np.concatenate(frames), FIXED.poses.max_gap)[1].sum()
     if not on_path:
         with pytest.raises(LogError, match="none of the" if total else "no detection frames"):
             build_keyframes(log, FIXED, ledger)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.extent import grouped_median
 from objslam.association.landmarks import State, variance
 from objslam.association.sightings import Sightings
 from objslam.association.visibility import View, Visits
@@ -13,8 +14,11 @@ from objslam.types import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # how often a phantom is detected where it should be, of how often an object of its class is
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # tried for how alike the rates of the objects are
+_CLEARLY = 10.0  # ln likelihood
 _POOLED = 100.0  # boxes: a class with so many weighs its own rate as much as that of all classes
 _RATES = (0.01, 0.95)
+_LOG_SIZE = 0.7  # standard deviation of ln size within a class,
+_PHANTOM_LOG_SIZES = 4.6  # and the width of the range in which a phantom may have any: a factor of 100
 _SURE = 20.0  # log odds that need no more
 
 
@@ -40,7 +44,7 @@ class Rates:
 def detection_rates(visits: Visits, kind: Ints, labels: int) -> Rates:
     """The rates of the classes: the median over their boxes, drawn to that of all classes where boxes are few.
 
-    The concentration is the most likely one, if each object may be real or a phantom.
+    The concentration is the lowest that is not clearly less likely than the best, if each object may be real or a phantom.
     """
     seen, expected = visits.seen.astype(float), visits.expected
     own = seen / np.maximum(expected, 1)
@@ -48,8 +52,9 @@ def detection_rates(visits: Visits, kind: Ints, labels: int) -> Rates:
     boxes = np.bincount(kind, seen, labels)
     mean = (boxes * _weighted_median(own, seen, kind, labels) + _POOLED * overall) / (boxes + _POOLED)
     mean = np.clip(mean, *_RATES)
-    likelihood = [np.logaddexp(0.0, _odds(visits.seen, expected, mean[kind], c)).sum() for c in _CONCENTRATIONS]
-    return Rates(mean, _CONCENTRATIONS[int(np.argmax(likelihood))])
+    odds = np.array([_odds(visits.seen, expected, mean[kind], c) for c in _CONCENTRATIONS])
+    likelihood = np.logaddexp(0.0, odds).sum(axis=1)
+    return Rates(mean, _CONCENTRATIONS[int(np.argmax(likelihood >= likelihood.max() - _CLEARLY))])
 
 
 def _odds(seen: Ints, expected: Ints, rate: Floats, concentration: float) -> Floats:
@@ -98,6 +103,21 @@ def chance_odds(s: Sightings, state: State, kind: Ints, visits: Visits, view: Vi
     expected = np.maximum(visits.inside, visits.expected) * area * strays / (max(len(view), 1) * view.solid_angle)
     points = np.log(np.maximum(strays * (strays - 1) / 2, 1.0))
     return np.asarray(np.clip(-points - poisson.logsf(number - 3, expected), -_SURE, _SURE))
+
+
+def size_odds(s: Sightings, state: State, kind: Ints) -> Floats:
+    """Log odds (N,), at most 0, of an object of its class against a phantom, by how large its boxes say it is.
+
+    Rays of different things that cross make a point at a wrong distance, where a box says a wrong size.
+    """
+    count, held = len(state.landmarks), np.flatnonzero(state.matched >= 0)
+    index = state.matched[held]
+    distance = np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1)
+    size = np.log(np.maximum(np.sqrt(s.size[held].prod(axis=1)) * distance, 1e-6))
+    own = np.nan_to_num(grouped_median(size, index, count))
+    usual = _weighted_median(own, state.number.astype(float), kind, state.landmarks.accepts.shape[1])[kind]
+    as_object = -0.5 * ((own - usual) / _LOG_SIZE) ** 2 - np.log(_LOG_SIZE * np.sqrt(2 * np.pi))
+    return np.asarray(np.minimum(as_object + np.log(_PHANTOM_LOG_SIZES), 0.0))
 
 
 def _no_stronger(number: Ints, kind: Ints) -> Ints:

@@ -13,7 +13,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.assign import gate_limit
-from objslam.association.evidence import Rates, chance_odds, detection_rates
+from objslam.association.evidence import Rates, chance_odds, detection_rates, size_odds
 from objslam.association.extent import grouped_median
 from objslam.association.landmarks import Landmarks, State, offsets, variance
 from objslam.association.matches import choose, gated_edges, track_bonus
@@ -205,7 +205,7 @@ def _drop_phantoms(work: _Work, state: State, times: int) -> tuple[State, Floats
 def _existence(work: _Work, state: State) -> Floats:
     kind, seen = state.kind(work.s), work.visits(state)
     rates = detection_rates(seen, kind, work.labels)
-    by_rate = rates.log_odds(seen, kind)
+    by_rate = rates.log_odds(seen, kind) + size_odds(work.s, state, kind)
     by_chance = chance_odds(work.s, state, kind, seen, work.view, work.gate)
     return np.asarray(1 / (1 + np.exp(-by_rate)) / (1 + np.exp(-by_chance)))
 

@@ -60,7 +60,7 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     small, large = np.minimum(diameter[a], diameter[b]), np.maximum(diameter[a], diameter[b])
     never = apart <= _APART * np.minimum(number[a], number[b])
     shared = (gap < _INSIDE[0] * small) & never
-    shared |= (gap < _INSIDE[1] * large) & (should >= _EXPECTED) & (apart <= _APART * should)
+    shared |= (gap < _INSIDE[1] * large) & (apart <= _APART * np.maximum(should, _EXPECTED))
     one = (gain > 0) | shared
     if across_labels:
         one &= never & (large < _SIZE_RATIO * small)

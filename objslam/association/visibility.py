@@ -13,7 +13,8 @@ from objslam.types import Bools, Camera, Floats, Ints
 _CHUNK = 1 << 20  # pairs of an object and a frame at a time
 _RANGES = (0.02, 0.98)  # of the distances at which a class is detected: closer or further, a miss says nothing
 _CORE_SHARE = 0.8  # of the boxes of a class, those of its strongest objects, tell its distances: the weakest may be phantoms
-_FRONT = (0.3, 0.1)  # m, and share of the distance, by which something must be closer to hide an object
+_FACING = 0.95  # share of an object's boxes that come from its front, if it has one
+_CLOSER = (0.3, 0.1)  # m, and share of the distance, by which something must be closer to hide an object
 _FILLED = 0.6  # of a box, width and height, that its object surely fills
 
 
@@ -96,6 +97,7 @@ def visits(s: Sightings, matched: Ints, position: Floats, kind: Ints, view: View
     obj, frame, away, pixel = (np.concatenate(column) for column in zip(*pairs, strict=True))
     inside = np.bincount(obj, minlength=count)
     usual = (away >= near[obj]) & (away <= far[obj])
+    usual &= _from_the_front(s.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
     clear = ~_hidden(frame, away, pixel, s, np.where(np.isfinite(s.range), s.range, distance))
     there = np.sort(index * len(view) + s.frame[held])
@@ -118,6 +120,23 @@ def _usual_ranges(distance: Floats, index: Ints, kind: Ints) -> tuple[Floats, Fl
     classes = int(kind.max(initial=-1)) + 1
     near, far = (grouped_quantile(distance[told], kind[index[told]], classes, q) for q in _RANGES)
     return near, far
+
+
+def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
+    """Whether a camera (V, 3) looks at its object (V,) from where that can be detected: a screen, say, only from one side.
+
+    An object has a front if its boxes, seen from origins (P, 3) with the object of each (P,), come from one half of the
+    directions about their mean; then misses from the other half say nothing.
+    """
+    count = len(position)
+    front = np.stack([np.bincount(index, c, count) for c in _unit(origin - position[index]).T], axis=1)
+    facing = np.einsum("pi,pi->p", _unit(origin - position[index]), front[index])
+    one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FACING)) >= 0
+    return ~one_sided[obj] | (np.einsum("vi,vi->v", camera - position[obj], front[obj]) >= 0)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
 def _in_image(
@@ -151,7 +170,7 @@ def _hidden(frame: Ints, distance: Floats, pixel: Floats, s: Sightings, reach: F
     start = np.searchsorted(s.frame[useful], frames)
     begin, end = start[frame], start[frame + 1]
     middle, half = (s.box[:, :2] + s.box[:, 2:]) / 2, _FILLED * (s.box[:, 2:] - s.box[:, :2]) / 2
-    front = distance - np.maximum(_FRONT[0], _FRONT[1] * distance)
+    front = distance - np.maximum(_CLOSER[0], _CLOSER[1] * distance)
     for k in range(int((end - begin).max(initial=0))):  # the k-th box of each frame: as many turns as a frame has boxes
         rows = np.flatnonzero(begin + k < end)
         box = useful[begin[rows] + k]

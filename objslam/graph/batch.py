@@ -63,7 +63,7 @@ def triangulate_at(
 ) -> Triangulation:
     """Every object by Eq. 1 at the camera poses (K, 4, 4); poses that are localised bring their own noise to the rays."""
     origins, directions = rays.in_map(map_T_camera)
-    sigma, place = _pose_noise(rays, keyframes, settings)
+    sigma, place = pose_noise(rays, keyframes, settings)
     return triangulate(
         origins,
         directions,
@@ -92,7 +92,7 @@ def solve_fixed(
     used = np.flatnonzero((association.object >= 0) & (start.weight > 0) & member[association.object])
     landmark = association.object[used]
     origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
-    angle, place = _pose_noise(rays, keyframes, settings)
+    angle, place = pose_noise(rays, keyframes, settings)
     across = np.hypot(angle[used] * np.linalg.norm(start.positions[landmark] - origins, axis=1), place)
     noise = factors.robust(loss, np.ones(len(used)) if loss == "l1" else across, 2)
     groups = [factors.point_to_line_fixed(origins, n, landmark, noise)]
@@ -105,7 +105,6 @@ def solve_fixed(
     graph, landmarks = build_graph(*groups), np.unique(landmark)
     values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
     optimum = _solve(graph, values, loss, settings, range(len(used), graph.size()), tolerance=1e-12)
-    unit = factors.L1_METRES if loss == "l1" else 1.0  # Huber's slope: Eq. 1's sum of distances in metres
     positions = start.positions.copy()
     positions[landmarks] = read_points(optimum.values)
     distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
@@ -124,8 +123,8 @@ def solve_fixed(
         covariance=covariance,
         solved=start.ok,
         weight=weight,
-        cost_before=optimum.cost_before / unit,
-        cost_after=optimum.cost_after / unit,
+        cost_before=optimum.cost_before,
+        cost_after=optimum.cost_after,
         iterations=optimum.iterations,
     )
 
@@ -137,16 +136,20 @@ def solve_joint(
     settings: Settings,
     ledger: Ledger,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    start: Floats | None = None,
 ) -> Estimate:
     """Poses and objects together, from a start that holds: the localisation's poses, or the graph grown along the odometry.
 
+    start: camera poses (K, 4, 4) to begin from instead.
     After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
     that the poses now carry, or place better, enter or move, until nothing changes.
     """
     rays = _share_bias(rays, association, settings)
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
-    if not keyframes.localized_every:
+    if start is not None:
+        map_T_camera = start
+    elif not keyframes.localized_every:
         map_T_camera, positions = grow(keyframes, rays, association, settings, progress)
     used = np.zeros(len(rays), dtype=bool)
     optimum, cost_before, iterations = None, np.nan, 0
@@ -283,7 +286,7 @@ def _share_bias(rays: Rays, association: Association, settings: Settings) -> Ray
     return replace(rays, range_sigma=sigma)
 
 
-def _pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
+def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
     """The rays' angle noise (R,), rad, and that of their origins, m, with the localisation's own noise in it.
 
     Keyframes that share a measured pose share its error: their rays count as the one.

@@ -42,17 +42,20 @@ def l_key(landmark: int) -> int:
 def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
     """Noise models, one for each of the sigmas (R,), shared where they agree to three digits.
 
-    The loss acts on the norm of the whitened residual. `gnc` is left without a loss: its optimiser brings it.
+    The loss acts on the norm of the whitened residual. `l1` is a Huber that costs one for each sigma, its kink at l1_kink (in
+    the residual's unit). `gnc` is left without a loss: its optimiser brings it.
     """
     digits = 10.0 ** (np.floor(np.log10(sigmas)) - 2)
     values, which = np.unique(np.round(sigmas / digits) * digits, return_inverse=True)
     estimators, wrap = gtsam.noiseModel.mEstimator, gtsam.noiseModel.Robust.Create
     models: list[gtsam.noiseModel.Base] = []
     for sigma in values:
+        if loss == "l1":  # whitened by s, Huber's slope is k / s and its kink k * s: these are 1 / sigma and l1_kink
+            whitened = gtsam.noiseModel.Isotropic.Sigma(dimension, np.sqrt(sigma * l1_kink))
+            models.append(wrap(estimators.Huber.Create(np.sqrt(l1_kink / sigma)), whitened))
+            continue
         model = gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
-        if loss == "l1":
-            models.append(wrap(estimators.Huber.Create(l1_kink / sigma), model))
-        elif loss == "huber":
+        if loss == "huber":
             models.append(wrap(estimators.Huber.Create(HUBER_K), model))
         elif loss == "cauchy":
             models.append(wrap(estimators.Cauchy.Create(CAUCHY_K), model))

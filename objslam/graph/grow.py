@@ -113,7 +113,7 @@ def ray_factors(rays: Rays, landmark: Ints, which: Ints, loss: Loss, settings: S
 
 
 def range_factors(rays: Rays, landmark: Ints, which: Ints) -> list[gtsam.NonlinearFactor]:
-    """The factors of the ranges that came with the rays `which` (n,), under Huber's loss; landmark: (R,)."""
+    """The factors of the ranges that came with the rays `which` (n,), under Cauchy's loss; landmark: (R,)."""
     which = which[np.isfinite(rays.range[which])]
     noise = factors.robust("cauchy", rays.range_sigma[which], 1)
     return factors.ranges(rays.keyframe[which], rays.range[which], landmark[which], noise)

@@ -1,0 +1,203 @@
+"""Images of a furnished room by casting rays (Open3D on the CPU, no display): colour, depth, and what each pixel shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.geometry import inverse
+from objslam.rays import undistort
+from objslam.simulation.furniture import Room
+from objslam.simulation.sight import project
+from objslam.types import Camera, Floats, Ints
+
+Reals = NDArray[np.floating]
+
+NEAR = 0.05
+"""m; what reaches nearer to the camera than this has no box."""
+_NOISE = 64
+_PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
+
+
+@dataclass(frozen=True)
+class Cast:
+    """What the rays of one image hit: depth (H, W) z in m, inf where nothing; part (H, W), -1 there.
+
+    normal (H, W, 3) and point (H, W, 3), m, are in map.
+    """
+
+    depth: Reals
+    part: Ints
+    normal: Reals
+    point: Reals
+
+
+@dataclass(frozen=True)
+class Caster:
+    """A room ready to be looked at through a camera; `seed` fixes the grain of its textures."""
+
+    room: Room
+    camera: Camera
+    seed: int = 0
+
+    @cached_property
+    def directions(self) -> Reals:
+        """(H, W, 3) the direction with z = 1, camera frame, of every pixel; pixel centres lie at whole numbers."""
+        v, u = np.mgrid[0 : self.camera.height, 0 : self.camera.width]
+        directions, _ = undistort(self.camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+        return np.asarray((directions / directions[:, 2:]).reshape(*u.shape, 3), dtype=np.float32)
+
+    @cached_property
+    def _scene(self) -> Any:
+        return _scene(self.room, range(len(self.room.parts)))
+
+    @cached_property
+    def _alone(self) -> list[Any]:
+        """A scene for each object that holds nothing else."""
+        return [_scene(self.room, np.flatnonzero(self.room.owner == i)) for i in range(len(self.room.labels))]
+
+    @cached_property
+    def _grain(self) -> Reals:
+        """(64^3) smooth solid noise in [0, 1] that repeats."""
+        from scipy.ndimage import gaussian_filter
+
+        rng = np.random.default_rng(self.seed)
+        white = rng.standard_normal((_NOISE,) * 3)
+        mixed = sum(gaussian_filter(white, s, mode="wrap") * s**1.5 for s in (0.7, 1.5, 3.0))
+        return np.clip(0.5 + mixed / (4 * mixed.std()), 0.0, 1.0).astype(np.float32).ravel()
+
+    def cast(self, map_T_camera: Floats) -> Cast:
+        """The first surface on the ray of every pixel from a camera at map_T_camera (4, 4)."""
+        rays = _rays(self.directions, map_T_camera)
+        hit = self._scene.cast_rays(_tensor(rays), 1)
+        depth = hit["t_hit"].numpy()
+        part = hit["geometry_ids"].numpy().astype(np.int64)
+        part[~np.isfinite(depth)] = -1
+        normal = hit["primitive_normals"].numpy()
+        reach = np.where(np.isfinite(depth), depth, 0.0)[..., None]
+        point = rays[..., :3] + reach * rays[..., 3:]
+        return Cast(depth, part, normal, point)
+
+    def owners(self, cast: Cast) -> Ints:
+        """(H, W) the object that each pixel shows, -1 for none."""
+        return np.append(self.room.owner, -1)[cast.part]
+
+    def silhouettes(self, map_T_camera: Floats, chosen: Ints) -> Ints:
+        """How many pixels (M,) of the image each of the chosen objects (M,) would cover if nothing stood before it."""
+        counts = np.zeros(len(chosen), dtype=np.int64)
+        for i, number in enumerate(chosen):
+            window = self._window(number, map_T_camera)
+            if window is not None:
+                rays = _rays(self.directions[window], map_T_camera)
+                counts[i] = int(self._alone[number].test_occlusions(_tensor(rays), nthreads=1).numpy().sum())
+        return counts
+
+    def full_sizes(self, map_T_camera: Floats, chosen: Ints) -> Floats:
+        """Width and height (M, 2), px, of the boxes that the chosen objects (M,) would have in an image without edges.
+
+        inf where an object reaches behind the camera.
+        """
+        sizes = np.full((len(chosen), 2), np.inf)
+        for i, number in enumerate(chosen):
+            local = self._local(number, map_T_camera)
+            if local[:, 2].min() >= NEAR:
+                sizes[i] = np.ptp(project(self.camera, local), axis=0)
+        return sizes
+
+    def _local(self, number: int, map_T_camera: Floats) -> Floats:
+        """The vertices (V, 3) of an object in the camera frame, m."""
+        camera_T_map = inverse(map_T_camera)
+        points = np.concatenate([self.room.parts[p].vertices for p in np.flatnonzero(self.room.owner == number)])
+        return np.asarray(points @ camera_T_map[:3, :3].T + camera_T_map[:3, 3])
+
+    def _window(self, number: int, map_T_camera: Floats) -> tuple[slice, slice] | None:
+        """The part of the image that may show an object, None where it reaches behind the camera or lies outside."""
+        local = self._local(number, map_T_camera)
+        if local[:, 2].min() < NEAR:
+            return None
+        flat = local[:, :2] / local[:, 2:]
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        inside = ((self.directions[..., :2] >= low) & (self.directions[..., :2] <= high)).all(axis=-1)
+        rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
+
+    def shade(self, cast: Cast, eye: Floats) -> Reals:
+        """Linear colour (H, W, 3) of what was hit, seen from `eye` (3,): diffuse and glossy light, with shadows."""
+        albedo, gloss = self._albedo(cast)
+        view = _unit(eye.astype(np.float32) - cast.point)
+        normal = np.where(_dot(cast.normal, view)[..., None] < 0, -cast.normal, cast.normal)
+        light = self.room.ambient.astype(np.float32) * (0.8 + 0.2 * normal[..., 2:])
+        shine = np.zeros_like(albedo)
+        start = cast.point + np.float32(2e-3) * normal
+        for lamp in self.room.lamps:
+            to = lamp.position.astype(np.float32) - start
+            rays = np.concatenate([start, to], axis=-1)
+            dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0, 1).numpy()
+            towards = _unit(to)
+            power = np.where(dark, 0.0, 1.0 / (0.4 + 0.3 * _dot(to, to))).astype(np.float32)
+            glint = np.maximum(_dot(_unit(towards + view), normal), 0.0) ** 4
+            colour = lamp.power.astype(np.float32)
+            light = light + (power * np.maximum(_dot(towards, normal), 0.0))[..., None] * colour
+            glint **= 4
+            shine += (power * glint**2 * gloss)[..., None] * colour
+        return np.asarray(np.where(cast.part[..., None] >= 0, albedo * light + shine, 0.0), dtype=np.float32)
+
+    def _albedo(self, cast: Cast) -> tuple[Reals, Reals]:
+        """The colour (H, W, 3) and the gloss (H, W) of the surface at each pixel."""
+        materials = [part.material for part in self.room.parts]
+        first = np.array([m.colour for m in materials], dtype=np.float32)[cast.part]
+        second = np.array([m.second for m in materials], dtype=np.float32)[cast.part]
+        gloss = np.array([m.gloss for m in materials], dtype=np.float32)[cast.part]
+        pattern = np.array([_PATTERNS[m.pattern] for m in materials])[cast.part]
+        scale = np.array([m.scale for m in materials], dtype=np.float32)[cast.part]
+        share = np.zeros(cast.part.shape, dtype=np.float32)
+        for kind in (1, 2, 3):
+            chosen = pattern == kind
+            if chosen.any():
+                share[chosen] = self._pattern(kind, cast.point[chosen] / scale[chosen][:, None])
+        return first + share[..., None] * (second - first), gloss
+
+    def _pattern(self, kind: int, at: Reals) -> Reals:
+        """The share (M,) of the second colour at points (M, 3) in units of the pattern's scale."""
+        if kind == 3:
+            return (np.floor(at + 0.37).astype(np.int64).sum(axis=1) & 1).astype(np.float32)
+        cell = np.floor(at * 2).astype(np.int64) & (_NOISE - 1)
+        grain = self._grain[(cell[:, 0] * _NOISE + cell[:, 1]) * _NOISE + cell[:, 2]]
+        if kind == 1:
+            return grain
+        return np.asarray(0.5 + 0.5 * np.sin(2 * np.pi * (at @ np.array([0.31, 1.0, 0.83], dtype=np.float32)) + 4 * grain))
+
+
+def _rays(directions: Reals, map_T_camera: Floats) -> Reals:
+    turned = directions @ map_T_camera[:3, :3].T.astype(np.float32)
+    return np.concatenate([np.broadcast_to(map_T_camera[:3, 3].astype(np.float32), turned.shape), turned], axis=-1)
+
+
+def _dot(a: Reals, b: Reals) -> Reals:
+    return np.asarray(np.einsum("hwc,hwc->hw", a, b))
+
+
+def _unit(v: Reals) -> Reals:
+    return np.asarray(v / np.sqrt(_dot(v, v) + np.float32(1e-12))[..., None])
+
+
+def _tensor(rays: Reals) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays))
+
+
+def _scene(room: Room, chosen: Any) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    for p in chosen:
+        part = room.parts[p]
+        vertices = o3d.core.Tensor.from_numpy(part.vertices.astype(np.float32))
+        triangles = o3d.core.Tensor.from_numpy(part.triangles.astype(np.uint32))
+        scene.add_triangles(vertices, triangles)
+    return scene
