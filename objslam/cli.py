@@ -47,19 +47,31 @@ Format = Annotated[str | None, typer.Option("--format", help="What SRC is; guess
 Robot = Annotated[int | None, typer.Option("--robot", help="MRCLAM: which robot.")]
 WithoutRange = Annotated[bool, typer.Option("--without-range", help="MRCLAM: bearings only.")]
 Anonymous = Annotated[bool, typer.Option("--anonymous", help="MRCLAM: every landmark gets the same label.")]
+DetectorModel = Annotated[
+    Path | None,
+    typer.Option(
+        "--detector", help="ONNX model that finds the boxes in the rgb images, in place of those of the log."
+    ),
+]
 Label = Annotated[str | None, typer.Option("--label", help="Label for boxes that come without one.")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from objslam import __version__
+
+        _say(f"objslam {__version__}")
+        raise typer.Exit
 
 
 @app.callback()
 def _options(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
+    ] = False,
 ) -> None:
-    if version:
-        from objslam import __version__
-
-        _say(f"objslam {__version__}")
-        raise typer.Exit
+    pass
 
 
 @app.command()
@@ -74,6 +86,7 @@ def run(
     without_range: WithoutRange = False,
     anonymous: Anonymous = False,
     label: Label = None,
+    detector: DetectorModel = None,
 ) -> None:
     """Map the objects of a log and write the result to a folder."""
     from objslam.ledger import Ledger
@@ -83,7 +96,7 @@ def run(
     ledger = Ledger()
     prepare_output(out)
     read = _read(log, ledger, format_, robot, without_range, anonymous, label)
-    _run(read, settings, ledger, out)
+    _run(read, settings, ledger, out, detector)
 
 
 @app.command(name="eval")
@@ -103,7 +116,7 @@ def evaluate_result(
 @app.command()
 def demo(
     out: Out = Path("demo_out"),
-    seed: Annotated[int, typer.Option("--seed", help="Another seed is another drive.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed is another drive.")] = 0,
 ) -> None:
     """Simulate a drive, map it with the poses as they are and together with them, and compare both with the truth."""
     from objslam.ledger import Ledger
@@ -175,7 +188,7 @@ def _read(
     return read(path, ledger, SourceOptions(format_, robot, not without_range, anonymous, label))
 
 
-def _run(log: Log, settings: Settings, ledger: Ledger, out: Path) -> None:
+def _run(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
     import time
 
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -184,16 +197,22 @@ def _run(log: Log, settings: Settings, ledger: Ledger, out: Path) -> None:
     from objslam.results import write_result
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=_console(stderr=True), transient=True) as bar:
+    console = _console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading")
 
         def show(stage: str, done: int, total: int) -> None:
             bar.update(task, description=stage, completed=done, total=total or None)
 
+        if detector is not None:
+            from objslam.detection import default_cache, detect_log, load_detector
+
+            network = load_detector(detector, settings.detector)
+            log = detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
         result = offline.run(log, settings, ledger, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
-        write_result(result, out, log.truth)
+        write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
         writing = time.perf_counter() - begin
     _report(ledger)
     counts, seconds = result.summary["counts"], {**result.summary["seconds"], "write": writing}

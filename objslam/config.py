@@ -16,6 +16,11 @@ Device = Literal["auto", "cpu", "cuda"]
 Loss = Literal["l1", "huber", "cauchy", "gnc"]
 Layout = Literal["ssd", "yolov8", "yolov5", "end_to_end", "yolox", "yolox_decoded", "detr"]
 Role = Literal["boxes", "labels", "scores", "logits", "predictions"]
+Resize = Literal["letterbox", "corner", "stretch", "none"]
+Colour = Literal["rgb", "bgr"]
+BoxForm = Literal["xyxy", "yxyx", "cxcywh"]
+BoxUnits = Literal["pixels", "fractions"]
+Activation = Literal["none", "sigmoid", "softmax"]
 Share = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -31,9 +36,9 @@ class Detector(Section):
     metadata, the shapes of its outputs, the habits of its family."""
 
     layout: Layout | None = None
-    """what the outputs are. ssd: boxes, labels and scores (SSD, torchvision, TensorFlow; boxes and scores may be one).
-    yolov8: 4 + classes a box (v8, v11, v12). yolov5: 4 + objectness + classes (v5, v7). end_to_end: x1, y1, x2, y2, score, class
-    (v10, v26). yolox: the raw grid; yolox_decoded: as exported with the decoding inside. detr: boxes and logits."""
+    """what the outputs are. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow; boxes and scores may be one output).
+    yolov8: box and classes (v8, v11, v12). yolov5: box, objectness and classes (v5, v7). end_to_end: corners, score, class
+    (v10, v26). yolox: the raw grid; yolox_decoded: exported with the decoding inside. detr: boxes and logits."""
     outputs: dict[Role, str] | None = None
     """the name of the output that holds each role: boxes, labels and scores (ssd), boxes and logits (detr), predictions (the
     others)."""
@@ -54,12 +59,12 @@ class Detector(Section):
     """the best so many of an image are kept."""
     size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
     """width and height, px, that an image is fitted into, for models that take any."""
-    resize: Literal["letterbox", "corner", "stretch", "none"] | None = None
-    """how an image is fitted: letterbox keeps its shape and pads all round, corner pads right and below, stretch does not keep
-    its shape, none leaves it as it is."""
+    resize: Resize | None = None
+    """how an image is fitted: letterbox keeps its shape and pads all round, corner pads right and below, stretch changes its
+    shape, none leaves it as it is."""
     pad: Annotated[int, Field(ge=0, le=255)] | None = None
     """the grey that is padded with; null: 114."""
-    colour: Literal["rgb", "bgr"] | None = None
+    colour: Colour | None = None
     """the order of the channels."""
     divide_by: Positive | None = None
     """values of 0 to 255 are divided by it, then by mean and std: (value / divide_by - mean) / std."""
@@ -67,11 +72,11 @@ class Detector(Section):
     """for each channel, in the network's order."""
     std: tuple[Positive, Positive, Positive] | None = None
     """for each channel."""
-    box_form: Literal["xyxy", "yxyx", "cxcywh"] | None = None
+    box_form: BoxForm | None = None
     """two corners, or centre and size."""
-    box_units: Literal["pixels", "fractions"] | None = None
+    box_units: BoxUnits | None = None
     """pixels or fractions of the network's input."""
-    activation: Literal["none", "sigmoid", "softmax"] | None = None
+    activation: Activation | None = None
     """what makes scores of the outputs. After softmax the last class is "nothing"."""
     device: Device = "auto"
     """auto: CUDA where this onnxruntime has it, else the CPU."""
@@ -100,7 +105,7 @@ class RayNoise(Section):
     border: Annotated[float, Field(allow_inf_nan=False)] = 1.0
     """px; a box that comes this close to the image's edge is cut off there, its centre is not the object's: dropped and
     counted. A negative number keeps such boxes."""
-    border_share: NotNegative = 0.05
+    border_share: NotNegative = 0.07
     """share of a box's own width or height that counts as close to the edge as well: detectors let cut boxes end short of
     it."""
 
@@ -281,8 +286,16 @@ def _read_yaml(file: Path) -> dict[str, Any]:
 def _find_names(settings: Settings, data: dict[str, Any], folder: Path) -> None:
     """A names file that lies beside the settings file is meant, wherever the run is started."""
     names = settings.detector.names
-    if isinstance(names, str) and (folder / names).is_file():
+    if isinstance(names, str) and is_file(folder / names):
         data["detector"]["names"] = str((folder / names).resolve())
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file that can be looked at; no text that is no path at all is an error."""
+    try:
+        return path.is_file()
+    except OSError:  # too long for a name, or in a folder that is closed to us
+        return False
 
 
 def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:

@@ -35,6 +35,22 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), valid
 
 
+def project(camera: Camera, points: Floats) -> Floats:
+    """Raw (distorted) pixels (N, 2) of points (N, 3), m, in the camera frame, in front of the camera."""
+    import cv2
+
+    if len(points) == 0:
+        return np.zeros((0, 2))
+    still = np.zeros(3)
+    if camera.distortion_model == "equidistant":
+        pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, camera.matrix, camera.distortion)
+    elif camera.distortion.any():
+        pixels, _ = cv2.projectPoints(points, still, still, camera.matrix, camera.distortion)
+    else:
+        pixels = (points @ camera.matrix.T)[:, :2] / points[:, 2:]
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
     """One ray for each usable box of the keyframes, in their order.
 

@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,17 @@ from objslam.errors import LogError, OutputError
 from objslam.ledger import Ledger
 from objslam.matching import lay_truth
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
+from objslam.sources.detections_file import write_detections
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
-from objslam.types import Association, Camera, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
+from objslam.types import Association, Camera, CameraLog, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
 
 OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
 PICTURE, RECORDING, SUMMARY = "map.png", "recording.rrd", "summary.json"
 GROUNDTRUTH = "groundtruth"
 TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth_objects.json", "groundtruth_trajectory.txt"
+DETECTIONS = "detections.jsonl"
 _LATER = ("reconstruction.ply", "evaluation.json")
-_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, PICTURE, RECORDING, *_LATER)
+_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING, *_LATER)
 """Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
 _STAGING = ".objslam-staging"
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
@@ -76,17 +79,18 @@ def prepare_output(out: Path) -> None:
             _write(staging / "probe", b"objslam")
 
 
-def write_result(result: RunResult, out: Path, truth: Truth | None = None) -> None:
+def write_result(result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()) -> None:
     """Write the whole result into the folder `out`, in place of an older one; other files there stay.
 
     Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
     summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
     only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is kept
-    beside the result for `load_truth`, and drawn as it lies on the map.
+    beside the result for `load_truth`, and drawn as it lies on the map. detected: cameras whose detections this run made;
+    they are kept as detections.jsonl (of several cameras, with the camera's name), which a log can take over.
     """
     prepare_output(out)
     with _disk(out), _staged(out) as staging:
-        for name, write in _writers(result, truth).items():
+        for name, write in _writers(result, truth, detected).items():
             write(staging / name)
             _sync(staging / name)
         _sync(staging)
@@ -154,7 +158,7 @@ def _existing(out: Path, name: str) -> Path:
     return out / name
 
 
-def _writers(result: RunResult, truth: Truth | None) -> dict[str, Callable[[Path], None]]:
+def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], None]]:
     """What writes each file, by name."""
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])
@@ -171,6 +175,10 @@ def _writers(result: RunResult, truth: Truth | None) -> dict[str, Callable[[Path
     if truth is not None and truth.trajectory is not None:
         true_path = truth.trajectory
         writers[TRUTH_TRAJECTORY] = lambda file: write_trajectory(true_path, file)
+    for camera_log in detected:
+        if camera_log.detections is not None:
+            name = DETECTIONS if len(detected) == 1 else f"{camera_log.camera.name}.{DETECTIONS}"
+            writers[name] = partial(write_detections, camera_log.detections)
     drawn = lay_truth(result.map, truth) if truth is not None else None
     if result.settings.output.picture:
         from objslam.picture import draw_map
@@ -224,14 +232,18 @@ def _rays_parquet(result: RunResult) -> bytes:
     return buffer.getvalue()
 
 
+def _own(folder: Path) -> tuple[str, ...]:
+    return _OWN + tuple(sorted(file.name for file in folder.glob(f"*.{DETECTIONS}")))
+
+
 def _swap(staging: Path, out: Path) -> None:
     """Put the staged files in the place of the old ones; the order is what keeps a killed run from a mix."""
-    for name in _OWN:
+    for name in _own(out):
         (out / name).unlink(missing_ok=True)
         if name == SUMMARY:
             _sync(out)
     _sync(out)
-    for name in reversed(_OWN):
+    for name in reversed(_own(staging)):
         if (staging / name).exists():
             if name == SUMMARY:
                 _sync(out)

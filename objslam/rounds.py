@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 # What solved poses still err by, seen from the objects: with it an association at them is neither too sure nor too tolerant.
 _SOLVED_XY = 0.02  # m
 _SOLVED_YAW = 0.005  # rad
+_SAME = 11.3  # squared Mahalanobis distance below which 99 % of equal points lie (chi-squared, 3 degrees of freedom)
+_FARTHEST = 1.0  # m; objects further apart are two, however little is known of them
+_TOGETHER = 0.03  # share of frames with both that a wrong box may account for
 _FIRST = 2.0  # times that, before the first solve
 
 Progress = Callable[[str, int, int], None]
@@ -99,10 +102,10 @@ def _joint(
         progress("solve", done, total)
 
     if _by_label(settings, all_rays):
-        association = associate_by_label(rays)
-        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, tell)
-        _count_unexplained(association, ledger)
-        return Solution(keyframes, rays, association, estimate, ())
+        by_label = associate_by_label(rays)
+        _count_unexplained(by_label, ledger)
+        solved = batch.solve_joint(keyframes, rays, by_label, settings, ledger, tell)
+        return Solution(keyframes, rays, by_label, solved, ())
 
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
@@ -124,6 +127,14 @@ def _joint(
         association = found
         start = map_T_base @ keyframes.base_T_camera
         estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, tell, start)
+        for _ in range(settings.joint.max_rounds):
+            merged = merge_unseen_together(rays, association, estimate)
+            if merged.count == association.count:
+                break
+            rounds.append({"objects": merged.count, "rays_changed": int((merged.object != association.object).sum())})
+            association = merged
+            start = estimate.map_T_base @ keyframes.base_T_camera
+            estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, tell, start)
         map_T_base = estimate.map_T_base
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
@@ -148,6 +159,45 @@ def _associate(
     sigma, place = noise
     return associate(
         rays, frames, cameras, settings, map_T_camera=map_T_camera, sigma=sigma, position_sigma=place, seed=settings.seed
+    )
+
+
+def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate) -> Association:
+    """Objects of one label that are no further apart than their covariances allow, and never seen in one frame, are one.
+
+    Poses that drifted between two visits leave one object twice, and each of the two then holds the poses of its visit: no
+    association at these poses finds out. Joined, they close the loop. Nearest pairs (by Mahalanobis distance) first; an
+    object takes part in one pair at a time.
+    """
+    position, covariance = estimate.positions, estimate.covariance
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
+    a, b = (known[i] for i in np.triu_indices(len(known), 1))
+    near = (association.label[a] == association.label[b]) & (np.linalg.norm(position[a] - position[b], axis=1) < _FARTHEST)
+    a, b = a[near], b[near]
+    apart = position[a] - position[b]
+    squared = np.einsum("pi,pi->p", apart, np.linalg.solve(covariance[a] + covariance[b], apart[..., None])[..., 0])
+    order = np.argsort(squared, kind="stable")
+    order = order[squared[order] < _SAME]
+    held = association.object >= 0
+    frames: list[set[int]] = [set() for _ in range(association.count)]
+    for j, k in zip(association.object[held].tolist(), rays.keyframe[held].tolist(), strict=True):
+        frames[j].add(k)
+    into = np.arange(association.count)
+    taken = np.zeros(association.count, dtype=bool)
+    for i, j in zip(a[order].tolist(), b[order].tolist(), strict=True):
+        together = len(frames[i] & frames[j])
+        if taken[i] or taken[j] or together > _TOGETHER * min(len(frames[i]), len(frames[j])):
+            continue
+        keep, drop = (i, j) if len(frames[i]) >= len(frames[j]) else (j, i)
+        into[drop], taken[i], taken[j] = keep, True, True
+    kept = np.flatnonzero(into == np.arange(association.count))
+    number = np.searchsorted(kept, into)
+    weights, existence = association.label_weights, association.existence
+    return Association(
+        object=np.append(number, -1)[association.object],  # -1 takes the last
+        label=association.label[kept],
+        label_weights=None if weights is None else weights[kept],
+        existence=None if existence is None else existence[kept],
     )
 
 

@@ -24,11 +24,11 @@ def assign(
 ) -> Ints:
     """The landmark of each ray (R,), or -1: at most one ray a landmark and frame, the most likely choice in each frame.
 
-    positions: (N, 3) m, NaN for a landmark to leave out; covariances: (N, 3, 3) m^2. accepts: (N, L) whether a box of a label
-    may be the landmark's. map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, position_sigma: m, of the rays.
-    pose_covariance: (K, 6, 6) of the cameras, rotation first, in the camera's own frame (GTSAM's marginals). gate: the share of
-    right matches that the gate on the squared deviation of the bearing lets through (chi-squared, 2 degrees of freedom); a
-    ray's range adds to the cost where it is known, and breaks nothing when it is wrong.
+    positions: (N, 3) m, NaN for a landmark to leave out; covariances: (N, 3, 3) m^2. accepts: (N, L) whether a box of a
+    label may be the landmark's. map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, position_sigma: m, of the
+    rays. pose_covariance: (K, 6, 6) of the cameras, rotation first, in the camera's own frame (GTSAM's marginals). gate: the
+    share of right matches that the gate on the squared deviation of the bearing lets through (chi-squared, 2 degrees of
+    freedom); a ray's range adds to the cost where it is known, and breaks nothing when it is wrong.
     """
     origin, direction = rays.in_map(map_T_camera)
     s = Sightings(

@@ -8,9 +8,9 @@ from objslam.types import Association, Rays
 
 
 def associate_by_label(rays: Rays) -> Association:
-    """One object for each label that has a ray, in the order of label_names; of several boxes a frame the best scored counts.
+    """One object for each label that has a ray, in the order of label_names; of several boxes a frame the best one counts.
 
-    The ties of a frame go to the first box. Rays left over belong to no object (-1).
+    Best is the highest score. The ties of a frame go to the first box. Rays left over belong to no object (-1).
     """
     labels = np.unique(rays.label)
     best = np.lexsort((np.arange(len(rays)), -rays.score, rays.label, rays.keyframe))

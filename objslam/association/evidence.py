@@ -1,4 +1,4 @@
-"""Is there an object at all? What speaks for it (boxes where it should be) against what speaks for chance (misses, strays)."""
+"""Is there an object at all? Boxes where it should be speak for it, misses, strays and odd sizes against it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.extent import grouped_median
-from objslam.association.landmarks import State, variance
+from objslam.association.landmarks import State, sizes, variance
 from objslam.association.sightings import Sightings
 from objslam.association.visibility import View, Visits
 from objslam.types import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # how often a phantom is detected where it should be, of how often an object of its class is
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # tried for how alike the rates of the objects are
-_CLEARLY = 10.0  # ln likelihood
+_CLEARLY = 5.0  # ln likelihood
 _POOLED = 100.0  # boxes: a class with so many weighs its own rate as much as that of all classes
 _RATES = (0.01, 0.95)
+_PRIOR = 3.0  # the most that odds without looking can be, and what they are for a class with few boxes
+_DOUBT = 5.0  # stray boxes that every class is reckoned to have
 _LOG_SIZE = 0.7  # standard deviation of ln size within a class,
 _PHANTOM_LOG_SIZES = 4.6  # and the width of the range in which a phantom may have any: a factor of 100
 _SURE = 20.0  # log odds that need no more
@@ -26,7 +27,7 @@ _SURE = 20.0  # log odds that need no more
 class Rates:
     """How often objects of each class are detected where they should be.
 
-    mean: (L,). concentration: of the beta distribution of an object's rate about the mean of its class (sum of its parameters).
+    mean: (L,). concentration: of the beta distribution of a rate about the mean of its class, the sum of its parameters.
     """
 
     mean: Floats
@@ -87,8 +88,8 @@ def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) ->
 def chance_odds(s: Sightings, state: State, kind: Ints, visits: Visits, view: View, gate: float) -> Floats:
     """Log odds (N,) that the rays of each object do not meet by chance.
 
-    Strays of its class (rays without object, and those of objects with no more rays than it has) make points by the pair. How
-    many further rays pass such a point within the gate, of all frames that look at it, is Poisson distributed.
+    Strays of its class (rays without object, and those of objects with no more rays than it has) make points by the pair.
+    How many further rays pass such a point within the gate, of all frames that look at it, is Poisson distributed.
     """
     from scipy.stats import poisson
 
@@ -105,16 +106,21 @@ def chance_odds(s: Sightings, state: State, kind: Ints, visits: Visits, view: Vi
     return np.asarray(np.clip(-points - poisson.logsf(number - 3, expected), -_SURE, _SURE))
 
 
+def prior_odds(s: Sightings, state: State, kind: Ints) -> Floats:
+    """Log odds (N,) of an object of its class before its own boxes are looked at: how many boxes of the class have one."""
+    labels = state.landmarks.accepts.shape[1]
+    held = np.bincount(s.label[state.matched >= 0], minlength=labels)
+    free = np.bincount(s.label[state.matched < 0], minlength=labels)
+    odds = np.log((held + _DOUBT * _PRIOR) / (free + _DOUBT))
+    return np.minimum(odds, np.log(_PRIOR))[kind]
+
+
 def size_odds(s: Sightings, state: State, kind: Ints) -> Floats:
     """Log odds (N,), at most 0, of an object of its class against a phantom, by how large its boxes say it is.
 
     Rays of different things that cross make a point at a wrong distance, where a box says a wrong size.
     """
-    count, held = len(state.landmarks), np.flatnonzero(state.matched >= 0)
-    index = state.matched[held]
-    distance = np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1)
-    size = np.log(np.maximum(np.sqrt(s.size[held].prod(axis=1)) * distance, 1e-6))
-    own = np.nan_to_num(grouped_median(size, index, count))
+    own = np.log(np.maximum(sizes(s, state), 1e-6))
     usual = _weighted_median(own, state.number.astype(float), kind, state.landmarks.accepts.shape[1])[kind]
     as_object = -0.5 * ((own - usual) / _LOG_SIZE) ** 2 - np.log(_LOG_SIZE * np.sqrt(2 * np.pi))
     return np.asarray(np.minimum(as_object + np.log(_PHANTOM_LOG_SIZES), 0.0))

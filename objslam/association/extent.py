@@ -16,9 +16,9 @@ def extents(
     keyframes: Keyframes,
     cameras: tuple[Camera, ...],
 ) -> Floats:
-    """Width and height (N, 2), m, of the objects at positions (N, 3): the median over their rays; NaN without ray or position.
+    """Width and height (N, 2), m, of the objects at positions (N, 3): the median over their rays.
 
-    map_T_camera: (K, 4, 4) of the keyframes.
+    NaN where there is no ray or no position. map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)
     index = association.object[held]

@@ -125,8 +125,8 @@ def _draw(s: Sightings, count: int, rng: np.random.Generator) -> tuple[Ints, Int
 class _Scorer:
     """Rays of one label, laid out so that the best ray of each frame is a running maximum over slices.
 
-    Rays stand in the order of their rank in their frame, and frames in the order of how many rays they have: for every k those
-    with more than k rays come first.
+    Rays stand in the order of their rank in their frame, and frames in the order of how many rays they have: for every k
+    those with more than k rays come first.
     """
 
     def __init__(self, s: Sightings, search: Search) -> None:

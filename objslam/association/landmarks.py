@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from objslam.association.extent import grouped_median
 from objslam.association.sightings import Sightings
 from objslam.types import Bools, Floats, Ints
 
@@ -26,7 +27,7 @@ class Landmarks:
 
     @classmethod
     def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
-        """Landmarks of one label each, label: (N,) of `labels`, with nothing known about their precision."""
+        """Landmarks of one label each, label: (N,) of `labels`, where they are taken to be."""
         accepts = np.zeros((len(position), labels), dtype=bool)
         accepts[np.arange(len(position)), label] = True
         return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
@@ -83,8 +84,25 @@ def variance(s: Sightings, distance: Floats, noise: Floats) -> Floats:
 
 
 def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
-    """How far each ray passes its point (R, 3): squared, m^2, inf where the point is behind, and the distance to it, m: (R,)."""
+    """How far each ray passes its point (R, 3), squared (inf where that is behind), and how far away that is: (R,), m."""
     to = position - s.origin
     depth = np.einsum("ri,ri->r", to, s.direction)
     distance2 = np.einsum("ri,ri->r", to, to)
     return np.where(depth > 0, np.maximum(distance2 - depth**2, 0.0), np.inf), np.sqrt(distance2)
+
+
+def sizes(s: Sightings, state: State) -> Floats:
+    """The size (N,) of each landmark, m: geometric mean of width and height, the median over its boxes; 0 without any."""
+    held = np.flatnonzero(state.matched >= 0)
+    index = state.matched[held]
+    distance = np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1)
+    return np.nan_to_num(grouped_median(np.sqrt(s.size[held].prod(axis=1)) * distance, index, len(state.landmarks)))
+
+
+def blurs(s: Sightings, state: State) -> Floats:
+    """One standard deviation (N,), m, of the rays of each landmark at its distance; 0 without any."""
+    held = np.flatnonzero(state.matched >= 0)
+    index, r = state.matched[held], s.take(held)
+    distance = np.linalg.norm(state.landmarks.position[index] - r.origin, axis=1)
+    spread = np.sqrt(variance(r, distance, state.landmarks.noise[index]))
+    return np.nan_to_num(grouped_median(spread, index, len(state.landmarks)))

@@ -23,9 +23,9 @@ _CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
 class Edges:
     """Possible matches, by ray and landmark in increasing order.
 
-    ray, landmark: (E,). deviation: (E,) squared, in standard deviations of the bearing (2 degrees of freedom). vague: (E,) how
-    much less a landmark of uncertain place says: the logarithm of the area that it covers over the ray's own. cost: (E,) all
-    that together, with what the range says.
+    ray, landmark: (E,). deviation: (E,) squared, in standard deviations of the bearing (2 degrees of freedom). vague: (E,)
+    how much less a landmark of uncertain place says: the logarithm of the area that it covers over the ray's own. cost: (E,)
+    all that together, with what the range says.
     """
 
     ray: Ints
@@ -70,7 +70,7 @@ def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | 
     cost = deviation + vague + np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
     keep = np.flatnonzero(deviation <= gate)
     keep = keep[np.lexsort((index[keep], ray[keep]))]
-    return Edges(*(column[keep] for column in (ray, index, deviation, vague, cost)))
+    return Edges(ray[keep], index[keep], deviation[keep], vague[keep], cost[keep])
 
 
 def _carried(to: Floats, pose: Floats) -> Floats:
@@ -82,13 +82,15 @@ def _carried(to: Floats, pose: Floats) -> Floats:
 
 def _near(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
     """Pairs that a bound on their deviation lets through; the bound takes matrix products only."""
-    rays, found = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    rays: list[Ints] = [np.zeros(0, dtype=np.int64)]
+    found: list[Ints] = [np.zeros(0, dtype=np.int64)]
     if len(s) == 0 or len(landmarks) == 0:
         return rays[0], found[0]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
-    turn = move = np.zeros(len(s))
+    turn: Floats = np.zeros(len(s))
+    move: Floats = np.zeros(len(s))
     if pose is not None:  # twice each part bounds the two together with their correlation
-        turn, move = (2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
+        turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     centre = s.origin.mean(axis=0)
     for label in np.unique(s.label):
         mine, which = np.flatnonzero(s.label == label), np.flatnonzero(landmarks.accepts[:, label])
@@ -123,12 +125,14 @@ def choose(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
     if len(useful) == 0:
         return chosen
     ray, landmark, gain = edges.ray[useful], edges.landmark[useful], unmatched - cost[useful]
-    places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)
+    places, place = np.unique(
+        frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True
+    )  # a landmark in a frame
     size = len(frame) + len(places)
     graph = coo_array((np.ones(len(ray)), (ray, len(frame) + place)), shape=(size, size))
-    part = connected_components(graph, directed=False)[1][ray]
+    part = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[ray]
     order = np.lexsort((landmark, ray, -gain, part))
-    ray, landmark, gain, part, place = (a[order] for a in (ray, landmark, gain, part, place))
+    ray, landmark, gain, part, place = ray[order], landmark[order], gain[order], part[order], place[order]
     first = np.flatnonzero(np.diff(part, prepend=-1))
     end = np.append(first[1:], len(part))
     one_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)

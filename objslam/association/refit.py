@@ -14,36 +14,37 @@ _DAMPING = 1e-6  # of the information: along a direction that the rays do not fi
 _ITERATIONS = 6
 
 
-def refit(s: Sightings, ray: Ints, index: Ints, start: Floats, noise: Floats) -> tuple[Floats, Floats]:
-    """Positions (N, 3) m and covariances (N, 3, 3) of points with pairs of a ray (P,) and the point (P,) that has it.
+def refit(s: Sightings, ray: Ints, index: Ints, start: Floats, noise: Floats) -> Floats:
+    """Positions (N, 3), m, of points from pairs of a ray (P,) and the point (P,) that has it; several may have one ray.
 
-    start: (N, 3) m. noise: (N,) factor on the noise of the rays. A ray may be given to several points. Points without rays stay,
-    with a covariance without bound.
+    start: (N, 3) m, where points stay along directions that their rays do not fix. noise: (N,) factor on the rays' noise.
     """
     count = len(start)
-    if count == 0 or len(ray) == 0:
-        return start.copy(), np.broadcast_to(np.eye(3) / 1e-12, (count, 3, 3)).copy()
     order = np.argsort(index, kind="stable")
     r, index = s.take(ray[order]), index[order]
     along = r.direction[:, :, None] * r.direction[:, None, :]
-    across = np.eye(3) - along
     ranged = np.isfinite(r.range)
     position = start.copy()
     for _ in range(_ITERATIONS):
         to = position[index] - r.origin
         depth = np.einsum("ri,ri->r", to, r.direction)
         offset = to - depth[:, None] * r.direction
-        spread = variance(r, np.linalg.norm(to, axis=1), noise[index])
+        distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
+        toward = to / distance[:, None]
+        # an angle does not change along the line of sight to the point, which the ray itself only nearly is
+        across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
+        spread = variance(r, distance, noise[index])
         weight = 1 / (spread + np.einsum("ri,ri->r", offset, offset) / _CAUCHY)
         beyond = np.where(ranged, r.range - depth, 0.0)
         range_weight = np.where(ranged, 1 / r.range_sigma**2 / (1 + (beyond / r.range_sigma) ** 2 / _RANGE_CAUCHY) ** 2, 0.0)
         information = weight[:, None, None] * across + range_weight[:, None, None] * along
-        pull = (range_weight * beyond)[:, None] * r.direction - weight[:, None] * offset
-        total = _sums(information.reshape(-1, 9), index, count).reshape(-1, 3, 3)
+        pull = (range_weight * beyond)[:, None] * r.direction - weight[:, None] * (across @ offset[:, :, None])[:, :, 0]
+        total = sums(information.reshape(-1, 9), index, count).reshape(-1, 3, 3)
         total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-        position = position + np.linalg.solve(total, _sums(pull, index, count)[:, :, None])[:, :, 0]
-    return position, np.linalg.inv(total)
+        position = position + np.linalg.solve(total, sums(pull, index, count)[:, :, None])[:, :, 0]
+    return position
 
 
-def _sums(values: Floats, index: Ints, count: int) -> Floats:
-    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1)
+def sums(values: Floats, index: Ints, count: int) -> Floats:
+    """Sums (count, D) of the values (P, D) of each group; index: (P,) group of each row."""
+    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1).astype(np.float64)

@@ -1,8 +1,8 @@
 """Global association with known poses: which box is of which object, when nobody says how many objects there are.
 
-Per label, points where rays of different frames meet are scored against all its rays at once; the best are refitted, their rays
-taken out, and what is left is searched again. Then objects are merged, fused across labels and dropped, each by what explains
-the boxes, and the misses, more cheaply.
+Per label, points where rays of different frames meet are scored against all its rays at once; the best are refitted, their
+rays taken out, and what is left is searched again. Then objects are merged, fused across labels and dropped, each by what
+explains the boxes, and the misses, more cheaply.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ import numpy as np
 
 from objslam import config
 from objslam.association.assign import gate_limit
-from objslam.association.evidence import Rates, chance_odds, detection_rates, size_odds
-from objslam.association.extent import grouped_median
+from objslam.association.evidence import chance_odds, detection_rates, prior_odds, size_odds
+from objslam.association.extent import grouped_median, grouped_quantile
 from objslam.association.landmarks import Landmarks, State, offsets, variance
 from objslam.association.matches import choose, gated_edges, track_bonus
-from objslam.association.refit import refit
+from objslam.association.motion import rest_odds
+from objslam.association.refit import refit, sums
 from objslam.association.sightings import Sightings, sight
 from objslam.association.structure import RAYLEIGH_MEDIAN, close_pairs, merges
 from objslam.association.visibility import View, Visits, visits
-from objslam.ledger import Ledger
+from objslam.errors import ConfigError
 from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
 
 _TURNS = 8  # searches among the rays that are left
-_ROUNDS = 12  # of merging, and of dropping, at the most
+_ROUNDS = 12  # of merging, and of merging and dropping, at the most
 _SETTLED = 3  # times that assignment and refit take turns after a change
 _SAMPLE = 4096  # rays of one label that a search looks at
 _MIN_RAYS = 3
@@ -60,18 +61,21 @@ def associate(
     sigma: Floats,
     position_sigma: float = 0.0,
     seed: int = 0,
-    ledger: Ledger | None = None,
 ) -> Association:
     """Which ray belongs to which object, at the camera poses (K, 4, 4) of the keyframes.
 
-    keyframes: all frames that were looked at, those without any box too: what was not seen counts as well. sigma: (R,) rad and
-    position_sigma: m, the noise of the rays with that of the poses. Objects come sorted by label, then by the frame that saw
-    them first; nothing else depends on the order of rays and keyframes. Rays that no object at rest explains have no object;
-    the ledger counts them.
+    keyframes: all frames that were looked at, those without any box too: what was not seen counts as well. sigma: (R,) rad
+    and position_sigma: m, the noise of the rays with that of the poses. Objects come sorted by label, then by the frame that
+    saw them first, and nothing depends on the order of rays and keyframes. Rays that no object at rest explains have none.
     """
     s, ray, keyframe = sight(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
     view = View(
-        cameras, keyframes.camera[keyframe], map_T_camera[keyframe], settings.rays.border, settings.rays.border_share
+        stamps=keyframes.stamps[keyframe],
+        cameras=cameras,
+        camera=keyframes.camera[keyframe],
+        map_T_camera=map_T_camera[keyframe],
+        margin=settings.rays.border,
+        margin_share=settings.rays.border_share,
     )
     gate = gate_limit(settings.association.gate)
     work = _Work(s, view, len(rays.label_names), gate, settings.association, _device(settings), seed)
@@ -81,23 +85,27 @@ def associate(
         before = len(state.landmarks)
         state = _settle(work, _explore(work, state, turn, _PARALLAX), 2)
         state = _merge_round(work, _not_by_chance(work, state))
-        state, _ = _drop_phantoms(work, state, 1)
+        state = _drop(work, state, _existence(work, state))
         if len(state.landmarks) <= before:
             break
-    state = _merge_all(work, state, across_labels=False)
-    if settings.association.fuse_labels:
-        state = _merge_all(work, state, across_labels=True)
-    state, existence = _drop_phantoms(work, state, 1000)
-    return _result(work, state, existence, rays, ray, ledger)
+    state = _with_far_ones(work, state)
+    for _ in range(_ROUNDS):  # rays of what is dropped go free, and may show that others are one
+        state = _merge_all(work, state)
+        before = len(state.landmarks)
+        state = _drop_all(work, state)
+        if len(state.landmarks) == before:
+            break
+    return _result(work, state, ray)
 
 
 def _device(settings: config.Settings) -> str:
     """Scoring pays on CUDA whenever it is there."""
-    if settings.triangulation.device != "auto":
-        return settings.triangulation.device
     import torch
 
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    device, there = settings.triangulation.device, torch.cuda.is_available()
+    if device == "cuda" and not there:
+        raise ConfigError("torch sees no CUDA device", hint="set triangulation.device=auto")
+    return ("cuda" if there else "cpu") if device == "auto" else device
 
 
 def _explore(work: _Work, state: State, turn: int, parallax: float) -> State:
@@ -124,6 +132,19 @@ def _explore(work: _Work, state: State, turn: int, parallax: float) -> State:
     return State(landmarks, state.matched)
 
 
+def _with_far_ones(work: _Work, state: State) -> State:
+    """Landmarks added where rays agree that have no parallax: seen from afar, or by a robot that hardly moves."""
+    known = len(state.landmarks)
+    state = _settle(work, _explore(work, state, _TURNS, 0.0), 2)
+    held = np.flatnonzero(state.matched >= 0)
+    index, direction = state.matched[held], work.s.direction[held]
+    mean = sums(direction, index, len(state.landmarks))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
+    narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
+    return _not_by_chance(work, state.keep(narrow | (np.arange(len(narrow)) < known)))
+
+
 def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
     """Assignment and refit in turns, until nothing changes or for some times."""
     for _ in range(times):
@@ -132,8 +153,8 @@ def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
         same = np.array_equal(matched, state.matched)
         held = np.flatnonzero(matched >= 0)
         old = state.landmarks
-        position, covariance = refit(work.s, held, matched[held], old.position, old.noise)
-        state = State(replace(old, position=position, covariance=covariance), matched)
+        position = refit(work.s, held, matched[held], old.position, old.noise)
+        state = State(replace(old, position=position), matched)
         state = State(replace(state.landmarks, noise=_noise(work, state)), matched)
         state = state.keep((state.number >= _MIN_RAYS) & np.isfinite(position).all(axis=1))
         if same:
@@ -182,32 +203,42 @@ def _merge_round(work: _Work, state: State, across_labels: bool = False) -> Stat
     return _settle(work, state.merge(target))
 
 
-def _merge_all(work: _Work, state: State, across_labels: bool) -> State:
-    for _ in range(_ROUNDS):
-        before = len(state.landmarks)
-        state = _merge_round(work, state, across_labels)
-        if len(state.landmarks) == before:
-            break
+def _merge_all(work: _Work, state: State) -> State:
+    for across_labels in (False, True) if work.settings.fuse_labels else (False,):
+        for _ in range(_ROUNDS):
+            before = len(state.landmarks)
+            state = _merge_round(work, state, across_labels)
+            if len(state.landmarks) == before:
+                break
     return state
 
 
-def _drop_phantoms(work: _Work, state: State, times: int) -> tuple[State, Floats]:
-    """Only landmarks that exist more likely than the settings ask for, and that likelihood (N,)."""
-    for _ in range(times):
-        existence = _existence(work, state)
-        failing = existence < work.settings.min_existence
-        if not failing.any():
-            break
-        state = _settle(work, state.keep(~(failing & ~_has_weaker(work, state, failing))))
-    return state, existence
+def _drop_all(work: _Work, state: State) -> State:
+    while True:
+        before = len(state.landmarks)
+        state = _drop(work, state, _existence(work, state))
+        if len(state.landmarks) == before:
+            return state
+
+
+def _drop(work: _Work, state: State, existence: Floats) -> State:
+    """Without the landmarks that exist less likely (N,) than the settings ask for; of neighbours the weaker go first."""
+    failing = existence < work.settings.min_existence
+    if not failing.any():
+        return state
+    return _settle(work, state.keep(~failing | _has_weaker(work, state, failing)))
 
 
 def _existence(work: _Work, state: State) -> Floats:
+    """How likely each landmark is an object at rest (N,)."""
+    from scipy.special import expit
+
     kind, seen = state.kind(work.s), work.visits(state)
     rates = detection_rates(seen, kind, work.labels)
-    by_rate = rates.log_odds(seen, kind) + size_odds(work.s, state, kind)
+    by_rate = prior_odds(work.s, state, kind) + rates.log_odds(seen, kind)
+    by_rate += size_odds(work.s, state, kind) + rest_odds(work.s, work.view.stamps, state)
     by_chance = chance_odds(work.s, state, kind, seen, work.view, work.gate)
-    return np.asarray(1 / (1 + np.exp(-by_rate)) / (1 + np.exp(-by_chance)))
+    return np.asarray(expit(by_rate) * expit(by_chance))
 
 
 def _has_weaker(work: _Work, state: State, failing: Bools) -> Bools:
@@ -221,18 +252,16 @@ def _has_weaker(work: _Work, state: State, failing: Bools) -> Bools:
     return result
 
 
-def _result(work: _Work, state: State, existence: Floats, rays: Rays, ray: Ints, ledger: Ledger | None) -> Association:
+def _result(work: _Work, state: State, ray: Ints) -> Association:
+    """The objects in an order of their own; ray: (R,) which ray each sighting is."""
     counts, kind = state.labels(work.s), state.kind(work.s)
-    count = len(kind)
-    first = np.full(count, len(work.s))
+    first = np.full(len(kind), len(work.s))
     held = np.flatnonzero(state.matched >= 0)
     np.minimum.at(first, state.matched[held], held)
     order = np.lexsort((first, kind))
-    number = np.append(np.empty(count, dtype=np.int64), -1)
-    number[order] = np.arange(count)
-    matched = np.empty(len(rays), dtype=np.int64)
+    number = np.append(np.empty(len(kind), dtype=np.int64), -1)
+    number[order] = np.arange(len(kind))
+    matched = np.empty(len(ray), dtype=np.int64)
     matched[ray] = number[state.matched]
-    if ledger is not None:
-        ledger.drop("boxes that no object at rest explains", int((matched < 0).sum()))
     weights = counts[order] / np.maximum(counts[order].sum(axis=1, keepdims=True), 1)
-    return Association(matched, kind[order], weights, existence[order])
+    return Association(matched, kind[order], weights, _existence(work, state)[order])

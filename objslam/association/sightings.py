@@ -42,7 +42,8 @@ class Sightings:
     def take(self, rays: Bools | Ints) -> Self:
         """A selection (mask or increasing indices)."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self)(**{k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()})
+        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()}
+        return type(self)(**selected)
 
 
 def sight(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from objslam.association.evidence import Rates
 from objslam.association.extent import grouped_median
-from objslam.association.landmarks import State, offsets, variance
+from objslam.association.landmarks import State, blurs, offsets, sizes, variance
+from objslam.association.matches import gated_edges
 from objslam.association.refit import refit
 from objslam.association.sightings import Sightings
 from objslam.association.visibility import Visits
@@ -46,8 +48,8 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     """
     count, number = len(state.landmarks), state.number
     target = np.arange(count)
-    diameter, blur = _sizes(s, state)
-    a, b = _close(state, diameter, blur, gate)
+    diameter = sizes(s, state)
+    a, b = _close(s, state, diameter, gate)
     wanted = (kind[a] == kind[b]) != across_labels
     a, b = a[wanted], b[wanted]
     if len(a) == 0:
@@ -65,7 +67,7 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     if across_labels:
         one &= never & (large < _SIZE_RATIO * small)
     taken = np.zeros(count, dtype=bool)
-    for p in np.lexsort((b, a, -gain)):
+    for p in np.lexsort((b, a, -gain)):  # the clearest first, each object in one pair at a time
         if one[p] and not taken[a[p]] and not taken[b[p]]:
             taken[[a[p], b[p]]] = True
             keep, gone = (a[p], b[p]) if number[a[p]] >= number[b[p]] else (b[p], a[p])
@@ -73,33 +75,37 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     return target
 
 
-def _sizes(s: Sightings, state: State) -> tuple[Floats, Floats]:
-    """The size of each object (geometric mean of width and height) and the noise of its rays at its distance: (N,) m."""
-    count, held = len(state.landmarks), np.flatnonzero(state.matched >= 0)
-    index, r = state.matched[held], s.take(held)
-    distance = np.linalg.norm(state.landmarks.position[index] - r.origin, axis=1)
-    diameter = grouped_median(np.sqrt(r.size.prod(axis=1)) * distance, index, count)
-    blur = grouped_median(np.sqrt(variance(r, distance, state.landmarks.noise[index])), index, count)
-    return np.nan_to_num(diameter), np.nan_to_num(blur)
-
-
 def close_pairs(s: Sightings, state: State, gate: float) -> tuple[Ints, Ints]:
-    """Pairs of landmarks a < b (P,) that stand so close that they could be one: within reach of each other's rays, or within
-    their size."""
-    return _close(state, *_sizes(s, state), gate)
+    """Pairs of landmarks a < b (P,) that could be one: within reach of each other's rays, within their size, in one line."""
+    return _close(s, state, sizes(s, state), gate)
 
 
-def _close(state: State, diameter: Floats, blur: Floats, gate: float) -> tuple[Ints, Ints]:
+def _close(s: Sightings, state: State, diameter: Floats, gate: float) -> tuple[Ints, Ints]:
     from scipy.spatial import cKDTree
 
     count, position = len(state.landmarks), state.landmarks.position
     near = min(_NEIGHBOURS + 1, count)
-    gap, other = cKDTree(position).query(position, k=np.arange(1, near + 1))
-    a, b, gap = np.repeat(np.arange(count), near), other.ravel(), gap.ravel()
+    gap, other = (np.asarray(found).ravel() for found in cKDTree(position).query(position, k=np.arange(1, near + 1)))
+    a, b = np.repeat(np.arange(count), near), other
+    blur = blurs(s, state)
     reach = np.maximum(_REACH * np.sqrt(gate) * (blur[a] + blur[b]), 0.5 * (diameter[a] + diameter[b]))
     close = (gap < reach) & (a != b)
-    pairs = np.unique(np.sort(np.stack([a[close], b[close]], axis=1), axis=1), axis=0)
+    c, d = _on_one_line(s, state, gate)
+    pairs = np.stack([np.append(a[close], c), np.append(b[close], d)], axis=1)
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
+
+
+def _on_one_line(s: Sightings, state: State, gate: float) -> tuple[Ints, Ints]:
+    """Pairs (P,) where half of the rays of the first pass the second too: one thing under little parallax, or a ghost."""
+    edges = gated_edges(s, state.landmarks, gate)
+    own = state.matched[edges.ray]
+    other = (own >= 0) & (own != edges.landmark)
+    count = len(state.landmarks)
+    pairs, shared = np.unique(own[other] * count + edges.landmark[other], return_counts=True)
+    first, second = pairs // count, pairs % count
+    half = 2 * shared >= state.number[first]
+    return first[half], second[half]
 
 
 def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
@@ -114,15 +120,14 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 
 def _gains(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates, gate: float, pairs: _Pairs) -> Floats:
-    """What one object saves over two (P,), as -2 ln likelihood: the fit of the rays, boxes that only two explain, the misses,
-    and the object itself."""
+    """What one object saves over two (P,), -2 ln likelihood: fit, boxes that only two explain, misses, the object itself."""
     count, a, b, number = len(pairs), pairs.a, pairs.b, state.number.astype(float)
     position, noise = state.landmarks.position, state.landmarks.noise
     r, own = s.take(pairs.ray), state.matched[pairs.ray]
     two = _ray_costs(r, position[own], noise[own], gate)
     share = (number[a] / (number[a] + number[b]))[:, None]
     wider = np.maximum(noise[a], noise[b])
-    middle, _ = refit(s, pairs.ray, pairs.pair, share * position[a] + (1 - share) * position[b], wider)
+    middle = refit(s, pairs.ray, pairs.pair, share * position[a] + (1 - share) * position[b], wider)
     off2, distance = offsets(r, middle[pairs.pair])
     deviation = np.sqrt(off2 / variance(r, distance, np.ones(len(r))))
     joint = np.maximum(grouped_median(deviation, pairs.pair, count) / RAYLEIGH_MEDIAN, np.minimum(noise[a], noise[b]))
@@ -147,7 +152,8 @@ def _ray_costs(r: Sightings, position: Floats, noise: Floats, gate: float) -> Fl
     return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise), gate)
 
 
-def _table(visits: Visits, which: Bools | None):  # type: ignore[no-untyped-def]
+def _table(visits: Visits, which: Bools | None) -> Any:
+    """A sparse matrix (N, F) with 1 where the visits `which` (V,) are, or all of them."""
     from scipy.sparse import csr_array
 
     obj, frame = (visits.object, visits.frame) if which is None else (visits.object[which], visits.frame[which])

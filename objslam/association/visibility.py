@@ -8,6 +8,7 @@ import numpy as np
 
 from objslam.association.extent import grouped_median, grouped_quantile
 from objslam.association.sightings import MIN_DEPTH, Sightings
+from objslam.rays import project, undistort
 from objslam.types import Bools, Camera, Floats, Ints
 
 _CHUNK = 1 << 20  # pairs of an object and a frame at a time
@@ -20,9 +21,12 @@ _FILLED = 0.6  # of a box, width and height, that its object surely fills
 
 @dataclass(frozen=True)
 class View:
-    """The frames' cameras: cameras, camera (F,) of each frame, map_T_camera (F, 4, 4); and how close to the image's edge a box
-    is still used: margin px, or margin_share of its size (negative margin: boxes that are cut off are used as well)."""
+    """The frames: stamps (F,) s; cameras, camera (F,) of each frame, map_T_camera (F, 4, 4).
 
+    margin px, margin_share of its size: how close to the image's edge a box is still used; a negative margin: anywhere.
+    """
+
+    stamps: Floats
     cameras: tuple[Camera, ...]
     camera: Ints
     map_T_camera: Floats
@@ -72,9 +76,9 @@ class Visits:
 def visits(s: Sightings, matched: Ints, position: Floats, kind: Ints, view: View) -> Visits:
     """Where the objects at positions (N, 3) were detected or should have been.
 
-    matched: (R,) the object of each sighting, -1 none. kind: (N,) the class of each object. An object should be detected where
-    its box lies in the image, at a distance at which its class, or most often itself, is detected, unless a box whose object is
-    closer covers it.
+    matched: (R,) the object of each sighting, -1 none. kind: (N,) the class of each object. An object should be detected
+    where its box lies in the image, at a distance at which its class, or most often itself, is detected, from its front if
+    it has one, and where no box covers it whose object is closer.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
@@ -142,7 +146,7 @@ def _unit(vectors: Floats) -> Floats:
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: View
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Object, frame, distance (V,) and pixel (V, 2) where the boxes of the objects lie in the image, no further than reach."""
+    """Object, frame, distance (V,) and pixel (V, 2) where the boxes of the objects lie in the image, within reach (N,) m."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]
@@ -185,26 +189,8 @@ def _widest(camera: Camera) -> float:
 
     Beyond it a distortion model may fold back into the image what is out of sight.
     """
-    from objslam.rays import undistort
-
     u, v = np.linspace(0.0, camera.width - 1, 33), np.linspace(0.0, camera.height - 1, 33)
     sides = [np.column_stack([u, np.full_like(u, at)]) for at in (0.0, camera.height - 1)]
     sides += [np.column_stack([np.full_like(v, at), v]) for at in (0.0, camera.width - 1)]
     directions, valid = undistort(camera, np.concatenate(sides))
     return float(np.arccos(np.clip(directions[valid, 2], -1.0, 1.0)).max()) if valid.any() else np.pi / 2
-
-
-def project(camera: Camera, points: Floats) -> Floats:
-    """Raw (distorted) pixels (M, 2) of points (M, 3), m, in the camera frame, in front of the camera."""
-    import cv2
-
-    if len(points) == 0:
-        return np.zeros((0, 2))
-    still = np.zeros(3)
-    if camera.distortion_model == "equidistant":
-        pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, camera.matrix, camera.distortion)
-    elif camera.distortion.any():
-        pixels, _ = cv2.projectPoints(points, still, still, camera.matrix, camera.distortion)
-    else:
-        pixels = (points @ camera.matrix.T)[:, :2] / points[:, 2:]
-    return np.asarray(pixels, dtype=float).reshape(-1, 2)

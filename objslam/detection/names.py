@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from objslam import config
 from objslam.errors import ConfigError, DetectorError
 from objslam.sources.coco import COCO_NAMES
 
@@ -42,7 +43,7 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
     if given in KNOWN:
         return KNOWN[given]
     places = (Path(given), model.parent / given)
-    file = next((place for place in places if place.is_file()), None)
+    file = next((place for place in places if config.is_file(place)), None)
     if file is None:
         looked = " and ".join(dict.fromkeys(str(place) for place in places))
         raise ConfigError(f"there is no names file {given}", hint=f"looked for {looked}; known lists: {', '.join(KNOWN)}")
@@ -83,12 +84,12 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
     return _checked(names, f"{model}, metadata")
 
 
-def default_names(count: int) -> tuple[tuple[str, ...], str]:
-    """Names for a model that brings none, and a warning that says so: COCO's where the number fits, else class_0, class_1."""
+def default_names(count: int) -> tuple[tuple[str, ...], str] | None:
+    """COCO's names for a model that brings none, if their number is its, and a warning that says so."""
     for key, names in KNOWN.items():
         if len(names) == count:
-            return names, f"the model names no classes; it has {count}, as {key} has: those names are taken"
-    return tuple(f"class_{i}" for i in range(count)), "the model names no classes: they are numbered (give detector.names)"
+            return names, f"the model names no classes but has {count} of them, as {key} has: its names are taken"
+    return None
 
 
 def _as_names(data: Any) -> tuple[str, ...] | None:

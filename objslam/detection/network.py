@@ -70,7 +70,7 @@ class Network:
     outputs: tuple[Tensor, ...]
 
     def run(self, blob: Array) -> list[Array]:
-        """The outputs, in the model's order, for images (B, 3, H, W) with the values that go in. DetectorError if it fails."""
+        """The outputs, in the model's order, for the values of images (B, 3, H, W); DetectorError if it fails."""
         count, _, height, width = blob.shape
         array = blob.transpose(0, 2, 3, 1) if self.image.channels_last else blob
         if self.image.batch == 0:
@@ -88,8 +88,8 @@ class Network:
 def open_network(path: Path, settings: config.Detector) -> Network:
     """Load an ONNX model with the settings' device and threads.
 
-    DetectorError where the file is missing, no ONNX model, or has inputs that an image cannot feed; ConfigError where CUDA is
-    asked for and this onnxruntime cannot give it.
+    DetectorError where the file is missing, no ONNX model, or has inputs that an image cannot feed; ConfigError where CUDA
+    is asked for and this onnxruntime cannot give it.
     """
     import onnxruntime
 

@@ -89,7 +89,7 @@ def solve_fixed(
     """
     loss = settings.fixed.loss
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
-    used = np.flatnonzero((association.object >= 0) & (start.weight > 0) & member[association.object])
+    used = np.flatnonzero((start.weight > 0) & np.isin(association.object, np.flatnonzero(member)))
     landmark = association.object[used]
     origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
     angle, place = pose_noise(rays, keyframes, settings)
@@ -207,11 +207,13 @@ def _second_opinion(
     supported = _supported(rays, association, map_T_camera, positions, used)
     support = np.bincount(association.object[supported], minlength=association.count)
     doubtful = support < _SURE * number
-    which = (association.object >= 0) & doubtful[association.object]
+    which = np.isin(association.object, np.flatnonzero(doubtful))
     if not which.any():
         return positions, supported
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
+    if used.any():  # poses that were solved have left the localisation's noise behind
+        keyframes = replace(keyframes, localized_every=0.0)
     placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, settings)
     other = positions.copy()
     other[objects[placed.ok]] = placed.positions[placed.ok]
@@ -224,7 +226,7 @@ def _second_opinion(
 
 def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
     """Which rays (R,) agree with their object, by how noisy those of its rays are that agreed so far (at first all)."""
-    placed = (association.object >= 0) & np.isfinite(positions[association.object, 0])
+    placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
     origins, directions = (a[placed] for a in rays.in_map(map_T_camera))
     miss = angles_off(origins, directions, positions[landmark]) / rays.sigma[placed]

@@ -16,7 +16,7 @@ import numpy as np
 from objslam.association.assign import assign
 from objslam.association.search import associate
 from objslam.config import Settings
-from objslam.geometry import adjoint, inverse
+from objslam.geometry import adjoint, inverse, lift_se2
 from objslam.graph import factors
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
 from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
@@ -24,7 +24,7 @@ from objslam.triangulation import triangulate
 from objslam.types import Bools, Camera, Floats, Ints, Keyframes, Rays
 
 _STRETCH = 150  # keyframes in which new landmarks are looked for
-_RECENT = 40  # keyframes; a landmark seen since then is met with hardly any drift in between
+_TURN, _PLACE = np.radians(1.5), 0.1  # rad, m; how finely headings are tried, and what they leave open
 _FEWEST = 5  # rays that must agree on a new landmark: a wrong one pulls on every pose after it
 _ITERATIONS = 3
 _FLOOR = 0.02  # m; landmarks are never taken to be known better than that
@@ -64,7 +64,7 @@ def explore(
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
-        owner[new] = _recognise(rays, new, known, keyframes, map_T_camera, begin)
+        owner[new], map_T_camera = _recognise(rays, new, known, keyframes, map_T_camera, begin, end)
         fresh = new[owner[new] >= 0]
         born = _discover(rays, owner, known, keyframes, map_T_camera, end, cameras, settings)
         fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known.label) - len(born))]) if len(born) else fresh
@@ -89,28 +89,58 @@ def explore(
     return map_T_camera
 
 
-def _recognise(rays: Rays, new: Ints, known: _Known, keyframes: Keyframes, map_T_camera: Floats, begin: int) -> Ints:
-    """The known landmark of each of the new rays (n,), or -1: first those seen a moment ago, then the older ones."""
-    owner = np.full(len(new), -1, dtype=np.int64)
+def _recognise(
+    rays: Rays, new: Ints, known: _Known, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
+) -> tuple[Ints, Floats]:
+    """The known landmark of each of the new rays (n,), or -1, and the poses (K, 4, 4) that explain most of them.
+
+    Within a step the odometry predicts well. Before it, out of sight of anything, the heading may have drifted far: then
+    headings on both sides are tried for the whole step at once, and the one that most rays agree with is taken.
+    """
     if len(new) == 0 or len(known.label) == 0:
-        return owner
-    recent = known.last >= begin - _RECENT
-    for group in (recent, ~recent):
-        left = np.flatnonzero(owner < 0)
-        if not group.any() or len(left) == 0:
-            continue
-        since = begin - 1 if group is recent else int(np.median(known.last[group]))
-        some = rays.take(new[left])
-        owner[left] = assign(
+        return np.full(len(new), -1, dtype=np.int64), map_T_camera
+    some = rays.take(new)
+    drifted = _drifted(keyframes, begin - 1)
+    heading = float(np.sqrt(np.linalg.eigvalsh(drifted[begin, :3, :3])[-1]))
+    turns = np.arange(1, int(3 * heading / _TURN) + 1) * _TURN
+    spread = drifted if len(turns) == 0 else _drifted(keyframes, begin) + np.diag([_TURN] * 3 + [_PLACE] * 3) ** 2
+    best, best_poses = np.full(len(new), -1, dtype=np.int64), map_T_camera
+    best_score = -np.inf
+    for turn in (0.0, *np.stack([turns, -turns], axis=1).ravel()):
+        poses = map_T_camera if turn == 0 else _turned(map_T_camera, begin, end, turn)
+        owner = assign(
             some,
-            np.where(group[:, None], known.position, np.nan),
+            known.position,
             known.covariance,
             _accepts(known.label, len(rays.label_names)),
-            map_T_camera,
+            poses,
             some.sigma,
-            pose_covariance=_drifted(keyframes, since),
+            pose_covariance=spread,
         )
-    return owner
+        owner = np.where(_in_range(some, owner, known, poses), owner, -1)
+        seen = np.bincount(owner[owner >= 0], minlength=1)
+        # a constellation that shows twice tells no more than once: each landmark counts up to three times
+        score = np.minimum(seen, 3).sum() - 0.1 * (owner < 0).sum() - 0.5 * (turn / max(heading, _TURN)) ** 2
+        if score > best_score:
+            best, best_score, best_poses = owner, score, poses
+    return best, best_poses
+
+
+def _in_range(rays: Rays, owner: Ints, known: _Known, map_T_camera: Floats) -> Bools:
+    """Which rays (n,) do not contradict their landmark by the range that came with them."""
+    origins, _ = rays.in_map(map_T_camera)
+    distance = np.linalg.norm(known.position[owner] - origins, axis=1)
+    return ~(np.abs(rays.range - distance) > 4 * rays.range_sigma + _PLACE)
+
+
+def _turned(map_T_camera: Floats, begin: int, end: int, angle: float) -> Floats:
+    """The poses with those of a step turned about its first, around the vertical."""
+    pivot = map_T_camera[begin, :3, 3]
+    turn = lift_se2(np.array([0.0, 0.0, angle]))
+    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
+    poses = map_T_camera.copy()
+    poses[begin:end] = turn @ poses[begin:end]
+    return poses
 
 
 def _discover(

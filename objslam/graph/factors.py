@@ -42,8 +42,8 @@ def l_key(landmark: int) -> int:
 def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
     """Noise models, one for each of the sigmas (R,), shared where they agree to three digits.
 
-    The loss acts on the norm of the whitened residual. `l1` is a Huber that costs one for each sigma, its kink at l1_kink (in
-    the residual's unit). `gnc` is left without a loss: its optimiser brings it.
+    The loss acts on the norm of the whitened residual. `l1` is a Huber that costs 1 for each sigma, with its kink at l1_kink
+    (in the residual's unit). `gnc` is left without a loss: its optimiser brings it.
     """
     digits = 10.0 ** (np.floor(np.log10(sigmas)) - 2)
     values, which = np.unique(np.round(sigmas / digits) * digits, return_inverse=True)

@@ -32,9 +32,10 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     except RuntimeError as error:
         ledger.warn(f"covariances: {indeterminate(error).message}; no object has one")
         return np.full((len(landmarks), 3, 3), np.nan)
-    widest = np.linalg.eigvalsh(covariance)[:, -1]
-    covariance[widest > (0.5 * _HELD) ** 2] = np.nan
-    return covariance
+    held_by_more = np.linalg.eigvalsh(covariance)[:, -1] <= (0.5 * _HELD) ** 2
+    without_prior = np.full_like(covariance, np.nan)
+    without_prior[held_by_more] = np.linalg.inv(np.linalg.inv(covariance[held_by_more]) - np.eye(3) / _HELD**2)
+    return without_prior
 
 
 def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints) -> Floats:

@@ -72,9 +72,7 @@ def levenberg_marquardt(
         after = optimizer.error()
     except RuntimeError as error:
         raise indeterminate(error) from error
-    if not np.isfinite(after):
-        raise SolveError("the solve ran away: its cost is not finite", hint="is the odometry usable, in metres and radians?")
-    return Optimum(values, before, after, optimizer.iterations())
+    return _finite(Optimum(values, before, after, optimizer.iterations()))
 
 
 def graduated(
@@ -98,13 +96,19 @@ def graduated(
         after = float(sum(w * graph.at(i).error(values) for i, w in enumerate(weights) if w > 0))
     except RuntimeError as error:
         raise indeterminate(error) from error
-    return Optimum(values, before, after, 0, weights)
+    return _finite(Optimum(values, before, after, 0, weights))
+
+
+def _finite(optimum: Optimum) -> Optimum:
+    if not np.isfinite(optimum.cost_after):
+        raise SolveError("the solve ran away: its cost is not finite", hint="is the odometry usable, in metres and radians?")
+    return optimum
 
 
 def indeterminate(error: RuntimeError) -> SolveError:
     """The error for what GTSAM threw: it names the variable that nothing holds, where it says so."""
-    first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    said = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
     return SolveError(
-        f"the factor graph has no single solution: {first.strip()}",
+        f"the factor graph has no single solution: {said.rstrip('.')}",
         hint="some pose or object is not held by any measurement; a smaller joint.prior_sigma holds every object",
     )

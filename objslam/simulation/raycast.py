@@ -70,6 +70,10 @@ class Caster:
         mixed = sum(gaussian_filter(white, s, mode="wrap") * s**1.5 for s in (0.7, 1.5, 3.0))
         return np.clip(0.5 + mixed / (4 * mixed.std()), 0.0, 1.0).astype(np.float32).ravel()
 
+    def prepare(self) -> None:
+        """Build all that is built once: after this, several threads may look through it at a time."""
+        _ = self.directions, self._scene, self._alone, self._grain
+
     def cast(self, map_T_camera: Floats) -> Cast:
         """The first surface on the ray of every pixel from a camera at map_T_camera (4, 4)."""
         rays = _rays(self.directions, map_T_camera)
@@ -200,4 +204,6 @@ def _scene(room: Room, chosen: Any) -> Any:
         vertices = o3d.core.Tensor.from_numpy(part.vertices.astype(np.float32))
         triangles = o3d.core.Tensor.from_numpy(part.triangles.astype(np.uint32))
         scene.add_triangles(vertices, triangles)
+    # the first ray makes Open3D build its tree, which two threads must not do at once
+    scene.cast_rays(_tensor(np.array([[0, 0, 0, 0, 0, 1]], dtype=np.float32)), 1)
     return scene

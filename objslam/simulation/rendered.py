@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Self
@@ -125,11 +127,11 @@ def true_boxes(caster: Caster, cast: Cast, map_T_camera: Floats, limits: BoxLimi
     order = np.lexsort((cast.depth[rows, columns], place))
     first = np.cumsum(visible) - visible
     depth = cast.depth[rows, columns][order][first + visible // 2].astype(np.float64)
-    ends = (np.minimum.reduceat, np.maximum.reduceat)
-    sides_of = (
-        [end(pixels[order], first) for end in ends for pixels in (columns, rows)] if len(objects) else np.zeros((4, 0))
-    )
-    box = np.stack(sides_of, axis=-1) + np.array([0.0, 0.0, 1.0, 1.0])
+    box = np.zeros((len(objects), 4))
+    if len(objects):
+        x, y = columns[order], rows[order]
+        low, high = np.minimum.reduceat, np.maximum.reduceat
+        box[:] = np.stack([low(x, first), low(y, first), high(x, first) + 1, high(y, first) + 1], axis=-1)
     size = box[:, 2:] - box[:, :2]
     height, width = owner.shape
     cut = np.asarray((box[:, :2] <= 0).any(axis=1) | (box[:, 2:] >= np.array([width, height])).any(axis=1))
@@ -155,13 +157,15 @@ def render_drive(
     out: Path,
     *,
     overwrite: bool = False,
+    workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render a drive and write it as a log folder with rgb, depth, odometry, localisation and truth; returns `out`.
 
-    The same settings and seed give the same log. groundtruth/ holds the objects (the middles of their bounding boxes), the
-    path, and the true boxes (`TRUTH_BOXES`). progress: called with frames done and frames in all. ConfigError where no room
-    shows every object well enough; OutputError where `out` holds something already (and no `overwrite`).
+    The same settings and seed give the same log, however many workers (threads; None: one a core, at most 4).
+    groundtruth/ holds the objects (the middles of their bounding boxes), the path, and the true boxes (`TRUTH_BOXES`).
+    progress: called with frames done and frames in all. ConfigError where no room shows every object well enough;
+    OutputError where `out` holds something already (and no `overwrite`).
     """
     if out.exists() and not overwrite and (not out.is_dir() or any(out.iterdir())):
         raise OutputError("there is something already", where=str(out), hint="name another folder, or ask to overwrite it")
@@ -169,24 +173,38 @@ def render_drive(
     from objslam.sources.folder import TRUTH, write_log_folder
 
     seeds = np.random.SeedSequence(seed).spawn(5)
-    path_rng, odometry_rng, localization_rng, sensor_rng = (np.random.default_rng(s) for s in seeds[:4])
+    path_rng, odometry_rng, localization_rng = (np.random.default_rng(s) for s in seeds[:3])
+    sensor_seed, room_seed = seeds[3:]
     motion = settings.motion
     course = Course.lay(motion, path_rng)
     stamps = START + np.arange(settings.frames) / settings.frame_rate
     map_T_base = lift_se2(course.at(stamps))
     map_T_camera = map_T_base @ settings.camera.base_T_camera
-    caster = Caster(_good_room(settings, map_T_camera, seeds[4]), settings.camera, seed)
+    caster = Caster(_good_room(settings, map_T_camera, room_seed), settings.camera, seed)
+    caster.prepare()
     out.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        gains = exposures(settings.sensor, settings.frames, sensor_rng)
-        boxes = []
-        for i, pose in enumerate(map_T_camera):
-            rgb, depth, found = render_frame(caster, pose, settings.sensor, gains[i], settings.limits, sensor_rng)
+        gains = exposures(settings.sensor, settings.frames, np.random.default_rng(sensor_seed))
+        for kind, _ in _KINDS:
+            (work / kind).mkdir()
+        grain_seeds = sensor_seed.spawn(settings.frames)
+
+        def render(i: int) -> TrueBoxes:
+            rng = np.random.default_rng(grain_seeds[i])
+            rgb, depth, found = render_frame(caster, map_T_camera[i], settings.sensor, gains[i], settings.limits, rng)
             _write_images(work, i, rgb, depth * settings.camera.depth_scale)
-            boxes.append(found)
-            if progress is not None:
-                progress(i + 1, settings.frames)
+            return found
+
+        boxes = []
+        pool = ThreadPoolExecutor(workers or min(os.cpu_count() or 1, 4))
+        try:
+            for found in pool.map(render, range(settings.frames)):
+                boxes.append(found)
+                if progress is not None:
+                    progress(len(boxes), settings.frames)
+        finally:
+            pool.shutdown(cancel_futures=True)  # a drive that is given up ends at once
         rgb_files, depth_files = (tuple(work / kind / f"{i:06d}.{end}" for i in range(len(stamps))) for kind, end in _KINDS)
         room = caster.room
         objects = tuple(TruthObject(i, label, room.middle[i]) for i, label in enumerate(room.labels))
@@ -215,7 +233,6 @@ def _write_images(folder: Path, number: int, rgb: NDArray[np.uint8], depth: Real
         cv2.imencode(".png", np.clip(depth + 0.5, 0, 65535).astype(np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1],
     )
     for (kind, end), content in zip(_KINDS, contents, strict=True):
-        (folder / kind).mkdir(exist_ok=True)
         (folder / kind / f"{number:06d}.{end}").write_bytes(content.tobytes())
 
 

@@ -80,13 +80,13 @@ def _swept(rings: Floats, closed: bool, middle: float, material: Material, segme
     return Part(vertices.reshape(-1, 3), _split(quads), material)
 
 
-def paint(rng: np.random.Generator, hue: float, saturation: float, value: float, spread: float = 1.0) -> Floats:
+def paint(rng: np.random.Generator, hue: float, saturation: float, value: float) -> Floats:
     """A linear colour (3,) near a hue (in turns), saturation and value; no two things are dyed alike."""
-    hue += spread * rng.normal(0.0, 0.012)
-    saturation = float(np.clip(saturation + spread * rng.normal(0.0, 0.05), 0.0, 1.0))
-    value = float(np.clip(value + spread * rng.normal(0.0, 0.05), 0.02, 1.0))
+    hue += rng.normal(0.0, 0.012)
+    saturation = float(np.clip(saturation + rng.normal(0.0, 0.05), 0.0, 1.0))
+    value = float(np.clip(value + rng.normal(0.0, 0.05), 0.02, 1.0))
     wheel = np.abs((hue + np.array([1.0, 2 / 3, 1 / 3])) % 1.0 * 6.0 - 3.0) - 1.0
-    return np.asarray(value * (1 - saturation + saturation * np.clip(wheel, 0.0, 1.0)) ** 1.0)
+    return np.asarray(value * (1 - saturation + saturation * np.clip(wheel, 0.0, 1.0)))
 
 
 def _plastic(rng: np.random.Generator, hue: float, saturation: float, value: float) -> Material:

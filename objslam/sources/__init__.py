@@ -11,7 +11,7 @@ from pathlib import Path
 
 from objslam.errors import ConfigError, LogError
 from objslam.ledger import Ledger
-from objslam.sources import folder, mrclam, tum
+from objslam.sources import folder, mrclam, ros, tum
 from objslam.types import Log
 
 
@@ -21,6 +21,7 @@ class SourceOptions:
 
     format: the name of a source, None to guess it. robot: which one, where there are several. with_range: whether measured
     depths are used. anonymous: whether landmarks that tell who they are get one label. label: for boxes without a class.
+    ROS bags: topics, base_frame, camera_info, rectified, extract and with_images are what `ros.BagOptions` says.
     """
 
     format: str | None = None
@@ -28,6 +29,16 @@ class SourceOptions:
     with_range: bool = True
     anonymous: bool = False
     label: str | None = None
+    topics: tuple[str, ...] = ()
+    base_frame: str | None = None
+    camera_info: Path | None = None
+    rectified: bool | None = None
+    extract: Path | None = None
+    with_images: bool = True
+
+    def of_bag(self) -> ros.BagOptions:
+        """Those of the options that a ROS bag takes."""
+        return ros.BagOptions(**{field.name: getattr(self, field.name) for field in fields(ros.BagOptions)})
 
 
 @dataclass(frozen=True)
@@ -58,6 +69,10 @@ def _read_tum(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
     return tum.read_stamped(path, ledger, label=options.label or "object", with_range=options.with_range)
 
 
+def _read_ros(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    return ros.read_bag(path, ledger, options.of_bag())
+
+
 SOURCES: tuple[Source, ...] = (
     Source("log", "camera.yaml or cameras/ with odometry.txt or localization.txt", folder.is_log_folder, _read_log),
     Source(
@@ -80,6 +95,13 @@ SOURCES: tuple[Source, ...] = (
         tum.is_stamped,
         _read_tum,
         frozenset({"label", "with_range"}),
+    ),
+    Source(
+        "ros",
+        "a ROS bag (.bag, .mcap, .db3, also .zstd), or a folder with one",
+        ros.is_bag,
+        _read_ros,
+        frozenset(field.name for field in fields(ros.BagOptions)),
     ),
 )
 

@@ -7,6 +7,7 @@ as 1e-05, which YAML 1.1 takes for text, stays a number.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -19,12 +20,23 @@ from objslam.ledger import Ledger
 from objslam.sources.textfile import read_bytes
 from objslam.types import Camera, DistortionModel, Floats
 
-_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
+COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
     "plumb_bob": (4, 5),
     "rational_polynomial": (8, 12, 14),
     "equidistant": (4,),
 }
+"""How many distortion coefficients each model takes."""
+
+CAMERAS = "cameras"
 _Mapping = dict[str, yaml.Node]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera out of a file, and whether the file says where it is on the robot (else base_T_camera is the identity)."""
+
+    camera: Camera
+    placed: bool
 
 
 def read_camera(
@@ -37,7 +49,28 @@ def read_camera(
     distortion_coefficients are taken as ROS writes them (rows, cols, data), as a flat list or as nested lists. LogError with
     the line of what is wrong.
     """
+    return _read(path, _mapping(path, _parse(path), "the file"), ledger, name, place_needed, depth_scale).camera
+
+
+def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
+    """Read a file with one camera as `read_camera` does, or with several, by name, under the key `cameras`.
+
+    Their place on the robot may be missing. LogError with the line of what is wrong.
+    """
     top = _mapping(path, _parse(path), "the file")
+    if CAMERAS not in top:
+        return (_read(path, top, ledger, None, False, 1000.0),)
+    cameras = _mapping(path, top[CAMERAS], CAMERAS)
+    if not cameras:
+        raise _error(path, top[CAMERAS], "no camera in it")
+    return tuple(
+        _read(path, _mapping(path, node, f"{CAMERAS}.{name}"), ledger, name, False, 1000.0) for name, node in cameras.items()
+    )
+
+
+def _read(
+    path: Path, top: _Mapping, ledger: Ledger, name: str | None, place_needed: bool, depth_scale: float
+) -> Calibration:
     width, height = _size(path, top, "image_width"), _size(path, top, "image_height")
     matrix = _matrix(path, _get(path, top, "camera_matrix"))
     if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
@@ -45,16 +78,15 @@ def read_camera(
     if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         ledger.warn(f"{path}: the principal point lies outside the image: is the calibration for {width}x{height}?")
     model, distortion = _distortion(path, top)
-    base_T_camera = np.eye(4)
-    if place_needed or "base_T_camera" in top:
-        base_T_camera = _pose(path, _get(path, top, "base_T_camera"))
+    placed = place_needed or "base_T_camera" in top
+    base_T_camera = _pose(path, _get(path, top, "base_T_camera")) if placed else np.eye(4)
     if "depth_scale" in top:
         depth_scale = _number(path, top["depth_scale"], "depth_scale")
         if depth_scale <= 0:
             raise _error(path, top["depth_scale"], "depth_scale must be above zero", "units per metre, such as 1000 for mm")
     if name is None:
         name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
-    return Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale)
+    return Calibration(Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale), placed)
 
 
 def write_camera(camera: Camera, path: Path) -> None:
@@ -180,9 +212,9 @@ def _distortion(path: Path, top: _Mapping) -> tuple[DistortionModel, Floats]:
         return "plumb_bob", np.zeros(5)
     model = next((known for known in get_args(DistortionModel) if known == given), None)
     if model is None:
-        raise _error(path, node, f"unknown distortion_model {given[:40]!r}", f"known: {', '.join(_COEFFICIENTS)}")
-    if len(values) not in _COEFFICIENTS[model]:
-        counts = " or ".join(map(str, _COEFFICIENTS[model]))
+        raise _error(path, node, f"unknown distortion_model {given[:40]!r}", f"known: {', '.join(COEFFICIENTS)}")
+    if len(values) not in COEFFICIENTS[model]:
+        counts = " or ".join(map(str, COEFFICIENTS[model]))
         raise _error(path, data, f"{model} takes {counts} distortion_coefficients, got {len(values)}")
     return model, values
 

@@ -1,5 +1,7 @@
 """The compiled bearing-ray factors against the formula itself."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -179,3 +181,88 @@ def test_motion_is_the_odometry_moved_to_the_camera():
     s = np.diag([p.tilt, p.tilt, o.floor_yaw, o.floor_xy, o.floor_xy, p.z]) ** 2
     ad = adjoint(inverse(extrinsics))
     np.testing.assert_allclose(covariance[0], ad @ s @ ad.T, atol=1e-15)
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.05, 3.0])
+def test_losses_cost_what_their_formulas_say(sigma):
+    distance = np.array([0.01, 0.5, 1.5, 4, 30]) * sigma  # on both sides of every kink
+    kink = 1e-3 * sigma
+    r, k, c = distance / sigma, factors.HUBER_K, factors.CAUCHY_K
+    expected = {
+        "l1": r - 0.5e-3,
+        "huber": np.where(r <= k, r**2 / 2, k * r - k**2 / 2),
+        "cauchy": c**2 / 2 * np.log1p((r / c) ** 2),
+        "gnc": r**2 / 2,
+    }
+    for loss, cost in expected.items():
+        (model,) = factors.robust(loss, np.array([sigma]), 3, kink)
+        prior = gtsam.PriorFactorPoint3(L, np.zeros(3), model)
+        found = []
+        for d in distance:
+            values = gtsam.Values()
+            values.insert(L, np.array([0.6 * d, 0, -0.8 * d]))
+            found.append(prior.error(values))
+        np.testing.assert_allclose(found, cost, rtol=1e-9, err_msg=loss)
+
+
+def test_noise_models_are_shared_where_sigmas_agree_to_three_digits():
+    sigmas = np.array([0.0100, 0.010001, 0.0102, 0.0100, 12.341, 12.342])
+    models = factors.robust("huber", sigmas, 2)
+    assert models[0] is models[1]
+    assert models[0] is models[3]
+    assert models[0] is not models[2]
+    assert models[4] is models[5]
+    assert factors.robust("huber", np.zeros(0), 2) == []
+
+
+def test_a_range_along_a_ray_says_nothing_across_it():
+    rng = np.random.default_rng(4)
+    origin, n = rng.normal(size=3), np.array([2.0, -1, 2]) / 3
+    (factor,) = factors.along_ray(origin[None], n[None], np.array([4.0]), np.array([0.1]), np.array([0]))
+    for along in (-0.1, 0.0, 0.2):
+        values = gtsam.Values()
+        values.insert(L, origin + (4.0 + along) * n + 7.0 * np.cross(n, [0.6, 0, 0.8]))
+        r = abs(along) / 0.1
+        k = factors.HUBER_K
+        assert factor.error(values) == pytest.approx(r**2 / 2 if r <= k else k * r - k**2 / 2, abs=1e-9)
+
+
+def test_a_range_is_the_distance_from_the_camera():
+    pose, _, point, _, distance = scene(1)
+    (factor,) = factors.ranges(np.array([0]), np.array([distance + 0.3]), np.array([0]), [gtsam.noiseModel.Unit.Create(1)])
+    assert factor.unwhitenedError(values_of(pose, point))[0] == pytest.approx(-0.3)
+
+
+def test_betweens_tie_each_keyframe_to_the_next():
+    keyframes = planar_keyframes([[0, 0, 0], [1, 0, 0.2], [1.5, 1, 0.5]], np.zeros((3, 6, 6)))
+    made = factors.betweens(*factors.motions(keyframes, Settings()), 5)
+    values = gtsam.Values()
+    for k, pose in enumerate(keyframes.odom_T_base @ keyframes.base_T_camera):
+        values.insert(factors.x_key(5 + k), gtsam.Pose3(pose))
+    assert [list(factor.keys()) for factor in made] == [
+        [factors.x_key(5), factors.x_key(6)],
+        [factors.x_key(6), factors.x_key(7)],
+    ]
+    for factor in made:
+        np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-12)
+
+
+def test_motions_need_odometry():
+    keyframes = replace(planar_keyframes([[0, 0, 0], [1, 0, 0]], None), odom_T_base=None)
+    with pytest.raises(ValueError, match="odometry"):
+        factors.motions(keyframes, Settings())
+
+
+def test_localisations_hold_the_camera_as_the_base_is_known():
+    keyframes = replace(planar_keyframes([[3, -2, 0.7], [1, 0, 0]], None), localized_every=4.0)
+    settings = Settings()
+    first, _ = factors.localizations(keyframes, settings)
+    extrinsics, base = keyframes.base_T_camera[0], keyframes.map_T_base[0]
+    at, planar = settings.localization, settings.planar
+    sigmas = 2.0 * np.array([planar.tilt, planar.tilt, at.yaw, at.xy, at.xy, planar.z])  # four share one: twice as unsure
+    for axis in range(6):
+        twist = np.zeros(6)
+        twist[axis] = 0.5 * sigmas[axis]
+        values = gtsam.Values()
+        values.insert(X, gtsam.Pose3(base @ exp_se3(twist[None])[0] @ extrinsics))
+        assert first.error(values) == pytest.approx(0.5 * 0.5**2, rel=1e-3)

@@ -13,6 +13,7 @@ Message = tuple["Connection", int, bytes]
 """Connection, time of recording (ns), and the serialised message."""
 Messages = Iterator[Message]
 
+_MAX_NAME = 256
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
 
@@ -65,11 +66,26 @@ class FileReport:
         """The report in words, one line a problem; nothing where the file is whole."""
         if not self.problems and not self.lost:
             return []
-        lost = f"{self.lost} lost" if self.complete else f"{self.lost or 'an unknown number'} lost or more"
-        return [f"{self.file}: damaged, {self.messages} messages read, {lost}: {'; '.join(self.problems) or 'no reason seen'}"]
+        known = f"at least {self.lost}" if self.lost else "an unknown number"
+        lost = f"{self.lost if self.complete else known} lost"
+        return [
+            f"{self.file}: damaged, {self.messages} messages read, {lost}: {'; '.join(self.problems) or 'no reason seen'}"
+        ]
+
+
+def plain(name: str) -> str:
+    """The name of a topic or frame as it can be shown on one line: what is not printable is replaced, what is long is cut."""
+    if len(name) <= _MAX_NAME and name.isprintable():
+        return name
+    return "".join(c if c.isprintable() else "\ufffd" for c in name[:_MAX_NAME])
+
+
+def frame_name(frame_id: str) -> str:
+    """A frame as tf knows it: ROS 1 wrote some of them with a leading slash."""
+    return plain(frame_id.lstrip("/"))
 
 
 def type_name(name: str) -> str:
-    """A message type as ROS 2 writes it (nav_msgs/Odometry becomes nav_msgs/msg/Odometry); what is no type stays as it is."""
+    """A message type as ROS 2 writes it (nav_msgs/Odometry becomes nav_msgs/msg/Odometry); what is no type stays."""
     match = _TYPE.fullmatch(name)
-    return f"{match[1]}/msg/{match[2]}" if match else name
+    return f"{match[1]}/msg/{match[2]}" if match else plain(name)

@@ -1,0 +1,9 @@
+"""Detection: a CNN detector, any ONNX model, on a log's images. The only room that knows onnxruntime."""
+
+from __future__ import annotations
+
+from objslam.detection.cache import default_cache
+from objslam.detection.detector import Boxes, Detector, load_detector
+from objslam.detection.on_log import detect_log
+
+__all__ = ["Boxes", "Detector", "default_cache", "detect_log", "load_detector"]

@@ -1,0 +1,93 @@
+"""Simulated drives as the graph takes them, with the truth beside: every label is one object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from objslam.association.by_label import associate_by_label
+from objslam.config import Odometry, Settings, load_settings
+from objslam.geometry import align, interpolate
+from objslam.graph.batch import Estimate, solve_fixed, solve_joint, triangulate_at
+from objslam.keyframes import build_keyframes
+from objslam.ledger import Ledger
+from objslam.rays import angles_off, build_rays
+from objslam.simulation import preset, simulate
+from objslam.types import Association, Floats, Keyframes, Log, Rays, Trajectory
+
+ODOMETRY_ALONE: dict[str, Any] = {"localization": None, "odometry": Odometry()}
+
+
+@dataclass(frozen=True)
+class Drive:
+    """points: (N, 3) where the objects are. map_T_base: (K, 4, 4) where the robot was."""
+
+    keyframes: Keyframes
+    rays: Rays
+    association: Association
+    settings: Settings
+    points: Floats
+    map_T_base: Floats
+
+    def fixed(self) -> Estimate:
+        placed = triangulate_at(self.keyframes.map_T_camera, self.keyframes, self.rays, self.association, self.settings)
+        return solve_fixed(self.keyframes, self.rays, self.association, placed, self.settings)
+
+    def joint(self, **more: Any) -> Estimate:
+        return solve_joint(self.keyframes, self.rays, self.association, self.settings, Ledger(), **more)
+
+    def object_errors(self, positions: Floats, alignment: str = "none") -> Floats:
+        """(N,) m; NaN where there is no position."""
+        there = np.isfinite(positions[:, 0])
+        pose, scale = align(positions[there], self.points[there], alignment)
+        return np.linalg.norm(scale * positions @ pose[:3, :3].T + pose[:3, 3] - self.points, axis=1)
+
+    def ate(self, map_T_base: Floats) -> float:
+        """Root mean square distance of the robot's places from the true ones, m, without alignment."""
+        return float(np.sqrt((np.linalg.norm((map_T_base - self.map_T_base)[:, :3, 3], axis=1) ** 2).mean()))
+
+    def scale(self, positions: Floats) -> float:
+        """How much larger the map is than the truth."""
+        there = np.isfinite(positions[:, 0])
+        return 1 / align(positions[there], self.points[there], "sim2")[1]
+
+    def right(self) -> np.ndarray:
+        """(R,) whether a ray, at the true pose, meets its object as closely as its noise lets."""
+        origins, directions = self.rays.in_map(self.map_T_base @ self.keyframes.base_T_camera)
+        return angles_off(origins, directions, self.points[self.association.object]) < 4 * self.rays.sigma
+
+
+def make_drive(seed: int, *overrides: str, stretch: float = 1.0, **changes: Any) -> Drive:
+    """A drive of the demo's room with overrides of the settings; stretch: odometry that takes so many metres for one."""
+    settings = load_settings(None, ("rays.pixel_sigma=2", *overrides))
+    log = simulate(preset("demo", **{"objects": 12, "classes": 12, "frames": 200, **changes}), seed)
+    return drive_of(_stretched(log, stretch), settings)
+
+
+def drive_of(log: Log, settings: Settings) -> Drive:
+    ledger = Ledger()
+    keyframes = build_keyframes(log, settings, ledger)
+    rays = build_rays(log, keyframes, settings, ledger)
+    kept, keyframe = np.unique(rays.keyframe, return_inverse=True)  # as a run does: no keyframe without a ray
+    keyframes, rays = keyframes.take(kept), replace(rays, keyframe=keyframe)
+    association = associate_by_label(rays)
+    place = {o.label: o.position for o in log.truth.objects}
+    true = log.truth.trajectory
+    return Drive(
+        keyframes=keyframes,
+        rays=rays,
+        association=association,
+        settings=settings,
+        points=np.array([place[rays.label_names[label]] for label in association.label]),
+        map_T_base=interpolate(true.stamps, true.poses, keyframes.stamps, 1.0)[0],
+    )
+
+
+def _stretched(log: Log, stretch: float) -> Log:
+    if log.odometry is None or stretch == 1:
+        return log
+    poses = log.odometry.poses.copy()
+    poses[:, :3, 3] = poses[0, :3, 3] + stretch * (poses[:, :3, 3] - poses[0, :3, 3])
+    return replace(log, odometry=Trajectory(log.odometry.stamps, poses))

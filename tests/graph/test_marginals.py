@@ -1,0 +1,91 @@
+"""Marginal covariances against dense linear algebra, and the way out when the graph leaves something open."""
+
+import gtsam
+import numpy as np
+
+from objslam.graph import factors
+from objslam.graph.marginals import marginal_covariances
+from objslam.graph.optimise import build_graph, make_values
+from objslam.ledger import Ledger
+
+POINTS = np.array([[4.0, 1, 0], [0, 5, 1], [-3, 2, 0.5]])
+CAMERAS = np.tile(np.eye(4), (3, 1, 1))
+CAMERAS[1:, :3, 3] = [[1.0, 0, 0], [0, 1.5, 0.2]]
+
+
+def sightings(pairs, sigma=0.01):
+    """Bearing factors for (camera, point) pairs without noise."""
+    camera, point = np.array(pairs).T
+    to = POINTS[point] - CAMERAS[camera, :3, 3]
+    directions = to / np.linalg.norm(to, axis=1, keepdims=True)
+    noise = [gtsam.noiseModel.Isotropic.Sigma(2, sigma)] * len(pairs)
+    return factors.bearing(camera, directions, point, noise)
+
+
+def anchors(cameras, sigma=1e-3):
+    return [
+        gtsam.PriorFactorPose3(factors.x_key(k), gtsam.Pose3(CAMERAS[k]), gtsam.noiseModel.Isotropic.Sigma(6, sigma))
+        for k in cameras
+    ]
+
+
+def dense(graph, values, landmark):
+    """The block of the inverse of the whole information matrix."""
+    keys = [factors.x_key(k) for k in range(3)] + [factors.l_key(j) for j in range(3)]
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    information = graph.linearize(values).hessian(ordering)[0]
+    at = 18 + 3 * landmark
+    return np.linalg.inv(information)[at : at + 3, at : at + 3]
+
+
+def test_covariances_are_blocks_of_the_inverse_information():
+    graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
+    values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
+    covariance = marginal_covariances(graph, values, np.array([2, 0]), ledger)
+    np.testing.assert_allclose(covariance[0], dense(graph, values, 2), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(covariance[1], dense(graph, values, 0), rtol=1e-6, atol=1e-12)
+    assert not ledger.lines()
+
+
+def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():
+    pairs = [(k, j) for k in range(3) for j in range(2)]
+    graph = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
+    values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
+    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    assert np.isnan(covariance[2]).all()
+    # the same graph with the loose landmark held: that changes nothing for the others, for nothing ties it to them
+    sure = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
+    sure.push_back(gtsam.PriorFactorPoint3(factors.l_key(2), POINTS[2], gtsam.noiseModel.Isotropic.Sigma(3, 1)))
+    for j in range(2):
+        np.testing.assert_allclose(covariance[j], dense(sure, values, j), rtol=1e-4, atol=1e-9)
+    assert len(ledger.warnings) == 1
+    assert "l2" in ledger.warnings[0]
+    assert "left unresolved" in ledger.warnings[0]
+
+
+def test_where_nothing_says_where_the_cameras_are_no_landmark_has_a_covariance():
+    graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))
+    values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
+    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    assert np.isnan(covariance).all()
+    assert "left unresolved" in ledger.lines()[0]
+
+
+def test_a_camera_that_one_ray_holds_leaves_no_covariance_at_all():
+    pairs = [(k, j) for k in range(2) for j in range(3)]
+    graph = build_graph(sightings([*pairs, (2, 0)]), anchors(range(2)))  # landmarks can be held, camera 2 cannot
+    values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
+    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    assert covariance.shape == (3, 3, 3)
+    assert np.isnan(covariance).all()
+    assert any("no object has one" in warning for warning in ledger.warnings)
+
+
+def test_no_landmarks():
+    ledger = Ledger()
+    values = make_values(CAMERAS, POINTS, np.zeros(0, dtype=np.int64))
+    covariance = marginal_covariances(build_graph(anchors(range(3))), values, np.zeros(0, dtype=np.int64), ledger)
+    assert covariance.shape == (0, 3, 3)
+    assert not ledger.lines()

@@ -1,0 +1,32 @@
+"""TUM fr3_cabinet, hand-held, with true camera poses: where the one object stands."""
+
+import numpy as np
+import pytest
+
+from objslam import offline
+from objslam.config import load_settings
+from objslam.ledger import Ledger
+from objslam.sources import SourceOptions, read
+
+CABINET = np.array([-1.520, 0.454])
+"""m; the centre of the depth images fused with the true poses, seen from above."""
+
+
+@pytest.mark.parametrize("overrides", [(), ("depth.use=false",), ("fixed.loss=huber",)])
+def test_the_cabinet(data_dir, overrides):
+    log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
+    result = offline.run(log, load_settings(None, ("mode=fixed", *overrides)), Ledger())
+    (cabinet,) = result.map.resolved()
+    assert cabinet.label == "cabinet"
+    assert np.linalg.norm(cabinet.position[:2] - CABINET) <= 0.04
+    assert 0 < cabinet.position[2] < 1.0
+    assert cabinet.rays >= 30
+
+
+def test_the_joint_mode_leaves_good_poses_where_they_are(data_dir):
+    log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
+    result = offline.run(log, load_settings(None, ("mode=joint",)), Ledger())
+    moved = np.linalg.norm((result.map_T_base - result.keyframes.map_T_base)[:, :3, 3], axis=1)
+    assert moved.max() < 0.05
+    (cabinet,) = result.map.resolved()
+    assert np.linalg.norm(cabinet.position[:2] - CABINET) <= 0.06

@@ -1,0 +1,38 @@
+"""UTIAS MRCLAM 6: the map of three real robots, poses and landmarks together from wheel odometry and a camera."""
+
+import numpy as np
+import pytest
+
+from objslam import offline
+from objslam.config import load_settings
+from objslam.evaluation import evaluate
+from objslam.ledger import Ledger
+from objslam.sources import SourceOptions, read
+from objslam.types import ObjectMap, Trajectory
+
+RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
+
+
+@pytest.mark.parametrize("robot", [1, 3, 5])
+@pytest.mark.parametrize(("with_range", "position", "path"), [(False, 0.25, 0.35), (True, 0.10, 0.35)])
+def test_landmarks_and_path(data_dir, robot, with_range, position, path):
+    log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=with_range))
+    ledger = Ledger()
+    result = offline.run(log, load_settings(None, ("mode=joint",)), ledger)
+    stamps, first = np.unique(result.keyframes.stamps, return_index=True)
+    found = evaluate(
+        result.map, log.truth, Trajectory(stamps, result.map_T_base[first]), align="se2", radius=RADIUS
+    ).to_dict()
+    assert (found["matched"], found["missed"], found["false"], found["unresolved"]) == (15, 0, 0, 0)
+    assert found["position_rmse"] <= position
+    assert found["ate"] <= path
+    assert not any("no single solution" in warning for warning in ledger.warnings)
+    assert np.isfinite(result.rays.range).all() == with_range
+
+
+@pytest.mark.parametrize("robot", [1, 3, 5])
+def test_the_start_was_far_off(data_dir, robot):
+    """Dead reckoning alone: what the joint solve has to correct, and that the bars above are none that it meets."""
+    log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=False))
+    found = evaluate(ObjectMap(()), log.truth, log.odometry, align="se2").to_dict()
+    assert found["ate"] > 1.0

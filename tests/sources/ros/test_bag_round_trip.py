@@ -1,0 +1,82 @@
+"""A drive written as a bag of every kind reads back as the same arrays, and gives the same map."""
+
+import numpy as np
+import pytest
+from bag_writer import write_bag
+from drive_bag import rows_of, simulated
+
+from objslam import offline
+from objslam.config import load_settings
+from objslam.ledger import Ledger
+from objslam.sources import SourceOptions, read
+from objslam.sources.folder import read_log_folder, write_log_folder
+
+KINDS = ["1-bag", "1-bag-bz2", "1-bag-lz4", "1-mcap-zstd", "2-sqlite3", "2-sqlite3-old", "3-sqlite3-message", "3-mcap-none",
+         "4-sqlite3", "4-sqlite3-old", "4-sqlite3-file", "4-mcap-none", "4-mcap-lz4", "4-mcap-zstd"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulated()
+
+
+def _close(a, b):
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-9)
+
+
+def _same_path(found, expected):
+    _close(found.stamps, expected.stamps)
+    _close(found.poses, expected.poses)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_same_arrays(tmp_path, makers, log, kind):
+    vision, _, storage = kind.partition("-")
+    maker = makers[vision]
+    path = write_bag(tmp_path / "drive", storage, maker, rows_of(log, maker))
+    ledger = Ledger()
+    found = read(path, ledger)
+    assert not ledger.lines()
+    _same_path(found.odometry, log.odometry)
+    _same_path(found.localization, log.localization)
+    (camera_log,), (expected,) = found.cameras, log.cameras
+    assert camera_log.camera.name == expected.camera.name
+    assert (camera_log.camera.width, camera_log.camera.height) == (expected.camera.width, expected.camera.height)
+    for name in ("matrix", "distortion", "base_T_camera"):
+        _close(getattr(camera_log.camera, name), getattr(expected.camera, name))
+    assert camera_log.mount is None
+    boxes, true = camera_log.detections, expected.detections
+    _close(boxes.frame_stamps, true.frame_stamps)
+    assert np.array_equal(boxes.frame, true.frame)
+    _close(boxes.boxes, true.boxes)
+    _close(boxes.scores, true.scores)
+    seen = sorted(set(true.label.tolist()))
+    names = [str(i) for i in seen] if maker.ros1 else [true.label_names[i] for i in seen]
+    assert boxes.label_names == tuple(names)
+    assert np.array_equal(np.array(seen)[boxes.label], true.label)
+
+
+@pytest.mark.parametrize("kind", ["1-bag", "4-sqlite3", "4-mcap-none", "4-mcap-zstd"])
+def test_the_same_map_as_from_the_folder(tmp_path, makers, log, kind):
+    vision, _, storage = kind.partition("-")
+    maker = makers[vision]
+    write_log_folder(log, tmp_path / "log")
+    path = write_bag(tmp_path / "drive", storage, maker, rows_of(log, maker))
+    settings = load_settings(None, ("mode=fixed", "association.method=by_label", "triangulation.device=cpu"))
+    maps = [
+        offline.run(source, settings, Ledger()).map.objects
+        for source in (read_log_folder(tmp_path / "log", Ledger()), read(path, Ledger()))
+    ]
+    assert len(maps[0]) == len(maps[1]) >= 3
+    for expected, found in zip(*maps, strict=True):
+        assert found.status == expected.status
+        np.testing.assert_allclose(found.position, expected.position, atol=1e-6)
+
+
+def test_convert_and_read_again(tmp_path, makers, log):
+    path = write_bag(tmp_path / "drive", "mcap-zstd", makers["4"], rows_of(log, makers["4"]))
+    found = read(path, Ledger(), SourceOptions(format="ros"))
+    write_log_folder(found, tmp_path / "log")
+    again = read_log_folder(tmp_path / "log", Ledger())
+    _same_path(again.odometry, found.odometry)
+    assert np.array_equal(again.cameras[0].detections.boxes, found.cameras[0].detections.boxes)

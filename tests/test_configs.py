@@ -1,0 +1,143 @@
+"""The settings in configs/: each is read and maps the simulated drive, and each does what its header promises."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from objslam.config import Settings, load_settings
+from objslam.evaluation import ObjectScores, evaluate
+from objslam.geometry import exp_se3
+from objslam.ledger import Ledger
+from objslam.matching import Alignment
+from objslam.offline import run
+from objslam.results import RunResult
+from objslam.simulation import preset, simulate
+from objslam.simulation.settings import DepthNoise
+from objslam.types import Floats, Log, Trajectory, Truth
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+NAMES = sorted(file.name for file in CONFIGS.glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def drive() -> Log:
+    return simulate(preset("demo"), 0)
+
+
+@pytest.fixture(scope="module")
+def drive_with_depth() -> Log:
+    return simulate(preset("demo", depth=DepthNoise()), 0)
+
+
+def settings(name: str, *overrides: str) -> Settings:
+    return load_settings(CONFIGS / name, overrides)
+
+
+def scores(result: RunResult, log: Log, align: Alignment = "none") -> ObjectScores:
+    objects = evaluate(result.map, log.truth, result.path_after, align=align).objects
+    assert objects is not None
+    return objects
+
+
+def rmse(result: RunResult, log: Log, align: Alignment = "none") -> float:
+    return float(np.sqrt((scores(result, log, align).errors ** 2).mean()))
+
+
+def sum_of_distances(point: Floats, m: Floats, n: Floats) -> float:
+    """Eq. 1, as it is written."""
+    return float(np.linalg.norm(np.cross(point - m, n), axis=1).sum())
+
+
+def first_frames(log: Log, number: int) -> Log:
+    (camera,) = log.cameras
+    boxes = camera.detections
+    assert boxes is not None
+    few = replace(boxes.take(boxes.frame < number), frame_stamps=boxes.frame_stamps[:number])
+    return replace(log, cameras=(replace(camera, detections=few),))
+
+
+def test_the_settings_that_the_readme_names_are_there() -> None:
+    assert {"paper.yaml", "odometry.yaml", "handheld.yaml", "rgbd.yaml"} <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_says_what_it_is_for_and_how_it_is_run(name: str) -> None:
+    lines = (CONFIGS / name).read_text(encoding="utf-8").splitlines()
+    header = lines[: next(i for i, line in enumerate(lines) if not line.startswith("#"))]
+    assert header
+    assert any(re.match(rf"# +objslam run .*--config configs/{re.escape(name)}\b", line) for line in header)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_maps_the_simulated_drive(name: str, drive: Log) -> None:
+    result = run(drive, settings(name), Ledger())
+    found = scores(result, drive)
+    assert len(found.matches) == 12
+    assert not found.false
+    assert found.errors.max() < 0.05
+    assert result.summary["mode"] == settings(name).mode
+
+
+def test_paper_finds_the_least_sum_of_distances(drive: Log) -> None:
+    result = run(drive, settings("paper.yaml"), Ledger())
+    for j, o in enumerate(result.map.objects):
+        mine = result.association.object == j
+        m, n = result.origins[mine], result.directions[mine]
+        best = minimize(
+            sum_of_distances,
+            m.mean(axis=0) + 2 * n.mean(axis=0),
+            args=(m, n),
+            method="Nelder-Mead",
+            options={"xatol": 1e-8, "fatol": 1e-12, "maxiter": 4000, "maxfev": 4000},
+        )
+        np.testing.assert_allclose(o.position, best.x, atol=1e-5)
+
+
+def test_paper_uses_no_depth(drive_with_depth: Log, drive: Log) -> None:
+    """Both drives are the same but for the depths."""
+    with_depth, without = (run(log, settings("paper.yaml"), Ledger()) for log in (drive_with_depth, drive))
+    np.testing.assert_array_equal([o.position for o in with_depth.map.objects], [o.position for o in without.map.objects])
+
+
+def test_odometry_needs_no_localisation(drive: Log) -> None:
+    log = replace(drive, localization=None)
+    result = run(log, settings("odometry.yaml"), Ledger())
+    found = scores(result, log, "se2")
+    assert len(found.matches) == 12
+    assert not found.false
+    assert rmse(result, log, "se2") < 0.05
+    # the same path as it is, uncorrected
+    assert rmse(run(log, settings("odometry.yaml", "mode=fixed"), Ledger()), log, "se2") > 0.1
+
+
+def test_handheld_takes_paths_that_leave_the_plane(drive: Log) -> None:
+    """Seen from a map that is tilted, the same drive climbs, rolls and pitches, and its objects stand elsewhere."""
+    turn = exp_se3(np.array([[0.5, -0.4, 1.0, 1.0, 2.0, 3.0]]))[0]
+    path, truth = drive.localization, drive.truth
+    assert path is not None
+    assert truth is not None
+    moved = tuple(replace(o, position=turn[:3, :3] @ o.position + turn[:3, 3]) for o in truth.objects)
+    log = replace(drive, localization=Trajectory(path.stamps, turn @ path.poses), odometry=None, truth=Truth(objects=moved))
+    found = scores(run(log, settings("handheld.yaml"), Ledger()), log)
+    assert len(found.matches) == 12
+    assert found.errors.max() < 0.05
+
+
+def test_rgbd_places_what_was_seen_from_one_side_only(drive_with_depth: Log) -> None:
+    log = first_frames(drive_with_depth, 8)
+    with_depth = run(log, settings("rgbd.yaml"), Ledger())
+    without = run(log, settings("rgbd.yaml", "depth.use=false"), Ledger())
+    assert len(scores(with_depth, log).matches) > len(scores(without, log).matches)
+    assert scores(with_depth, log).errors.max() < 0.3
+
+
+def test_rgbd_uses_depth_with_fixed_poses_too(drive_with_depth: Log) -> None:
+    result = run(drive_with_depth, settings("rgbd.yaml", "mode=fixed"), Ledger())
+    plain = run(drive_with_depth, settings("rgbd.yaml", "mode=fixed", "depth.use=false"), Ledger())
+    assert rmse(result, drive_with_depth) < rmse(plain, drive_with_depth)

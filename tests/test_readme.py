@@ -1,0 +1,139 @@
+"""What README.md says is what happens: its blocks marked `# runs` run, its commands exist, its tables are true."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+import yaml
+
+from objslam.cli import app
+from objslam.config import Settings, load_settings
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+MARK = "# runs"  # the first line of a block that needs no data of others
+
+
+def blocks(language: str) -> list[str]:
+    """The fenced blocks of a language, without their indentation."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", README, re.MULTILINE | re.DOTALL)
+    return [textwrap.dedent(text) for _, text in found]
+
+
+def commands() -> list[list[str]]:
+    """Every `objslam ...` of the blocks and of the text, as arguments."""
+    lines = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("objslam ")]
+    lines += re.findall(r"`(objslam [^`]+)`", README)
+    return [shlex.split(line.split(" > ")[0])[1:] for line in lines]
+
+
+def rows(first: str) -> list[list[str]]:
+    """The cells of the table whose first column is called so."""
+    table = re.search(rf"^\| {first} \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", README, re.MULTILINE)
+    assert table
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table[1].splitlines()]
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which all marked blocks ran, one after the other, as a reader types them."""
+    folder = tmp_path_factory.mktemp("readme")
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    marked = [block for block in blocks("bash") if block.startswith(MARK)]
+    assert marked
+    for block in marked:
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", block],
+            cwd=folder,
+            env={**os.environ, "PATH": path},
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
+        )
+        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
+        assert "Traceback" not in done.stderr
+    return folder
+
+
+def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
+    for result in ("demo_out/fixed", "demo_out/joint", "my_map", "out"):
+        assert (played / result / "map.png").is_file()
+        assert (played / result / "recording.rrd").is_file()
+    (cup,) = json.loads((played / "my_map" / "objects.json").read_text())["objects"]
+    shown = json.loads(blocks("json")[0])
+    assert set(cup) == set(shown)
+    assert cup["status"] == shown["status"]
+    np.testing.assert_allclose(cup["position"], shown["position"], atol=0.005)
+    np.testing.assert_allclose(cup["position"], [2.5, 0.5, 0.4], atol=0.02)
+    sigma = np.sqrt(np.linalg.eigvalsh(cup["covariance"])[-1])
+    assert f"Its sigma is {sigma:.2f} m" in README
+    assert load_settings(played / "my_settings.yaml").fixed.loss == "huber"
+    assert (played / "my_copy" / "groundtruth" / "objects.json").is_file()
+
+
+def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
+    fields = set(re.findall(r"`(\w+)`", " ".join(row[0] for row in rows("field"))))
+    written: set[str] = set()
+    for file in played.glob("**/objects.json"):
+        objects = json.loads(file.read_text())
+        written |= {key for o in objects["objects"] for key in o}
+    assert written <= fields
+    assert fields - written <= {"ray"}  # no object was unresolved
+    results = {file.name for name in ("demo_out/joint", "my_map") for file in (played / name).iterdir()}
+    section = README.partition("## What comes out")[2]
+    for name in results:
+        assert f"`{name}`" in section, name
+
+
+def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
+    table = {row[1]: row for row in rows("drive")}
+    for mode in ("fixed", "joint"):
+        evaluation = json.loads((played / "demo_out" / mode / "evaluation.json").read_text())
+        row = table[mode]
+        assert row[2] == f"{evaluation['matched']} / {evaluation['matched'] + evaluation['missed']}"
+        assert row[3] == str(evaluation["false"])
+        assert abs(float(row[4].removesuffix(" m")) - evaluation["position_rmse"]) < 0.002
+        assert abs(float(row[5].removesuffix(" m")) - evaluation["ate"]) < 0.002
+
+
+@pytest.mark.parametrize("arguments", commands(), ids=" ".join)
+def test_every_command_has_the_options_that_are_shown(arguments: list[str]) -> None:
+    """Parses each command line, down to its last option, without running it."""
+    command: Any = typer.main.get_command(app)
+    context = command.make_context("objslam", ["config"], resilient_parsing=True)
+    arguments = [argument for argument in arguments if argument not in ("--debug", "--help", "...")]
+    while hasattr(command, "resolve_command") and arguments and arguments[0] != "COMMAND":
+        name, command, arguments = command.resolve_command(context, arguments)
+        if arguments and not hasattr(command, "resolve_command"):
+            command.make_context(name, arguments, parent=context)
+
+
+@pytest.mark.parametrize("row", rows("setting"), ids=lambda row: row[0].strip("`"))
+def test_the_settings_have_the_defaults_that_are_shown(row: list[str]) -> None:
+    value: object = Settings()
+    for part in row[0].strip("`").split("."):
+        value = getattr(value, part)
+    assert yaml.safe_load(row[1]) == value
+
+
+def test_what_is_linked_or_named_is_there() -> None:
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    named = re.findall(r"\b(?:configs|tools|objslam)/[\w/]+\.\w+", README)
+    assert links
+    assert named
+    for name in links + named:
+        assert (ROOT / name).is_file(), name
