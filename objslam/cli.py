@@ -49,9 +49,7 @@ WithoutRange = Annotated[bool, typer.Option("--without-range", help="MRCLAM: bea
 Anonymous = Annotated[bool, typer.Option("--anonymous", help="MRCLAM: every landmark gets the same label.")]
 DetectorModel = Annotated[
     Path | None,
-    typer.Option(
-        "--detector", help="ONNX model that finds the boxes in the rgb images, in place of those of the log."
-    ),
+    typer.Option("--detector", help="ONNX model that finds the boxes in the rgb images, in place of those of the log."),
 ]
 Label = Annotated[str | None, typer.Option("--label", help="Label for boxes that come without one.")]
 
@@ -285,7 +283,7 @@ def main() -> NoReturn:
         if debug:
             raise
         _say(
-            f"objslam: internal error, {type(error).__name__}: {error} (please report it with the output of --debug)",
+            f"objslam: internal error, {type(error).__name__}: {error} (please report it with its traceback: objslam --debug ...)",
             stderr=True,
         )
         sys.exit(1)

@@ -165,7 +165,7 @@ class AssociationSettings(Section):
 
     method: Literal["auto", "global", "by_label"] = "auto"
     """by_label: every label is one object. global: several objects may share a label. auto: by_label where no frame has two
-    boxes of one label, else global."""
+    boxes of one label and hardly a ray disagrees with the one object, else global."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """points tried at a time for each label, from pairs of rays."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999

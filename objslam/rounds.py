@@ -24,6 +24,7 @@ _SOLVED_YAW = 0.005  # rad
 _SAME = 11.3  # squared Mahalanobis distance below which 99 % of equal points lie (chi-squared, 3 degrees of freedom)
 _FARTHEST = 1.0  # m; objects further apart are two, however little is known of them
 _TOGETHER = 0.03  # share of frames with both that a wrong box may account for
+_MANY, _SECOND = 5, 0.25  # rays, and share of a label's rays, that disagree with its one object if there is a second
 _FIRST = 2.0  # times that, before the first solve
 
 Progress = Callable[[str, int, int], None]
@@ -54,9 +55,10 @@ def solve(
 ) -> Solution:
     """Find and solve the objects of a log; frames are all that have a pose, those without a ray too.
 
-    Fixed mode: one association at the poses as they are, one solve. Joint mode: where every label is one object, the graph
-    grows with that knowledge; else the poses are explored without it, then association and joint solve take turns until no
-    ray changes its object. SolveError where joint mode has neither odometry nor localisation.
+    Where no frame has two boxes of one label, and the rays bear it out, every label is one object: in joint mode the graph
+    grows with that knowledge. Else the association is global: in fixed mode once, at the poses as they are; in joint mode
+    the poses are explored first, then association and solve take turns until no ray changes its object.
+    SolveError where joint mode has neither odometry nor localisation.
     """
     from objslam.graph import batch
 
@@ -101,11 +103,12 @@ def _joint(
     def tell(done: int, total: int) -> None:
         progress("solve", done, total)
 
-    if _by_label(settings, all_rays):
+    if _may_be_by_label(settings, all_rays):
         by_label = associate_by_label(rays)
-        _count_unexplained(by_label, ledger)
         solved = batch.solve_joint(keyframes, rays, by_label, settings, ledger, tell)
-        return Solution(keyframes, rays, by_label, solved, ())
+        if _labels_tell(settings, by_label, solved.weight):
+            _count_unexplained(by_label, ledger)
+            return Solution(keyframes, rays, by_label, solved, ())
 
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
@@ -152,8 +155,6 @@ def _associate(
     map_T_camera: Floats,
     noise: tuple[Floats, float],
 ) -> Association:
-    if settings.association.method == "by_label":
-        return associate_by_label(rays)
     from objslam.association.search import associate
 
     sigma, place = noise
@@ -201,13 +202,27 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
     )
 
 
-def _by_label(settings: Settings, rays: Rays) -> bool:
-    """Whether labels tell objects apart: as set, or because no frame ever has two boxes of one label."""
+def _may_be_by_label(settings: Settings, rays: Rays) -> bool:
+    """Whether every label may be one object: as set, or because no frame ever has two boxes of one label."""
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
     pairs = np.stack([rays.keyframe, rays.label])
     return np.unique(pairs, axis=1).shape[1] == pairs.shape[1]
 
 
+def _labels_tell(settings: Settings, association: Association, weight: Floats) -> bool:
+    """Whether the rays bear out that every label is one object: of no label has a large part been rejected (weight 0)."""
+    if settings.association.method == "by_label":
+        return True
+    held = association.object >= 0
+    number = np.bincount(association.object[held], minlength=association.count)
+    rejected = np.bincount(association.object[held & (weight == 0)], minlength=association.count)
+    return not ((rejected >= _MANY) & (rejected > _SECOND * number)).any()
+
+
 def _count_unexplained(association: Association, ledger: Ledger) -> None:
-    ledger.drop("boxes that no object at rest explains", int((association.object < 0).sum()))
+    left = int((association.object < 0).sum())
+    if left:
+        ledger.warn(
+            f"{left} of {len(association.object)} boxes are explained by no object at rest (unexplained_share, by label)"
+        )

@@ -131,7 +131,7 @@ def test_the_settings_have_the_defaults_that_are_shown(row: list[str]) -> None:
 
 
 def test_what_is_linked_or_named_is_there() -> None:
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
     named = re.findall(r"\b(?:configs|tools|objslam)/[\w/]+\.\w+", README)
     assert links
     assert named

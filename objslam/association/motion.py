@@ -12,7 +12,7 @@ from objslam.types import Floats, Ints
 
 _RARE = 3.0  # log odds against motion before its rays are looked at
 _WAY = 0.5  # of an object's size
-_MOST = 15  # rays that count
+_MOST = 10  # rays that count
 
 
 def rest_odds(s: Sightings, stamps: Floats, state: State) -> Floats:
@@ -29,7 +29,7 @@ def rest_odds(s: Sightings, stamps: Floats, state: State) -> Floats:
 
 
 def _with_velocity(s: Sightings, stamps: Floats, state: State) -> tuple[Floats, Floats]:
-    """Which share of the squared deviations of its rays a velocity of each landmark explains, and how far it goes, m: (N,)."""
+    """Which share of its rays' squared deviations a velocity of each landmark explains, and how far it goes, m: (N,)."""
     count = len(state.landmarks)
     held = np.flatnonzero(state.matched >= 0)
     index, r = state.matched[held], s.take(held)

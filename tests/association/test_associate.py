@@ -54,14 +54,18 @@ def test_moving_objects_and_many_false_boxes(seed):
     assert (association.object[roaming] < 0).mean() > 0.6
 
 
-def test_a_class_that_only_moves_gives_no_object():
-    settings = DriveSettings(placed=(("cup", (2.0, 1.0, 0.5)), ("ball", (-2.0, 1.0, 0.5))), objects=0, moving=3, pixel_sigma=3.0)
-    scene = drive(settings, 2)
-    moving = scene.rays.take(scene.whose >= 2)
-    only = replace(moving, label=np.full(len(moving), 0))
-    association = scene.associate(rays=only)
-    assert len(only) > 100
-    assert (association.object < 0).mean() > 0.8
+@pytest.mark.parametrize("seed", [0, 2])
+def test_what_moves_among_what_stands_gives_no_object(seed):
+    placed = (("cup", (2.0, 1.0, 0.5)), ("ball", (-2.0, 1.0, 0.5)))
+    settings = DriveSettings(placed=placed, objects=0, moving=3, pixel_sigma=3.0)
+    scene = drive(settings, seed)
+    association = scene.associate()
+    found, _, errors = scene.compare(association)
+    assert association.count == len(found) == 2
+    assert errors.max() < 0.05
+    roaming = scene.whose >= 2
+    assert roaming.sum() > 80
+    assert (association.object[roaming] < 0).mean() > 0.95
 
 
 @pytest.mark.parametrize("distance", [0.25, 0.5])
