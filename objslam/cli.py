@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -114,22 +116,40 @@ def evaluate_result(
 @app.command()
 def demo(
     out: Out = Path("demo_out"),
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed is another drive.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed is another room and drive.")] = 0,
+    boxes: Annotated[
+        bool, typer.Option("--boxes", help="Simulate the detector's boxes too, without rendering images: done in seconds.")
+    ] = False,
 ) -> None:
-    """Simulate a drive, map it with the poses as they are and together with them, and compare both with the truth."""
+    """Make a drive, map it with the poses as they are and together with them, and compare both with the truth.
+
+    The drive is rendered: a furnished room, RGB-D images, seven objects that the detector shipped with objslam knows.
+    """
     from objslam.ledger import Ledger
     from objslam.results import prepare_output
     from objslam.simulation import preset, simulate
     from objslam.sources.folder import read_log_folder, write_log_folder
 
     prepare_output(out)
-    log = out / "log"
-    write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
-    _say(f"simulated a drive: {log}")
-    for mode in ("fixed", "joint"):
+    log, model = out / "log", None
+    if boxes:
+        write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
+    else:
+        from objslam.simulation.rendered import RenderSettings, render_drive
+
+        model = Path(__file__).parent / "models" / "ssd7.onnx"
+        with _progress() as show:
+            render_drive(
+                RenderSettings(), seed, log, overwrite=True, progress=lambda done, total: show("rendering", done, total)
+            )
+    _say(f"made a drive: {log}")
+    runs = (("fixed", "localization"), ("joint", "odometry"))
+    for mode, poses in runs:
         ledger = Ledger()
-        _say(f"\n[bold]objslam run {log} --mode {mode} -o {out / mode}[/]", markup=True)
-        _run(read_log_folder(log, ledger), _settings(mode, None, None), ledger, out / mode)
+        settings = _settings(mode, None, [f"poses.use={poses}"])
+        shown = f"objslam run {log} -o {out / mode} --mode {mode} --set poses.use={poses}"
+        _say(f"\n[bold]{shown}{f' --detector {model.name}' if model else ''}[/]", markup=True)
+        _run(read_log_folder(log, ledger), settings, ledger, out / mode, model)
         _evaluate(out / mode, None, "none", 0.5)
     _say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: rerun {out / 'joint' / 'recording.rrd'}")
 
@@ -189,19 +209,10 @@ def _read(
 def _run(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
     import time
 
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
     from objslam import offline
     from objslam.results import write_result
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    console = _console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading")
-
-        def show(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=stage, completed=done, total=total or None)
-
+    with _progress() as show:
         if detector is not None:
             from objslam.detection import default_cache, detect_log, load_detector
 
@@ -221,6 +232,18 @@ def _run(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path
         + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
     )
     _say(f"wrote {out}")
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr, where that is a terminal: called with the stage's name, what is done and the total."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = _console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("reading")
+        yield lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None)
 
 
 def _evaluate(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
@@ -283,7 +306,7 @@ def main() -> NoReturn:
         if debug:
             raise
         _say(
-            f"objslam: internal error, {type(error).__name__}: {error} (please report it with its traceback: objslam --debug ...)",
+            f"objslam: internal error, {type(error).__name__}: {error} (please report it; objslam --debug shows where)",
             stderr=True,
         )
         sys.exit(1)

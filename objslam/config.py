@@ -89,6 +89,8 @@ class Detector(Section):
 class Poses(Section):
     """How poses are read off the log."""
 
+    use: Literal["auto", "odometry", "localization"] = "auto"
+    """which poses of a log that has both: auto takes the localisation, and in joint mode the odometry between its poses."""
     max_gap: Positive = 1.1
     """s; a frame in a longer gap of the path is dropped and counted."""
 

@@ -7,6 +7,7 @@ import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from objslam import __version__
 from objslam.association.extent import extents
 from objslam.config import Settings
-from objslam.errors import SolveError
+from objslam.errors import LogError, SolveError
 from objslam.geometry import widest_angle
 from objslam.keyframes import build_keyframes, correct_path
 from objslam.ledger import Ledger
@@ -30,6 +31,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     SolveError when no ray is left to solve; LogError when no frame lies on the path. What was dropped is in the ledger, and
     with it in the summary.
     """
+    log = _chosen_poses(log, settings)
     seconds: dict[str, float] = {}
     with _stage("rays", seconds, progress):
         frames = build_keyframes(log, settings, ledger)
@@ -62,6 +64,15 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         path=path,
         path_after=correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base),
     )
+
+
+def _chosen_poses(log: Log, settings: Settings) -> Log:
+    use = settings.poses.use
+    if use == "auto":
+        return log
+    if (log.odometry if use == "odometry" else log.localization) is None:
+        raise LogError(f"the log has no {use}", where=log.name, hint="leave poses.use at auto")
+    return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
 
 
 @contextmanager

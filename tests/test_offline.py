@@ -265,7 +265,7 @@ def test_a_frame_or_two(mode, frames, localised):
     assert len(result.keyframes) == frames
     if frames == 1:
         assert not result.map.resolved()
-    unexplained = ledger.dropped.get("boxes that no object at rest explains", 0)
+    unexplained = result.summary["counts"]["rays_unexplained"]
     assert sum(o.rays for o in result.map.objects) + unexplained == len(few)
 
 

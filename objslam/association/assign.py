@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.association.landmarks import Landmarks
-from objslam.association.matches import RANGE_LOSS, choose, gated_edges
+from objslam.association.landmarks import RANGE_LOSS, Landmarks
+from objslam.association.matches import choose, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.types import Bools, Floats, Ints, Rays
 

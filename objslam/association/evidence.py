@@ -93,15 +93,10 @@ def chance_odds(s: Sightings, state: State, kind: Ints, visits: Visits, view: Vi
     """
     from scipy.stats import poisson
 
-    count, number = len(state.landmarks), state.number
-    held = np.flatnonzero(state.matched >= 0)
-    index = state.matched[held]
-    distance = np.maximum(np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1), 1e-3)
-    angle2 = variance(s.take(held), distance, state.landmarks.noise[index]) / distance**2
-    area = np.pi * gate * np.bincount(index, angle2, count) / np.maximum(number, 1)
+    number = state.number
     free = np.bincount(s.label[state.matched < 0], minlength=state.landmarks.accepts.shape[1])
     strays = _no_stronger(number, kind) + free[kind]
-    expected = np.maximum(visits.inside, visits.expected) * area * strays / (max(len(view), 1) * view.solid_angle)
+    expected = strays * stray_share(s, state, visits, view, gate)
     points = np.log(np.maximum(strays * (strays - 1) / 2, 1.0))
     return np.asarray(np.clip(-points - poisson.logsf(number - 3, expected), -_SURE, _SURE))
 
@@ -113,6 +108,16 @@ def prior_odds(s: Sightings, state: State, kind: Ints) -> Floats:
     free = np.bincount(s.label[state.matched < 0], minlength=labels)
     odds = np.log((held + _DOUBT * _PRIOR) / (free + _DOUBT))
     return np.minimum(odds, np.log(_PRIOR))[kind]
+
+
+def stray_share(s: Sightings, state: State, visits: Visits, view: View, gate: float) -> Floats:
+    """The share (N,) of boxes thrown anywhere into the images that would pass each landmark within its gate."""
+    count, held = len(state.landmarks), np.flatnonzero(state.matched >= 0)
+    index = state.matched[held]
+    distance = np.maximum(np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1), 1e-3)
+    angle2 = variance(s.take(held), distance, state.landmarks.noise[index]) / distance**2
+    area = np.pi * gate * np.bincount(index, angle2, count) / np.maximum(state.number, 1)
+    return np.maximum(visits.inside, visits.expected) * area / (max(len(view), 1) * view.solid_angle)
 
 
 def size_odds(s: Sightings, state: State, kind: Ints) -> Floats:

@@ -70,7 +70,7 @@ def _best(points: Floats, scorer: _Scorer, least: float) -> Floats:
         if float(left[best]) < max(least, _COMPETES * float(whole[best])):
             break
         found.append(best)
-        taken = support[best] > 0
+        taken = support[best] > scorer.doubt
         left -= support[:, taken].sum(dim=1)
         support[:, taken] = 0.0
     return scorer.unload(moved[found])
@@ -145,11 +145,12 @@ class _Scorer:
         across = np.eye(3) - n[:, :, None] * n[:, None, :]
         self.across = self._tensor(across.reshape(-1, 9))
         self.foot = self._tensor((across @ origin[:, :, None])[:, :, 0])
-        self.range = None
+        self.range, self.doubt = None, 0.0
         if np.isfinite(s.range).any():
             ranged = np.isfinite(s.range)
             precision = np.where(ranged, 1 / s.range_sigma, 0.0)
             self.range = self._tensor(np.where(ranged, s.range, 0.0)), self._tensor(precision)
+            self.doubt = 1 - _RANGE_SHARE  # a ray with less support may have a wrong range, or belong to something behind
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.as_tensor(values, dtype=self.dtype, device=self.device).contiguous()

@@ -11,6 +11,10 @@ from objslam.association.extent import grouped_median
 from objslam.association.sightings import Sightings
 from objslam.types import Bools, Floats, Ints
 
+RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
+"""What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
+has its range anywhere within some metres, a right box has a wrong range one time in ten or so."""
+
 
 @dataclass(frozen=True)
 class Landmarks:
@@ -89,6 +93,13 @@ def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
     depth = np.einsum("ri,ri->r", to, s.direction)
     distance2 = np.einsum("ri,ri->r", to, to)
     return np.where(depth > 0, np.maximum(distance2 - depth**2, 0.0), np.inf), np.sqrt(distance2)
+
+
+def range_costs(s: Sightings, distance: Floats, variance_along: Floats | float = 0.0) -> Floats:
+    """What the range of each ray (R,) adds to the cost of a landmark at `distance` (R,) m; 0 where there is none."""
+    with np.errstate(invalid="ignore"):
+        wrong = (distance - s.range) ** 2 / (s.range_sigma**2 + variance_along) - RANGE_GAIN
+    return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
 
 
 def sizes(s: Sightings, state: State) -> Floats:

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.landmarks import Landmarks, variance
+from objslam.association.landmarks import Landmarks, range_costs, variance
 from objslam.association.sightings import MIN_DEPTH, Sightings
 from objslam.geometry import skew
 from objslam.types import Floats, Ints
 
-RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
-"""What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
-has its range anywhere within some metres, a right box has a wrong range one time in ten or so."""
 TRACK_GAIN = 2.0
 """What a match to the landmark of the other boxes of its track takes off the cost."""
 _CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
@@ -64,10 +61,8 @@ def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | 
     determinant = a * c - b**2
     deviation = (c * offset[:, 0] ** 2 - 2 * b * offset[:, 0] * offset[:, 1] + a * offset[:, 1] ** 2) / determinant
     along = np.einsum("ei,eij,ej->e", r.direction, covariance, r.direction)
-    with np.errstate(invalid="ignore"):
-        wrong = (distance - r.range) ** 2 / (r.range_sigma**2 + along) - RANGE_GAIN
     vague = np.log(determinant / own**2)
-    cost = deviation + vague + np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
+    cost = deviation + vague + range_costs(r, distance, along)
     keep = np.flatnonzero(deviation <= gate)
     keep = keep[np.lexsort((index[keep], ray[keep]))]
     return Edges(ray[keep], index[keep], deviation[keep], vague[keep], cost[keep])

@@ -15,6 +15,7 @@ from objslam import config
 from objslam.association.assign import gate_limit
 from objslam.association.evidence import chance_odds, detection_rates, prior_odds, size_odds
 from objslam.association.extent import grouped_median, grouped_quantile
+from objslam.association.labels import adopted
 from objslam.association.landmarks import Landmarks, State, offsets, variance
 from objslam.association.matches import choose, gated_edges, track_bonus
 from objslam.association.motion import rest_odds
@@ -95,6 +96,9 @@ def associate(
         state = _drop_all(work, state)
         if len(state.landmarks) == before:
             break
+    if settings.association.fuse_labels:
+        accepts = adopted(s, state, work.visits(state), view, gate)
+        state = _drop_all(work, _settle(work, replace(state, landmarks=replace(state.landmarks, accepts=accepts))))
     return _result(work, state, ray)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from objslam.association.evidence import Rates
 from objslam.association.extent import grouped_median
-from objslam.association.landmarks import State, blurs, offsets, sizes, variance
+from objslam.association.labels import SIZE_RATIO
+from objslam.association.landmarks import State, blurs, offsets, range_costs, sizes, variance
 from objslam.association.matches import gated_edges
 from objslam.association.refit import refit
 from objslam.association.sightings import Sightings
@@ -22,7 +23,6 @@ _OBJECT_COST = 10.0  # squared deviations that one more object costs, besides ln
 _INSIDE = (0.35, 0.5)  # of the size of the smaller, of the larger: things closer than that share their space,
 _APART = 0.1  # unless they were seen as two in this share of the frames in which they could have been
 _EXPECTED = 5.0  # frames with both that two things should have, for their absence to say something
-_SIZE_RATIO = 2.0  # what has two labels has one size
 _DUPLICATE = 0.5  # boxes of one frame that overlap as much (intersection over union) are of one thing
 _NEIGHBOURS = 8
 _REACH = 2.0  # gates: rays seen under little parallax put one thing at two distances
@@ -65,7 +65,7 @@ def merges(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     shared |= (gap < _INSIDE[1] * large) & (apart <= _APART * np.maximum(should, _EXPECTED))
     one = (gain > 0) | shared
     if across_labels:
-        one &= never & (large < _SIZE_RATIO * small)
+        one &= never & (large < SIZE_RATIO * small)
     taken = np.zeros(count, dtype=bool)
     for p in np.lexsort((b, a, -gain)):  # the clearest first, each object in one pair at a time
         if one[p] and not taken[a[p]] and not taken[b[p]]:
@@ -149,7 +149,7 @@ def _gains(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
 def _ray_costs(r: Sightings, position: Floats, noise: Floats, gate: float) -> Floats:
     """-2 ln likelihood of each ray (R,) given its point, up to a constant; never more than that of a stray."""
     off2, distance = offsets(r, position)
-    return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise), gate)
+    return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 
 
 def _table(visits: Visits, which: Bools | None) -> Any:

@@ -62,7 +62,7 @@ def test_what_moves_among_what_stands_gives_no_object(seed):
     association = scene.associate()
     found, _, errors = scene.compare(association)
     assert association.count == len(found) == 2
-    assert errors.max() < 0.05
+    assert errors.max() < 0.1
     roaming = scene.whose >= 2
     assert roaming.sum() > 80
     assert (association.object[roaming] < 0).mean() > 0.95
@@ -150,26 +150,6 @@ def test_an_object_missed_most_of_the_time_stays():
     assert scene.associate(rays=join(scene.rays, rarely.rays)).count == 4
 
 
-def test_a_hidden_object_was_not_missed():
-    wall, cup = np.array([1.0, 0.0, 0.3]), np.array([2.5, 0.0, 0.3])
-    poses = lift_se2(np.column_stack([np.zeros(200), np.linspace(-0.6, 0.6, 200), np.zeros(200)]))
-    names = ("box", "cup")
-    front = watch(wall[None], poses, names=names, label=np.array([0]), size=0.5)
-    others = watch(np.array([[2.5, 0.9, 0.3], [2.5, -0.9, 0.3]]), poses, names=names, label=np.array([1, 1]))
-    behind = watch(cup[None], poses, names=names, label=np.array([1]))
-    ahead = np.abs(poses[behind.rays.keyframe, 1, 3]) > 0.45  # else the box is in the way
-    with_box = front.associate(ANYTHING, rays=join(front.rays, others.rays, behind.rays.take(ahead)))
-    without = front.associate(ANYTHING, rays=join(others.rays, behind.rays.take(ahead)))
-    existence = []
-    for association, parts in ((with_box, 3), (without, 2)):
-        origin = 0 if parts == 3 else 1
-        cups = np.flatnonzero(association.label == 1)
-        assert len(cups) == 3, origin
-        number = [int((association.object == j).sum()) for j in cups]
-        existence.append(association.existence[cups[int(np.argmin(number))]])
-    assert existence[0] > existence[1] + 0.05
-
-
 def test_one_thing_with_two_labels_is_one_object():
     scene = drive(preset("rooms"), 6)
     rng = np.random.default_rng(0)
@@ -183,7 +163,9 @@ def test_one_thing_with_two_labels_is_one_object():
     mixed = fused.label_weights[fused.label == 0]
     assert len(mixed) == (scene.label == 0).sum()
     assert np.abs(mixed[:, -1] - 0.3).max() < 0.25
-    assert scene.associate(APART, rays=rays).count > len(scene.points)
+    apart = scene.associate(APART, rays=rays)
+    assert apart.label_weights is not None
+    assert (apart.label_weights.max(axis=1) == 1).all()
 
 
 def test_two_boxes_of_one_thing_in_a_frame_are_one_object():
