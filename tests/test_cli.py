@@ -191,7 +191,7 @@ def test_config_dump_is_what_config_reads(objslam, tmp_path):
 
 
 def test_demo(objslam, tmp_path):
-    demo = objslam("demo", "-o", tmp_path / "demo", "--seed", 1)
+    demo = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
     assert demo.code == 0, demo.err
     assert demo.out.count("position RMSE") == 2
     for mode in MODES:
@@ -201,7 +201,18 @@ def test_demo(objslam, tmp_path):
         assert found["recall"] > 0.8
         assert found["position_median"] < 0.1
     assert objslam("run", tmp_path / "demo" / "log", "-o", tmp_path / "again", *LEAN).code == 0
-    assert objslam("demo", "-o", tmp_path / "demo", "--seed", 1).code == 0  # over the demo before
+    assert objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1).code == 0  # over the demo before
+
+
+def test_demo_from_images(objslam, tmp_path):
+    """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
+    demo = objslam("demo", "-o", tmp_path / "demo")
+    assert demo.code == 0, demo.err
+    for mode, bar in (("fixed", 0.05), ("joint", 0.10)):
+        found = json.loads((tmp_path / "demo" / mode / "evaluation.json").read_text())
+        assert (found["matched"], found["missed"], found["false"]) == (7, 0, 0)
+        assert found["position_rmse"] <= bar
+        assert (tmp_path / "demo" / mode / "detections.jsonl").is_file()
 
 
 def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_path):
