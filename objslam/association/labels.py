@@ -23,8 +23,8 @@ _BY_CHANCE = 1e-3  # how many labels may be adopted wrongly
 def adopted(s: Sightings, state: State, visits: Visits, view: View, gate: float) -> Bools:
     """Which labels each landmark accepts (N, L) once those are added whose free boxes it explains, in its size.
 
-    A label is added where more of its boxes lie on a landmark, in frames in which that has none, than strays would, and fewer
-    than it has.
+    A label is added where more of its boxes lie on a landmark, in frames in which that has none, than strays would, and
+    fewer than it has.
     """
     from scipy.stats import poisson
 

@@ -24,6 +24,7 @@ def refit(s: Sightings, ray: Ints, index: Ints, start: Floats, noise: Floats) ->
     r, index = s.take(ray[order]), index[order]
     along = r.direction[:, :, None] * r.direction[:, None, :]
     ranged = np.isfinite(r.range)
+    number = np.maximum(np.bincount(index, minlength=count), 1)
     position = start.copy()
     for _ in range(_ITERATIONS):
         to = position[index] - r.origin
@@ -41,7 +42,10 @@ def refit(s: Sightings, ray: Ints, index: Ints, start: Floats, noise: Floats) ->
         pull = (range_weight * beyond)[:, None] * r.direction - weight[:, None] * (across @ offset[:, :, None])[:, :, 0]
         total = sums(information.reshape(-1, 9), index, count).reshape(-1, 3, 3)
         total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-        position = position + np.linalg.solve(total, sums(pull, index, count)[:, :, None])[:, :, 0]
+        step = np.linalg.solve(total, sums(pull, index, count)[:, :, None])[:, :, 0]
+        # under little parallax a full step may go anywhere; no step is longer than the point is away
+        length, reach = np.linalg.norm(step, axis=1), np.bincount(index, distance, count) / number
+        position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     return position
 
 
