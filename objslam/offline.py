@@ -84,7 +84,7 @@ def _stage(name: str, seconds: dict[str, float], progress: Progress) -> Iterator
 
 
 def _describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> tuple[ObjectMap, Floats]:
-    """The objects with what can be said of each, counting rays that were not rejected; how far off the rays are (R,), rad."""
+    """The objects with what can be said of each, counting rays not rejected; and how far off the rays are (R,), rad."""
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
     origins, directions = rays.in_map(map_T_camera)
