@@ -64,7 +64,9 @@ def test_what_a_result_holds_fits_together(mode):
     counts = result.summary["counts"]
     dropped_boxes = sum(n for reason, n in ledger.dropped.items() if reason.startswith("boxes"))
     assert counts["rays"] == r
-    assert counts["detections"] == len(log.cameras[0].detections) == len(held[held]) + dropped_boxes
+    assert counts["detections"] == len(log.cameras[0].detections) == r + dropped_boxes
+    assert counts["rays_unexplained"] == (~held).sum()
+    assert counts["rays_rejected"] == (result.weight[held] == 0).sum()
     assert counts["keyframes"] == k
     assert (counts["objects"], counts["unresolved"]) == (4, 0)
     assert result.summary["dropped"] == ledger.dropped

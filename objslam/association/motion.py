@@ -35,9 +35,14 @@ def _with_velocity(s: Sightings, stamps: Floats, state: State) -> tuple[Floats, 
     index, r = state.matched[held], s.take(held)
     time = _standard(stamps[r.frame], index, count)
     to = state.landmarks.position[index] - r.origin
-    across = np.eye(3) - r.direction[:, :, None] * r.direction[:, None, :]
-    weighted = across / variance(r, np.linalg.norm(to, axis=1), state.landmarks.noise[index])[:, None, None]
-    pull = -(weighted @ to[:, :, None])[:, :, 0]
+    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
+    toward = to / distance[:, None]
+    # as in `refit`: along the line of sight nothing changes, so a point that drives along with the camera gains nothing
+    across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
+    spread = variance(r, distance, state.landmarks.noise[index])
+    offset = to - np.einsum("ri,ri->r", to, r.direction)[:, None] * r.direction
+    weighted = across / spread[:, None, None]
+    pull = -(weighted @ offset[:, :, None])[:, :, 0]
     blocks = [sums((weighted * (time**p)[:, None, None]).reshape(-1, 9), index, count).reshape(-1, 3, 3) for p in range(3)]
     information = np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
     information += (1e-6 * np.trace(information, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(6)
@@ -45,8 +50,7 @@ def _with_velocity(s: Sightings, stamps: Floats, state: State) -> tuple[Floats, 
     moving = np.linalg.solve(information, right[:, :, None])[:, :, 0]
     resting = np.linalg.solve(information[:, :3, :3], right[:, :3, None])[:, :, 0]
     gain = (moving * right).sum(axis=1) - (resting * right[:, :3]).sum(axis=1)
-    squared = np.einsum("pi,pij,pj->p", to, weighted, to)
-    total = np.maximum(np.bincount(index, squared, count), 1e-9)
+    total = np.maximum(np.bincount(index, np.einsum("pi,pi->p", offset, offset) / spread, count), 1e-9)
     duration = grouped_quantile(time, index, count, 1.0) - grouped_quantile(time, index, count, 0.0)
     return gain / total, np.nan_to_num(np.linalg.norm(moving[:, 3:], axis=1) * duration)
 

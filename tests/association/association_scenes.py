@@ -54,9 +54,7 @@ class Scene:
         """Positions (M, 3) of the associated objects by Eq. 1."""
         origins, directions = self.rays.in_map(self.keyframes.map_T_camera)
         settings = Settings().triangulation
-        return triangulate(
-            origins, directions, association.object, association.count, self.rays.sigma, settings
-        ).positions
+        return triangulate(origins, directions, association.object, association.count, self.rays.sigma, settings).positions
 
     def compare(self, association: Association, radius: float = 0.5) -> tuple[Ints, Ints, Floats]:
         """Matched objects and points, and their errors, m."""
@@ -129,11 +127,12 @@ def rays_of_boxes(
     """Rays of boxes (R, 4) px of an undistorted camera."""
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     direction = np.column_stack([centre, np.ones(len(boxes))]) @ np.linalg.inv(camera.matrix).T
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     nothing = np.full(len(boxes), np.nan)
     return Rays(
         keyframe=frame,
-        direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        sigma=np.full(len(boxes), pixel_sigma / camera.focal),
+        direction=direction,
+        sigma=pixel_sigma / camera.focal * direction[:, 2] ** 1.5,
         range=nothing,
         range_sigma=nothing,
         label=label,

@@ -267,5 +267,7 @@ def test_strays_alone_make_no_object():
     scene = watch(np.zeros((0, 3)), circle(200))
     frame = np.sort(rng.integers(0, 200, 150))
     centre = rng.uniform([20, 20], [620, 460], (150, 2))
-    strays = rays_of_boxes(frame, np.column_stack([centre - 15, centre + 15]), np.zeros(150, dtype=np.int64), scene.cameras[0], ("cup",), 3.0)
+    strays = rays_of_boxes(
+        frame, np.column_stack([centre - 15, centre + 15]), np.zeros(150, dtype=np.int64), scene.cameras[0], ("cup",), 3.0
+    )
     assert scene.associate(rays=strays).count == 0

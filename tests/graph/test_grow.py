@@ -85,7 +85,7 @@ def test_false_boxes_do_not_pull_the_path_away():
         assert drive.right().mean() < 0.67
         map_T_camera, positions = grown(drive)
         assert drive.ate(path_of(drive, map_T_camera)) < 0.5 * drive.ate(drive.keyframes.map_T_base)
-        assert np.nanmedian(drive.object_errors(positions, "se2")) < 0.1
+        assert np.nanmedian(drive.object_errors(positions, "se2")) < 0.15
 
 
 def test_no_landmark_leaves_the_odometry_as_it_is():

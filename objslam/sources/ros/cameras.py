@@ -77,7 +77,7 @@ def find_cameras(
         alone = len(calibrations) == 1
         named = {c.camera.name: [t for t in seeds if _is_named(t, c.camera.name)] for c in calibrations}
         if alone and not any(named.values()):
-            named = dict.fromkeys(named, list(seeds))
+            named = {name: list(seeds) for name in named}
         for name in (name for name, topics in named.items() if not topics):
             ledger.warn(f"the camera {name!r} has no topics: left out (--topic {name}.detections=/name, or image)")
         taken = {topic.name for topics in named.values() for topic in topics}

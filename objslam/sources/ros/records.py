@@ -74,7 +74,7 @@ class FileReport:
 
 
 def plain(name: str) -> str:
-    """The name of a topic or frame as it can be shown on one line: what is not printable is replaced, what is long is cut."""
+    """The name of a topic or frame as one line can show it: what is not printable is replaced, what is long is cut."""
     if len(name) <= _MAX_NAME and name.isprintable():
         return name
     return "".join(c if c.isprintable() else "\ufffd" for c in name[:_MAX_NAME])

@@ -12,7 +12,6 @@ from objslam.geometry import pose_from_quaternion
 from objslam.ledger import Ledger
 from objslam.types import Floats, Ints
 
-
 _FAR, _LONG, _SHORT = 1e9, 1e3, 1e-6  # m; the length of a quaternion, which should be 1
 
 
@@ -37,7 +36,7 @@ class PoseRows:
         """Stamps (N,), s, in the order they came, and poses (N, 4, 4); those that are no poses are dropped and counted."""
         values = np.frombuffer(self.values).reshape(-1, 7)
         with np.errstate(invalid="ignore"):
-            good = (np.abs(values) < [_FAR] * 3 + [_LONG] * 4).all(axis=1)
+            good = np.asarray((np.abs(values) < [_FAR] * 3 + [_LONG] * 4).all(axis=1))
         good &= np.linalg.norm(np.where(good[:, None], values[:, 3:], 0.0), axis=1) > _SHORT
         stamps = choose_times(self.stamps, self.logged) / 1e9
         where = None if good.all() else f"stamp {stamps[~good][0]:.3f}"

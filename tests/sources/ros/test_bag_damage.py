@@ -1,5 +1,6 @@
-"""Damaged bags give what a reader of bytes could still find in them, and say what is lost; the originals stay as they are."""
+"""Damaged bags give what a reader of bytes could still find, and say what is lost; the originals stay as they are."""
 
+import contextlib
 import hashlib
 import io
 import shutil
@@ -87,14 +88,12 @@ def _recoverable(data, payloads):
     found = set()
     stream = StreamReader(io.BytesIO(data), emit_chunks=True)
     end = 8
-    try:
+    with contextlib.suppress(Exception):  # the library has no one kind of error for a file that ends
         for record in stream.records:
             end = stream._stream.count
             if isinstance(record, Chunk) and len(record.data) > 0:
                 messages = [r.data for r in breakup_chunk(record, validate_crc=True) if hasattr(r, "publish_time")]
                 found |= set(messages) & set(payloads)
-    except Exception:  # noqa: BLE001 the library has no one kind of error for a file that ends
-        pass
     stump = data[end + 9 + 28 :]  # an opcode and a length, times, size and CRC: then what compresses
     start = stump.find(zstandard.FRAME_HEADER)
     if start >= 0:

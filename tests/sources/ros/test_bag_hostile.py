@@ -116,7 +116,13 @@ def test_sizes_without_sense_in_mcap(tmp_path, makers):
     good = write_mcap(tmp_path / "good.mcap", "zstd", makers["4"], _odometry(makers["4"])).read_bytes()
     bomb = zstandard.ZstdCompressor().compress(bytes(300 << 20))
     assert len(bomb) < 100_000
-    evil = [_chunk(300 << 20, bomb), _chunk(10, bomb), _chunk(2**62, b""), _chunk(10, b"xx", b"\xff\xfe"), struct.pack("<BQ", 0xF0, 4) + b"abcd"]
+    evil = [
+        _chunk(300 << 20, bomb),
+        _chunk(10, bomb),
+        _chunk(2**62, b""),
+        _chunk(10, b"xx", b"\xff\xfe"),
+        struct.pack("<BQ", 0xF0, 4) + b"abcd",
+    ]
     evil.append(struct.pack("<BQ", 5, 3) + b"abc")
     evil.append(struct.pack("<BQ", 3, 20) + b"\x01\0\xff\xff\xff\x7f" + bytes(14))
     (tmp_path / "evil.mcap").write_bytes(good[:8] + b"".join(evil) + good[8:])
@@ -134,7 +140,11 @@ def test_sizes_without_sense_in_mcap(tmp_path, makers):
 def test_sizes_without_sense_in_a_ros1_bag(tmp_path, makers):
     path = write_bag(tmp_path / "good", "bag-bz2", makers["1"], _odometry(makers["1"]))
     data = path.read_bytes()
-    for at, value in ((data.index(b"index_pos=") + 10, b"\xff" * 8), (data.index(b"size=") + 5, b"\xff" * 4), (13, b"\xff" * 4)):
+    for at, value in (
+        (data.index(b"index_pos=") + 10, b"\xff" * 8),
+        (data.index(b"size=") + 5, b"\xff" * 4),
+        (13, b"\xff" * 4),
+    ):
         changed = bytearray(data)
         changed[at : at + len(value)] = value
         (tmp_path / "evil.bag").write_bytes(changed)
@@ -177,15 +187,19 @@ def test_bytes_changed_at_random_never_end_in_a_traceback(tmp_path_factory, whol
     for _ in range(data.draw(st.integers(1, 8))):
         at = data.draw(st.integers(0, len(content) - 1))
         content[at : at + data.draw(st.integers(1, 4))] = data.draw(st.binary(min_size=1, max_size=4))
-    path = tmp_path_factory.mktemp("fuzz") / f"x{ {'bag': '.bag', 'mcap': '.mcap'}.get(kind.split('-')[0], '.db3')}"
+    path = tmp_path_factory.mktemp("fuzz") / f"x{ {'bag': '.bag', 'mcap': '.mcap'}.get(kind.split('-')[0], '.db3') }"
     path.write_bytes(content[: data.draw(st.integers(20, len(content)))])
+    for look in (describe, lambda path: read(path, Ledger())):
+        error = _error_of(look, path)
+        assert error is None or "\n" not in str(error)
+
+
+def _error_of(look, path):
     try:
-        info = describe(path)
-        read(path, Ledger())
+        look(path)
     except LogError as error:
-        assert "\n" not in str(error)
-    else:
-        assert info.messages >= 0
+        return error
+    return None
 
 
 @pytest.fixture(scope="module")

@@ -139,7 +139,11 @@ def test_what_is_no_image_is_dropped_and_counted(makers, tmp_path, colour):
     huge.height = huge.width = 2**31
     unknown.encoding = "../../etc"
     narrow.step = 3
-    wrong = [maker.compressed(5, b"\x89PNG\r\n no", "png"), maker.compressed(6, b"", "jpeg"), maker.compressed(7, b"nothing", "x")]
+    wrong = [
+        maker.compressed(5, b"\x89PNG\r\n no", "png"),
+        maker.compressed(6, b"", "jpeg"),
+        maker.compressed(7, b"nothing", "x"),
+    ]
     images, pixels, ledger = _extract(maker, tmp_path, [good, small, huge, unknown, narrow])
     assert len(pixels) == 1
     assert sum(ledger.dropped.values()) == 4
@@ -152,7 +156,9 @@ def test_what_is_no_image_is_dropped_and_counted(makers, tmp_path, colour):
 
 def test_stamps_that_repeat_or_go_back(makers, tmp_path, colour):
     maker = makers["4"]
-    messages = [maker.image(t * _S, np.full((2, 2), value, np.uint8), "mono8") for t, value in ((5, 1), (5, 2), (3, 3), (6, 4))]
+    messages = [
+        maker.image(t * _S, np.full((2, 2), value, np.uint8), "mono8") for t, value in ((5, 1), (5, 2), (3, 3), (6, 4))
+    ]
     images, pixels, ledger = _extract(maker, tmp_path, messages)
     assert images.stamps.tolist() == [5, 6]
     assert [int(p[0, 0]) for p in pixels] == [1, 4]

@@ -204,16 +204,17 @@ def test_any_bytes_for_a_head(data):
 
 @given(st.binary(max_size=400))
 def test_any_bytes_for_a_message(data):
-    for connection in (Connection("/d", "vision_msgs/msg/Detection2DArray", "cdr"), Connection("/o", "nav_msgs/msg/Odometry", "cdr")):
+    for name, decode in _DECODERS.items():
         try:
-            _DECODERS[connection.topic](data)
-        except Undecodable as error:
-            assert str(error)
+            message = decode(data)
+        except Undecodable:
+            continue
+        assert message.__msgtype__ == name
 
 
 _DECODERS = {
-    topic: make_decoder(Connection(topic, name, "cdr"))
-    for topic, name in (("/d", "vision_msgs/msg/Detection2DArray"), ("/o", "nav_msgs/msg/Odometry"))
+    name: make_decoder(Connection("/x", name, "cdr"))
+    for name in ("vision_msgs/msg/Detection2DArray", "nav_msgs/msg/Odometry")
 }
 
 

@@ -186,9 +186,7 @@ def test_of_several_that_fit_one_is_taken_and_all_are_listed(bag, tmp_path):
     ledger = Ledger()
     log = _read(bag, tmp_path, ledger)
     np.testing.assert_allclose(log.odometry.poses, _drive(range(11)), atol=1e-12)
-    assert ledger.warnings == [
-        "several fit odometry: /odom is taken, not /odometry/filtered (--topic odometry=... chooses)"
-    ]
+    assert ledger.warnings == ["several fit odometry: /odom is taken, not /odometry/filtered (--topic odometry=... chooses)"]
     ledger = Ledger()
     log = _read(bag, tmp_path, ledger, topics=("odometry=/odometry/filtered",))
     np.testing.assert_allclose(log.odometry.poses, _drive(range(11)) @ _correction(5), atol=1e-12)
@@ -263,7 +261,8 @@ def test_a_camera_that_moves_on_the_robot(makers, tmp_path):
 def test_images_of_a_camera_raw_before_rectified(makers, tmp_path):
     plumb = Camera("front", 6, 4, _CAMERA.matrix, distortion=np.array([-0.2, 0.1, 0, 0, 0]))
     bag = Bag(makers["4"]).odometry().tf("base_link", _FRAME, _OPTICAL, static=True)
-    bag.camera("/front/color/camera_info", camera=plumb, projection=np.column_stack([_CAMERA.matrix * [[0.9], [0.9], [1]], np.zeros(3)]))
+    projection = np.diag([0.9, 0.9, 1.0]) @ np.column_stack([_CAMERA.matrix, np.zeros(3)])
+    bag.camera("/front/color/camera_info", camera=plumb, projection=projection)
     bag.image("/front/color/image_raw").image("/front/color/image_rect").image("/front/depth/image", encoding="16UC1")
     bag.image("/far/depth/image", "far_optical_frame", encoding="16UC1")
     ledger = Ledger()
@@ -271,7 +270,7 @@ def test_images_of_a_camera_raw_before_rectified(makers, tmp_path):
     assert "several fit front.image: /front/color/image_raw is taken, not /front/color/image_rect" in ledger.warnings[0]
     assert camera_log.camera.distortion.tolist() == plumb.distortion.tolist()
     assert camera_log.rgb.stamps.tolist() == camera_log.depth.stamps.tolist() == [1, 2]
-    assert [p.relative_to(tmp_path).as_posix() for p in camera_log.rgb.paths][0] == "images/front/rgb/1.000000000.png"
+    assert camera_log.rgb.paths[0].relative_to(tmp_path).as_posix() == "images/front/rgb/1.000000000.png"
     (camera_log,) = _read(bag, tmp_path, topics=("image=/front/color/image_rect",), with_images=False).cameras
     assert not camera_log.camera.distortion.any()
     assert camera_log.camera.matrix[0, 0] == 450

@@ -124,7 +124,11 @@ def test_what_is_no_pose_is_dropped(makers):
     ledger = Ledger()
     bad = np.eye(4)
     bad[0, 3] = np.nan
-    messages = [(False, 10**9, ("a", "b", _pose(1))), (False, 2 * 10**9, ("a", "b", bad)), (False, 3 * 10**9, ("a", "b", _pose(2)))]
+    messages = [
+        (False, 10**9, ("a", "b", _pose(1))),
+        (False, 2 * 10**9, ("a", "b", bad)),
+        (False, 3 * 10**9, ("a", "b", _pose(2))),
+    ]
     tree = _tree(makers["4"], *messages, ledger=ledger)
     assert tree.stamps("a", "b").tolist() == [1.0, 3.0]
     assert list(ledger.dropped.values()) == [1]
