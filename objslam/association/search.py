@@ -30,8 +30,9 @@ _TURNS = 8  # searches among the rays that are left
 _ROUNDS = 12  # of merging, and of merging and dropping, at the most
 _SETTLED = 3  # times that assignment and refit take turns after a change
 _SAMPLE = 4096  # rays of one label that a search looks at
-_MIN_RAYS = 3
-_MIN_SUPPORT = 2.5  # of a point in a search, where a ray that fits perfectly counts 1
+_MIN_RAYS = 3  # of an object
+_MIN_SUPPORT = 2.5  # of a point in a search, where a ray that fits perfectly counts 1,
+_ABOVE = 3.0  # and by how many standard deviations it exceeds what strays give
 _CHANCE = 3.0  # log odds against strays that a point needs to be kept in the search
 _PARALLAX = np.radians(2.0)  # of two rays that make a point
 _NOISE = (0.3, 3.0)
@@ -129,7 +130,10 @@ def _explore(work: _Work, state: State, turn: int, parallax: float) -> State:
             free = free[np.isin(work.s.frame[free], some)]
         pool = work.s.take(free)
         pool = replace(pool, sigma=pool.sigma * noise[label], place=pool.place * noise[label])
-        search = Search(work.settings.hypotheses, _MIN_SUPPORT, work.gate, parallax, work.device)
+        # of so many rays so many pass any point by chance, and support half each
+        chance = np.pi * work.gate * float((pool.sigma**2).sum()) / work.view.solid_angle
+        support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE * np.sqrt(chance)))
+        search = Search(work.settings.hypotheses, support, work.gate, parallax, work.device)
         points = discover(pool, search, rng)
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), work.labels)
         landmarks = landmarks.and_also(new)

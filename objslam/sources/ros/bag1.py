@@ -202,7 +202,9 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
         reading.report.damage("a connection whose description is broken", 0)
         return
     name, definition = (details.get(key, b"").decode("utf-8", "replace") for key in (b"type", b"message_definition"))
-    reading.connections[_number(fields, b"conn")] = Connection(plain(topic), type_name(name), "ros1", definition)
+    connection, key = Connection(plain(topic), type_name(name), "ros1", definition), _number(fields, b"conn")
+    if reading.connections.get(key) != connection:
+        reading.connections[key] = connection
 
 
 def _read_index(file: BinaryIO, end: int, reading: _Reading) -> None:

@@ -20,7 +20,7 @@ _MODELS = {
 """Other spellings that drivers use."""
 
 _UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")
-_MAX_PIXELS = 1 << 16
+_MAX_PIXELS, _MAX_FOCAL = 1 << 16, 1e7
 
 
 def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera, Floats]:
@@ -34,7 +34,8 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
     if rectified and not values.any() and not _values(info, "D").any():  # nothing to rectify, and nobody filled in P
         values = _values(info, "K")
     width, height, matrix = _image(info, values)
-    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0 and 0 < width < _MAX_PIXELS > height > 0):
+    sane = bool((np.abs(matrix) < _MAX_FOCAL).all()) and matrix[0, 0] > 0 and matrix[1, 1] > 0
+    if not (sane and 0 < width < _MAX_PIXELS > height > 0):
         which = "P" if rectified else "K"
         hint = "a calibration file can stand in for it"
         raise LogError(f"the camera is not calibrated ({which} or the size of the image is zero)", where=topic, hint=hint)
@@ -44,7 +45,8 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
         return Camera(name, width, height, matrix), np.eye(4)
     model, distortion = _distortion(info, topic)
     rotation = _values(info, "R").reshape(3, 3)
-    turned = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
+    turned = bool((np.abs(rotation) < 1.01).all())
+    turned = turned and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
     frame_T_camera = make_pose(rotation if turned else np.eye(3), np.zeros(3))
     return Camera(name, width, height, matrix, model, distortion), frame_T_camera
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from objslam.sources.ros import layouts
@@ -63,7 +64,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
     name, encoding = connection.type, connection.encoding
     if encoding not in ("ros1", "cdr"):
         raise Undecodable(f"encoded as {encoding[:40]!r}, which is not read")
-    stores = _stores(connection)
+    stores = _stores(name, encoding, connection.definition, connection.language)
 
     def decode(data: bytes) -> Any:
         from rosbags.serde import SerdeError
@@ -83,13 +84,14 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
     return decode
 
 
-def _stores(connection: Connection) -> list[Typestore]:
+@lru_cache(maxsize=256)
+def _stores(name: str, encoding: str, definition: str, language: str) -> list[Typestore]:
+    """What can decode a type, one for each layout; the files of a recording share them, as making them takes a while."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-    name = connection.type
-    texts: tuple[str, ...] = (connection.definition,) if connection.definition else layouts.KNOWN.get(name, ())
+    texts: tuple[str, ...] = (definition,) if definition else layouts.KNOWN.get(name, ())
     if not texts:
-        known = get_typestore(Stores.ROS1_NOETIC if connection.encoding == "ros1" else Stores.ROS2_HUMBLE)
+        known = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
         if name not in known.fielddefs:
             raise Undecodable("the bag does not bring the type's definition")
         return [known]
@@ -98,7 +100,7 @@ def _stores(connection: Connection) -> list[Typestore]:
         if len(text) > _MAX_DEFINITION:
             raise Undecodable("its definition is larger than any definition")
         try:
-            types = get_types_from_idl(text) if connection.language == "idl" else get_types_from_msg(text, name)
+            types = get_types_from_idl(text) if language == "idl" else get_types_from_msg(text, name)
             _check(types)
             store = get_typestore(Stores.EMPTY)
             store.register(types)

@@ -153,10 +153,9 @@ def _record(op: int, data: bytes, reading: _Reading) -> Messages:
             key, schema = struct.unpack_from("<HH", data)
             topic, encoding = _strings(data, 4, 2)
             name, language, text = reading.schemas.get(schema, ("", "", ""))
-            if key not in reading.channels or name:
-                reading.channels[key] = Connection(
-                    plain(topic), type_name(name), encoding, text if language else "", language
-                )
+            channel = Connection(plain(topic), type_name(name), encoding, text if language else "", language)
+            if key not in reading.channels or (name and reading.channels[key] != channel):
+                reading.channels[key] = channel
         elif op == _MESSAGE:
             if len(data) < _MESSAGE_HEAD.size:
                 raise Damaged("a message without its head")

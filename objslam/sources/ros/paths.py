@@ -58,7 +58,8 @@ def read_paths(survey: Survey, tree: TfTree, choices: Choices, base_frame: str |
     topics = [topic for topic in candidates(survey, "odometry") if not _is_world(_main_pair(topic)[0])]
     topic = choose("odometry", topics, choices, survey, ledger)
     odometry = None if topic is None else _from_topic(topic, "odometry message", ledger)
-    base = _find_base(tree, base_frame, odometry.child if odometry else "", ledger)
+    moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(survey)), "")
+    base = _find_base(tree, base_frame, moved, ledger)
     if odometry is not None:
         odometry = _moved_to(base, odometry, tree, ledger)
     elif choices.of("odometry") != [NONE]:
@@ -108,7 +109,7 @@ def _find_base(tree: TfTree, given: str | None, child: str, ledger: Ledger) -> s
     if child and (child in tree.frames or not known):
         return child
     if child:
-        ledger.warn(f"the odometry moves {child!r}, which is not in tf: {known[0]!r} is taken to be the same")
+        ledger.warn(f"the path is that of {child!r}, which is not in tf: {known[0]!r} is taken to be the same")
     return known[0] if known else _BASES[-1]
 
 
@@ -117,7 +118,7 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
     if child in ("", base):
         return odometry
     if child not in tree.frames or base not in tree.frames:
-        ledger.warn(f"the odometry moves {child!r}, which tf does not connect to {base!r}: it is taken to be the same")
+        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: it is taken to be the same")
         return odometry
     child_T_base, known = tree.at(child, base, odometry.stamps)
     ledger.drop(f"odometry message at whose time tf {child} -> {base} is not known", int((~known).sum()))

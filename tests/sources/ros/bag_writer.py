@@ -33,7 +33,8 @@ _ARRAY = "std_msgs/Header header\n{}[] {}\n"
 _APRILTAGS = {
     "apriltag_msgs/msg/AprilTagDetectionArray": _ARRAY.format("apriltag_msgs/AprilTagDetection", "detections"),
     "apriltag_msgs/msg/AprilTagDetection": "string family\nint32 id\nint32 hamming\n"
-    "float32 goodness\nfloat32 decision_margin\napriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\nfloat64[9] homography\n",
+    "float32 goodness\nfloat32 decision_margin\napriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\n"
+    "float64[9] homography\n",
     "apriltag_msgs/msg/Point": "float64 x\nfloat64 y\n",
     "apriltag_ros/msg/AprilTagDetectionArray": _ARRAY.format("apriltag_ros/AprilTagDetection", "detections"),
     "apriltag_ros/msg/AprilTagDetection": "int32[] id\nfloat64[] size\ngeometry_msgs/PoseWithCovarianceStamped pose\n",

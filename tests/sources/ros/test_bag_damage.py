@@ -266,6 +266,20 @@ def test_sqlite_that_is_cut(tmp_path, bags, payloads, share):
     assert "pages are missing" in report.lines()[0]
 
 
+@pytest.mark.parametrize("share", [0.35, 0.8])
+def test_sqlite_that_is_cut_with_messages_over_many_pages(tmp_path, makers, share):
+    """Images fill chains of overflow pages: all that lie before the cut come back to the byte, none of them half."""
+    maker, count = makers["4"], 80
+    noise = np.random.default_rng(0).integers(0, 256, (count, 100, 200)).astype(np.uint8)
+    rows = [("/image", 10**9 * i, maker.image(10**9 * i, noise[i], "mono8")) for i in range(count)]
+    expected = [serialize(maker, message) for _, _, message in rows]
+    folder = write_bag(tmp_path / "x", "sqlite3", maker, rows)
+    messages, (report,) = _read(copy_cut(folder / "x.db3", tmp_path / "cut.db3", share))
+    assert messages == expected[: len(messages)]
+    assert len(messages) >= int(share * count) - 3
+    assert "pages are missing" in report.lines()[0]
+
+
 def test_sqlite_with_a_broken_page(tmp_path, bags, payloads):
     data = bytearray(bags["sqlite3"].read_bytes())
     (page,) = struct.unpack_from(">H", data, 16)

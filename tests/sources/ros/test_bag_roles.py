@@ -181,6 +181,22 @@ def test_poses_in_map_but_not_goals(bag, makers, tmp_path, covariance):
     assert _read(bag, tmp_path, topics=("localization=none",)).localization is None
 
 
+def test_odometry_in_map_is_localisation(makers, tmp_path):
+    """As visual SLAM and motion capture give it; there is no tf of the robot at all."""
+    write_camera(_CAMERA, tmp_path / "camera.yaml")
+    bag = Bag(makers["4"]).odometry("/slam/odometry", frame="map", child="rig").boxes()
+    ledger = Ledger()
+    log = _read(bag, tmp_path, ledger, camera_info=tmp_path / "camera.yaml")
+    assert not ledger.lines()
+    assert log.odometry is None
+    np.testing.assert_allclose(log.localization.poses, _drive(range(11)), atol=1e-12)
+    chosen = _read(
+        bag, tmp_path, camera_info=tmp_path / "camera.yaml", topics=("odometry=/slam/odometry", "localization=none")
+    )
+    assert chosen.localization is None
+    assert len(chosen.odometry) == 11
+
+
 def test_of_several_that_fit_one_is_taken_and_all_are_listed(bag, tmp_path):
     bag.odometry("/odometry/filtered", move=lambda pose: pose @ _correction(5))
     ledger = Ledger()
