@@ -11,6 +11,7 @@ import numpy as np
 from objslam.association.by_label import associate_by_label
 from objslam.config import Settings
 from objslam.errors import SolveError
+from objslam.geometry import inverse
 from objslam.keyframes import correct_poses
 from objslam.ledger import Ledger
 from objslam.types import Association, Camera, Floats, Keyframes, Rays
@@ -113,7 +114,7 @@ def _joint(
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
         map_T_camera = explore(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
-    map_T_base = map_T_camera @ np.linalg.inv(keyframes.base_T_camera)
+    map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
     estimate: Estimate | None = None

@@ -5,8 +5,6 @@ Arrays go in and come out as numpy float64; torch does the work and is imported 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from objslam import config
 from objslam.errors import ConfigError
+from objslam.threads import one_torch_thread
 from objslam.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -74,26 +73,10 @@ def triangulate(
     ends on an object's surface, its rays meet inside). An object's answer does not depend on the other objects, nor on the
     order of the rays. ValueError for arrays that do not fit or are not finite; ConfigError for a device that is not there.
     """
-    with _one_thread():
+    with one_torch_thread():
         return _triangulate(
             origins, directions, object_index, count, sigma, settings, seed, ranges, range_sigma, position_sigma
         )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for torch: these batches are small, and a pool of threads spins beside other busy processes.
-
-    On a machine of two cores with one of them busy, a run that one thread does in 4 s took two threads up to 18 s.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _triangulate(

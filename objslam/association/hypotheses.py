@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +9,7 @@ import torch
 from torch import Tensor
 
 from objslam.association.sightings import MIN_DEPTH, Sightings
+from objslam.threads import one_torch_thread
 from objslam.types import Floats, Ints
 
 _CHUNK = 1 << 18  # pairs of a ray and a point at a time: what the processor's cache holds
@@ -42,19 +41,8 @@ def discover(s: Sightings, search: Search, rng: np.random.Generator) -> Floats:
     points = _propose(s, search, rng)
     if len(points) == 0:
         return points
-    with _one_thread():
+    with one_torch_thread():
         return _best(points, _Scorer(s, search), search.support)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """The work comes in chunks that fit the cache: more threads gain little, and wait for each other on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _best(points: Floats, scorer: _Scorer, least: float) -> Floats:
