@@ -1,0 +1,76 @@
+"""The command line, a file a command. Heavy imports happen inside the commands: --help must answer at once."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from objslam.cli.config import config_dump
+from objslam.cli.console import say
+from objslam.cli.convert import convert
+from objslam.cli.demo import demo
+from objslam.cli.evaluate import evaluate_result
+from objslam.cli.run import run
+from objslam.errors import ObjslamError
+
+app = typer.Typer(
+    name="objslam",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="A robot's log becomes a map of objects in 3D: poses and detector boxes in, positions with covariances out.",
+)
+app.command()(run)
+app.command(name="eval")(evaluate_result)
+app.command()(demo)
+app.command()(convert)
+config_app = typer.Typer(no_args_is_help=True, help="Look at the settings.")
+config_app.command("dump")(config_dump)
+app.add_typer(config_app, name="config")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from objslam import __version__
+
+        say(f"objslam {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> NoReturn:
+    """Entry point: exit code 0 done, 1 the work failed (one line on stderr), 2 wrong use; a traceback with --debug only."""
+    debug = "--debug" in sys.argv
+    try:
+        app()
+    except ObjslamError as error:
+        if debug:
+            raise
+        say(f"objslam: {error}", stderr=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        say("objslam: interrupted", stderr=True)
+        sys.exit(130)
+    except MemoryError:
+        say("objslam: out of memory", stderr=True)
+        sys.exit(1)
+    except Exception as error:  # the last resort: no traceback reaches a user
+        if debug:
+            raise
+        say(
+            f"objslam: internal error, {type(error).__name__}: {error} (please report it; objslam --debug shows where)",
+            stderr=True,
+        )
+        sys.exit(1)
+    sys.exit(0)

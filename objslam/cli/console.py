@@ -1,0 +1,43 @@
+"""What a command says: lines, a progress bar, warnings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from objslam.ledger import Ledger
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on stderr, where that is a terminal: called with the stage's name, what is done and the total."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    screen = console(stderr=True)
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
+        task = bar.add_task("reading")
+        yield lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None)
+
+
+def report(ledger: Ledger) -> None:
+    """Every drop and warning of a ledger, a line each on stderr."""
+    for line in ledger.lines():
+        say(f"warning: {line}", stderr=True)
+
+
+def console(stderr: bool = False) -> Console:
+    """Where tables and lines go: as wide as the terminal, 120 columns without one."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, highlight=False, width=None if sys.stdout.isatty() else 120)
+
+
+def say(text: str, *, stderr: bool = False, markup: bool = False, end: str = "\n") -> None:
+    """A line, not wrapped."""
+    console(stderr).print(text, markup=markup, end=end, soft_wrap=True)

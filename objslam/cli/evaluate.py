@@ -1,0 +1,38 @@
+"""objslam eval: a result against the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import console
+from objslam.cli.options import Align, Radius
+
+if TYPE_CHECKING:
+    from objslam.matching import Alignment
+
+
+def evaluate_result(
+    out: Annotated[Path, typer.Argument(help="A result folder.")],
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="objects.json, or a groundtruth or log folder; what the log brought if not given."),
+    ] = None,
+    align: Align = "none",
+    radius: Radius = 0.5,
+) -> None:
+    """Compare a result with ground truth: matched, missed and false objects, position errors, path error."""
+    evaluate_folder(out, truth, align, radius)
+
+
+def evaluate_folder(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
+    """Evaluate a result folder, write evaluation.json into it and print the table."""
+    from objslam.evaluation import evaluate, write_evaluation
+    from objslam.evaluation_table import evaluation_table
+    from objslam.results import load_map, load_trajectory, load_truth
+
+    evaluation = evaluate(load_map(out), load_truth(truth or out), load_trajectory(out), align=align, radius=radius)
+    write_evaluation(evaluation, out)
+    console().print(evaluation_table(evaluation))

@@ -1,0 +1,99 @@
+"""objslam run: a log becomes a result folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import console, progress_bar, report, say
+from objslam.cli.options import (
+    Anonymous,
+    Config,
+    DetectorModel,
+    Format,
+    Label,
+    Mode,
+    Out,
+    Robot,
+    Set,
+    WithoutRange,
+    settings_of,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from objslam.config import Settings
+    from objslam.ledger import Ledger
+    from objslam.types import Log, ObjectMap
+
+
+def run(
+    log: Annotated[Path, typer.Argument(help="A log folder, or anything that `objslam convert` reads.")],
+    out: Out = Path("out"),
+    mode: Mode = None,
+    config: Config = None,
+    set_: Set = None,
+    format_: Format = None,
+    robot: Robot = None,
+    without_range: WithoutRange = False,
+    anonymous: Anonymous = False,
+    label: Label = None,
+    detector: DetectorModel = None,
+) -> None:
+    """Map the objects of a log and write the result to a folder."""
+    from objslam.ledger import Ledger
+    from objslam.results import prepare_output
+    from objslam.sources import SourceOptions, read
+
+    settings = settings_of(mode, config, set_)
+    ledger = Ledger()
+    prepare_output(out)
+    options = SourceOptions(format_, robot, not without_range, anonymous, label)
+    run_log(read(log, ledger, options), settings, ledger, out, detector)
+
+
+def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
+    """Map the objects of a log, write the result folder, and say what came of it."""
+    import time
+
+    from objslam import offline
+    from objslam.results import write_result
+
+    with progress_bar() as show:
+        if detector is not None:
+            from objslam.detection import default_cache, detect_log, load_detector
+
+            network = load_detector(detector, settings.detector)
+            log = detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
+        result = offline.run(log, settings, ledger, show)
+        show("writing", 0, 0)
+        begin = time.perf_counter()
+        write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
+        writing = time.perf_counter() - begin
+    report(ledger)
+    counts, seconds = result.summary["counts"], {**result.summary["seconds"], "write": writing}
+    console().print(objects_table(result.map))
+    say(
+        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"in {counts['keyframes']} keyframes, {settings.mode} mode; "
+        + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
+    )
+    say(f"wrote {out}")
+
+
+def objects_table(objects: ObjectMap) -> Table:
+    import numpy as np
+    from rich.table import Table
+
+    table = Table(title="objects")
+    for name in ("id", "label", "x m", "y m", "z m", "sigma m", "rays", "parallax deg", "rms deg", "status"):
+        table.add_column(name, justify="left" if name in ("label", "status") else "right")
+    for o in objects.objects:
+        sigma = "" if o.covariance is None else f"{np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.3f}"
+        place = (f"{x:.3f}" for x in o.position)
+        numbers = (str(o.rays), f"{o.parallax_deg:.1f}", f"{o.rms_deg:.2f}")
+        table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")
+    return table
