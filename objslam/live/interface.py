@@ -1,0 +1,69 @@
+"""What an adapter pushes, and what a session shows of itself: the seam between middleware and the map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from objslam.types import Camera, Floats, ObjectMap, Trajectory
+
+
+class Sink(Protocol):
+    """Where messages go. Every push returns at once: True when the message was accepted, False when it was dropped and counted.
+
+    Callable from any thread. No message, however bad (not finite, back in time, a camera that nobody knows), raises.
+    Frames as everywhere: `map`, `odom`, `base`, and a camera's optical frame, which goes by the camera's name.
+    """
+
+    def push_camera(self, camera: Camera) -> bool:
+        """A calibrated camera (a CameraInfo, say); its base_T_camera holds until a transform says otherwise."""
+        ...
+
+    def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
+        """odom_T_base (4, 4) at stamp, s; covariance: (6, 6) as ROS has it (x, y, z, roll, pitch, yaw), of the whole pose."""
+        ...
+
+    def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
+        """map_T_base (4, 4) at stamp, s, from a localisation; covariance likewise."""
+        ...
+
+    def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
+        """base_T_camera (4, 4) of a camera that moves on the robot, from this stamp, s, until the next."""
+        ...
+
+    def push_detections(
+        self,
+        stamp: float,
+        camera: str,
+        boxes: Floats,
+        labels: Sequence[str],
+        scores: Floats,
+        depths: Floats | None = None,
+        track_ids: Sequence[int] | None = None,
+    ) -> bool:
+        """All boxes of one image: (B, 4) raw px, labels B, scores (B,), depths (B,) z in m or NaN, track_ids B or -1.
+
+        An image without a box is pushed too: what was not seen is evidence.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The state of a session at one moment.
+
+    stamp: of the newest keyframe, s (NaN before the first). map: the objects, as offline gives them. path: map_T_base of all
+    keyframes. lag: s between a message's arrival and its place in the map, the newest. update: (p50, p99) s from push to
+    updated. counters: accepted messages by kind; dropped: by reason. keyframes, rebuilds: how many.
+    """
+
+    stamp: float
+    map: ObjectMap
+    path: Trajectory
+    keyframes: int = 0
+    rebuilds: int = 0
+    lag: float = 0.0
+    update: tuple[float, float] = (0.0, 0.0)
+    counters: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
