@@ -10,7 +10,7 @@ from objslam.types import Camera, Floats, ObjectMap, Trajectory
 
 
 class Sink(Protocol):
-    """Where messages go. Every push returns at once: True when the message was accepted, False when it was dropped and counted.
+    """Where messages go. A push returns at once: True, accepted, or False, dropped and counted.
 
     Callable from any thread. No message, however bad (not finite, back in time, a camera that nobody knows), raises.
     Frames as everywhere: `map`, `odom`, `base`, and a camera's optical frame, which goes by the camera's name.
@@ -21,7 +21,7 @@ class Sink(Protocol):
         ...
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """odom_T_base (4, 4) at stamp, s; covariance: (6, 6) as ROS has it (x, y, z, roll, pitch, yaw), of the whole pose."""
+        """odom_T_base (4, 4) at stamp, s; covariance: (6, 6) in the order of ROS, x, y, z, roll, pitch, yaw."""
         ...
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
