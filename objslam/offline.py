@@ -63,6 +63,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         cameras=cameras,
         path=path,
         path_after=correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base),
+        trace=solution.trace,
     )
 
 

@@ -25,6 +25,7 @@ from objslam.matching import lay_truth
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.sources.detections_file import write_detections
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
+from objslam.trace import Round
 from objslam.types import Association, Camera, CameraLog, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
 
 OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
@@ -48,6 +49,7 @@ class RunResult:
     index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
     the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
     path: the full path that the log brought, at its own rate, before estimation; path_after: the same path after it.
+    trace: the rounds of the estimation, for the recording.
     """
 
     map: ObjectMap
@@ -64,6 +66,7 @@ class RunResult:
     cameras: tuple[Camera, ...]
     path: Trajectory
     path_after: Trajectory
+    trace: tuple[Round, ...] = ()
 
 
 def prepare_output(out: Path) -> None:

@@ -14,6 +14,7 @@ from objslam.errors import SolveError
 from objslam.geometry import inverse
 from objslam.keyframes import correct_poses
 from objslam.ledger import Ledger
+from objslam.trace import Round, Trace, Why
 from objslam.types import Association, Camera, Floats, Keyframes, Rays
 
 if TYPE_CHECKING:
@@ -36,7 +37,8 @@ Progress = Callable[[str, int, int], None]
 class Solution:
     """Which ray belongs to which object, the estimate, and what each round of the two did.
 
-    rays, keyframes: those that were solved, the keyframes without a ray left out; rays.keyframe counts in them.
+    rays, keyframes: those that were solved, the keyframes without a ray left out; rays.keyframe counts in them. trace: for
+    the recording, empty where there is none.
     """
 
     keyframes: Keyframes
@@ -44,6 +46,7 @@ class Solution:
     association: Association
     estimate: Estimate
     rounds: tuple[dict[str, int], ...]
+    trace: tuple[Round, ...] = ()
 
 
 def solve(
@@ -64,6 +67,7 @@ def solve(
     from objslam.graph import batch
 
     keyframes, rays_of_keyframes = seen_something(frames, rays)
+    trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     if settings.mode == "fixed":
         if not frames.localized_every:
             ledger.warn("the poses are odometry, taken as they are: the map drifts as they do (--mode joint corrects both)")
@@ -73,12 +77,14 @@ def solve(
         )
         progress("solve", 0, 0)
         placed = batch.triangulate_at(keyframes.map_T_camera, keyframes, rays_of_keyframes, association, settings)
-        estimate = batch.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings)
+        estimate = batch.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
+        if trace is not None:
+            trace.end_round("fixed", association, estimate)
         _count_unexplained(association, ledger)
-        return Solution(keyframes, rays_of_keyframes, association, estimate, ())
+        return Solution(keyframes, rays_of_keyframes, association, estimate, (), tuple(trace.rounds if trace else ()))
     if not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation")
-    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress)
+    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace)
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
@@ -97,6 +103,7 @@ def _joint(
     settings: Settings,
     ledger: Ledger,
     progress: Progress,
+    trace: Trace | None,
 ) -> Solution:
     from objslam.graph import batch
     from objslam.graph.explore import explore
@@ -104,12 +111,18 @@ def _joint(
     def tell(done: int, total: int) -> None:
         progress("solve", done, total)
 
+    def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
+        solved = batch.solve_joint(keyframes, rays, association, settings, ledger, tell, start, trace)
+        if trace is not None:
+            trace.end_round(why, association, solved)
+        return solved
+
     if _may_be_by_label(settings, all_rays):
         by_label = associate_by_label(rays)
-        solved = batch.solve_joint(keyframes, rays, by_label, settings, ledger, tell)
+        solved = solve_round("labels", by_label)
         if _labels_tell(settings, by_label, solved.weight):
             _count_unexplained(by_label, ledger)
-            return Solution(keyframes, rays, by_label, solved, ())
+            return Solution(keyframes, rays, by_label, solved, (), tuple(trace.rounds if trace else ()))
 
     map_T_camera = keyframes.map_T_camera
     if not keyframes.localized_every:
@@ -129,23 +142,21 @@ def _joint(
         if changed == 0:
             break
         association = found
-        start = map_T_base @ keyframes.base_T_camera
-        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, tell, start)
+        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
         for _ in range(settings.joint.max_rounds):
             merged = merge_unseen_together(rays, association, estimate)
             if merged.count == association.count:
                 break
             rounds.append({"objects": merged.count, "rays_changed": int((merged.object != association.object).sum())})
             association = merged
-            start = estimate.map_T_base @ keyframes.base_T_camera
-            estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, tell, start)
+            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera)
         map_T_base = estimate.map_T_base
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
     assert estimate is not None
     _count_unexplained(association, ledger)
-    return Solution(keyframes, rays, association, estimate, tuple(rounds))
+    return Solution(keyframes, rays, association, estimate, tuple(rounds), tuple(trace.rounds if trace else ()))
 
 
 def _associate(

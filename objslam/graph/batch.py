@@ -15,15 +15,18 @@ from objslam.graph.grow import anchor, grow, landmark_priors, range_factors, ray
 from objslam.graph.marginals import marginal_covariances
 from objslam.graph.optimise import (
     Optimum,
+    Watch,
     build_graph,
     graduated,
     levenberg_marquardt,
     make_values,
-    read_points,
     read_poses,
+    with_points,
 )
+from objslam.graph.watch import watch_solve
 from objslam.ledger import Ledger
 from objslam.rays import angles_off
+from objslam.trace import Trace
 from objslam.triangulation import Triangulation, triangulate
 from objslam.types import Association, Bools, Floats, Ints, Keyframes, Rays
 
@@ -79,7 +82,12 @@ def triangulate_at(
 
 
 def solve_fixed(
-    keyframes: Keyframes, rays: Rays, association: Association, start: Triangulation, settings: Settings
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    start: Triangulation,
+    settings: Settings,
+    trace: Trace | None = None,
 ) -> Estimate:
     """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
 
@@ -104,9 +112,9 @@ def solve_fixed(
     )
     graph, landmarks = build_graph(*groups), np.unique(landmark)
     values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
-    optimum = _solve(graph, values, loss, settings, range(len(used), graph.size()), tolerance=1e-12)
-    positions = start.positions.copy()
-    positions[landmarks] = read_points(optimum.values)
+    watch = watch_solve(trace, start.positions, landmarks, keyframes.map_T_camera)
+    optimum = _solve(graph, values, loss, settings, range(len(used), graph.size()), tolerance=1e-12, watch=watch)
+    positions = with_points(start.positions, landmarks, optimum.values)
     distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
     weight = start.weight.copy()
     weight[used] = _weights(loss, distance / across, optimum)
@@ -137,6 +145,7 @@ def solve_joint(
     ledger: Ledger,
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Floats | None = None,
+    trace: Trace | None = None,
 ) -> Estimate:
     """Poses and objects together, from a start that holds: the localisation's poses, or the graph grown along the odometry.
 
@@ -150,7 +159,7 @@ def solve_joint(
     if start is not None:
         map_T_camera = start
     elif not keyframes.localized_every:
-        map_T_camera, positions = grow(keyframes, rays, association, settings, progress)
+        map_T_camera, positions = grow(keyframes, rays, association, settings, progress, trace)
     used = np.zeros(len(rays), dtype=bool)
     optimum, cost_before, iterations = None, np.nan, 0
     for _ in range(_ROUNDS):
@@ -161,11 +170,13 @@ def solve_joint(
         graph, others = _joint_graph(keyframes, rays, association, positions, used, settings.joint.loss, settings)
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         values = make_values(map_T_camera, positions, landmarks)
-        optimum = _solve(graph, values, settings.joint.loss, settings, others)
+        optimum = _solve(
+            graph, values, settings.joint.loss, settings, others, watch=watch_solve(trace, positions, landmarks)
+        )
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
-        positions[landmarks] = read_points(optimum.values)
+        positions = with_points(positions, landmarks, optimum.values)
     assert optimum is not None
 
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
@@ -270,10 +281,11 @@ def _solve(
     settings: Settings,
     known_inliers: Sequence[int],
     tolerance: float = 1e-6,
+    watch: Watch | None = None,
 ) -> Optimum:
     if loss == "gnc":
         return graduated(graph, values, settings.joint.max_iterations, known_inliers)
-    return levenberg_marquardt(graph, values, settings.joint.max_iterations, tolerance)
+    return levenberg_marquardt(graph, values, settings.joint.max_iterations, tolerance, watch)
 
 
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:

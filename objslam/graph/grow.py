@@ -16,6 +16,7 @@ from objslam.geometry import inverse
 from objslam.graph import factors
 from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
 from objslam.rays import angles_off
+from objslam.trace import Trace
 from objslam.triangulation import triangulate
 from objslam.types import Association, Floats, Ints, Keyframes, Rays
 
@@ -39,6 +40,7 @@ def grow(
     association: Association,
     settings: Settings,
     progress: Callable[[int, int], None],
+    trace: Trace | None = None,
 ) -> tuple[Floats, Floats]:
     """Camera poses (K, 4, 4) in map and landmark positions (N, 3), NaN where the rays never carried one.
 
@@ -88,9 +90,11 @@ def grow(
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         if len(landmarks):
             values = make_values(map_T_camera[:end], positions, landmarks)
-            values = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values
-            map_T_camera[:end] = read_poses(values)
-            positions[landmarks] = read_points(values)
+            optimum = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4)
+            map_T_camera[:end] = read_poses(optimum.values)
+            positions[landmarks] = read_points(optimum.values)
+            if trace is not None:
+                trace.iteration("grow", optimum.cost_after, map_T_camera[:end], positions)
         progress(end, len(keyframes))
         begin = end
         if surprise < _HOLDS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -11,6 +11,9 @@ import numpy as np
 from objslam.errors import SolveError
 from objslam.graph.factors import L0, X0
 from objslam.types import Floats, Ints
+
+Watch = Callable[[float, gtsam.Values], None]
+"""Called after each iteration with the cost and the values that it led to."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,19 @@ def read_points(values: gtsam.Values) -> Floats:
     return np.asarray(gtsam.utilities.extractPoint3(values)).reshape(-1, 3)
 
 
+def with_points(positions: Floats, landmarks: Ints, values: gtsam.Values) -> Floats:
+    """The positions (N, 3) with those of the landmarks (n,) as the values have them."""
+    placed = positions.copy()
+    placed[landmarks] = read_points(values)
+    return placed
+
+
 def levenberg_marquardt(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, max_iterations: int, relative_tolerance: float = 1e-6
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    max_iterations: int,
+    relative_tolerance: float = 1e-6,
+    watch: Watch | None = None,
 ) -> Optimum:
     """The minimum from `start`; SolveError when the linear system is indeterminate, naming the variable where GTSAM does."""
     parameters = gtsam.LevenbergMarquardtParams()
@@ -66,6 +80,8 @@ def levenberg_marquardt(
     parameters.setRelativeErrorTol(relative_tolerance)
     parameters.setAbsoluteErrorTol(1e-12)
     try:
+        if watch is not None:
+            parameters.iterationHook = lambda number, before, after: watch(float(after), optimizer.values())
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
         before = graph.error(start)
         values = optimizer.optimize()
