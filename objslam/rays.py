@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.ledger import Ledger
-from objslam.types import Bools, Camera, Floats, Ints, Keyframes, Log, Rays, label_table
+from objslam.types import Bools, Camera, Detections, Floats, Ints, Keyframes, Log, Rays, label_table
 
 
 def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
@@ -54,8 +54,8 @@ def project(camera: Camera, points: Floats) -> Floats:
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
     """One ray for each usable box of the keyframes, in their order.
 
-    Boxes below the score limit, with a centre outside the image, cut off by its edge, or where the lens model has no inverse
-    are dropped and counted.
+    Boxes below the score limit, with a centre outside the image, cut off by its edge (unless the detections are `whole`), or
+    where the lens model has no inverse are dropped and counted.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -68,7 +68,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
         boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
-        boxes = boxes.take(_usable(boxes.boxes, boxes.scores, camera, settings, ledger))
+        boxes = boxes.take(_usable(boxes, camera, settings, ledger))
         directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
         ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
         boxes, directions = boxes.take(valid), directions[valid]
@@ -104,9 +104,9 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     )
 
 
-def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger) -> Bools:
-    where = f"camera {camera.name}"
-    keep = scores >= settings.rays.min_score
+def _usable(detections: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> Bools:
+    where, boxes = f"camera {camera.name}", detections.boxes
+    keep = detections.scores >= settings.rays.min_score
     ledger.drop(f"boxes below rays.min_score {settings.rays.min_score:g}", int((~keep).sum()), where)
     size = np.array([camera.width, camera.height])
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
@@ -115,7 +115,7 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     keep &= inside
     border = np.maximum(settings.rays.border, settings.rays.border_share * (boxes[:, 2:] - boxes[:, :2]))
     cut = (boxes[:, :2] <= border).any(axis=1) | (boxes[:, 2:] >= size - 1 - border).any(axis=1)
-    if settings.rays.border >= 0:
+    if settings.rays.border >= 0 and not detections.whole:
         ledger.drop("boxes cut off by the image's edge (rays.border)", int((keep & cut).sum()), where)
         keep &= ~cut
     return keep

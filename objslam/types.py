@@ -75,7 +75,8 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4)
     x1, y1, x2, y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1].
-    depths: (M,) z along the optical axis, m, NaN where unknown. track_ids: (M,) -1 where unknown.
+    depths: (M,) z along the optical axis, m, NaN where unknown. track_ids: (M,) -1 where unknown. whole: a box that the
+    image cuts off is never among them (fiducials are found by all their corners), so that centres hold up to the edge.
     """
 
     frame_stamps: Floats
@@ -86,6 +87,7 @@ class Detections:
     depths: Floats
     track_ids: Ints
     label_names: tuple[str, ...]
+    whole: bool = False
 
     def __post_init__(self) -> None:
         m = len(self.frame)

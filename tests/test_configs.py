@@ -74,8 +74,15 @@ def test_each_says_what_it_is_for_and_how_it_is_run(name: str) -> None:
     assert any(re.match(rf"# +objslam run .*--config configs/{re.escape(name)}\b", line) for line in header)
 
 
+@pytest.fixture(scope="module")
+def drive_among_tags() -> Log:
+    """Every object has a label of its own."""
+    return simulate(preset("demo", classes=12), 0)
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_each_maps_the_simulated_drive(name: str, drive: Log) -> None:
+def test_each_maps_the_simulated_drive(name: str, drive: Log, drive_among_tags: Log) -> None:
+    drive = drive_among_tags if settings(name).association.method == "by_label" else drive
     result = run(drive, settings(name), Ledger())
     found = scores(result, drive)
     assert len(found.matches) == 12

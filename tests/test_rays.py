@@ -168,6 +168,14 @@ def test_the_border_grows_with_the_box(border, share, kept):
     assert rays.track_id.tolist() == kept
 
 
+def test_boxes_of_what_is_never_cut_off_hold_up_to_the_edge():
+    boxes = np.array([[-20.0, 200, 30, 240], [500, 440, 560, 479.5], [560, 200, 730, 240]])
+    camera_log = seen(lens("plumb_bob", np.zeros(5)), boxes)
+    rays, ledger = rays_of(log_of(replace(camera_log, detections=replace(camera_log.detections, whole=True))))
+    assert rays.track_id.tolist() == [0, 1]
+    assert ledger.dropped == {"boxes with their centre outside the image": 1}
+
+
 def test_sigma_is_how_a_shift_of_the_centre_turns_the_ray():
     camera = lens("plumb_bob", np.zeros(5), np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
     rays, _ = rays_of(log_of(seen(camera, boxes_of(CENTRES))), rays={"pixel_sigma": 4.0, "box_sigma": 0})

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from objslam.geometry import inverse
-from objslam.rays import undistort
+from objslam.rays import project, undistort
 from objslam.simulation.furniture import Room
-from objslam.simulation.sight import project
 from objslam.types import Camera, Floats, Ints
 
 Reals = NDArray[np.floating]

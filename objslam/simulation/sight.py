@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from objslam.geometry import inverse
+from objslam.rays import project
 from objslam.simulation.settings import DriveSettings
 from objslam.types import Bools, Camera, Detections, Floats, Ints
 
@@ -48,22 +49,6 @@ class Boxes:
     def take(self, boxes: Bools) -> Self:
         """A selection of the boxes."""
         return type(self)(*(getattr(self, f.name)[boxes] for f in fields(self)))
-
-
-def project(camera: Camera, points: Floats) -> Floats:
-    """Raw (distorted) pixels (M, 2) of points (M, 3), m, in the camera frame, in front of the camera."""
-    import cv2
-
-    if len(points) == 0:
-        return np.zeros((0, 2))
-    still = np.zeros(3)
-    if camera.distortion_model == "equidistant":
-        pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, camera.matrix, camera.distortion)
-    elif camera.distortion.any():
-        pixels, _ = cv2.projectPoints(points, still, still, camera.matrix, camera.distortion)
-    else:
-        pixels = (points @ camera.matrix.T)[:, :2] / points[:, 2:]
-    return np.asarray(pixels, dtype=float).reshape(-1, 2)
 
 
 def view_angle(camera: Camera) -> float:

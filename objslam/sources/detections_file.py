@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +27,22 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
     """Read a detections file; pixels of the raw image, stamps in s, depths z along the optical axis in m.
 
     A line that is malformed, or whose stamp repeats or goes back, is dropped and counted as a frame, a box that cannot be
-    right as a box. LogError where no frame is left.
+    right as a box. The detections are `whole` where every frame says so. LogError where no frame is left.
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
+    whole = True
     for number, text in lines:
         place = f"{path}:{number}"
         try:
-            _add_frame(text, place, collector)
+            whole &= _add_frame(text, place, collector)
         except _Malformed as malformed:
             ledger.drop(f"detection frame malformed: {malformed}", where=place)
     if not collector.stamps:
         state = f"none of its {len(lines)} lines is a detection frame" if lines else "no detection frame in it"
         hint = "take the file away to run a detector on rgb.txt"
         raise LogError(state, where=str(path), hint=hint)
-    return collector.checked(ledger)
+    return replace(collector.checked(ledger), whole=whole)
 
 
 def write_detections(detections: Detections, path: Path) -> None:
@@ -53,13 +55,15 @@ def write_detections(detections: Detections, path: Path) -> None:
     optional = {"depths": depths, "track_ids": track_ids}
     columns: dict[str, list[Any]] = {"boxes": boxes, "labels": labels, "scores": scores}
     columns |= {name: column for name, column in optional.items() if any(value is not None for value in column)}
+    whole = {"whole": True} if detections.whole else {}
     with path.open("w", encoding="utf-8") as file:
         for stamp, start, end in zip(stamps, bounds[:-1], bounds[1:], strict=True):
-            frame = {"stamp": stamp} | {name: column[start:end] for name, column in columns.items()}
+            frame = {"stamp": stamp} | {name: column[start:end] for name, column in columns.items()} | whole
             file.write(json.dumps(frame, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _add_frame(text: str, place: str, collector: BoxCollector) -> None:
+def _add_frame(text: str, place: str, collector: BoxCollector) -> bool:
+    """Add the frame of a line; whether it says that its boxes are whole."""
     try:
         frame = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -81,9 +85,13 @@ def _add_frame(text: str, place: str, collector: BoxCollector) -> None:
         raise _Malformed("a box is not 4 numbers")
     if not len(boxes) == len(labels) == len(scores) == len(depths) == len(track_ids):
         raise _Malformed("boxes, labels, scores, depths and track_ids differ in length")
+    whole = frame.get("whole", False)
+    if type(whole) is not bool:
+        raise _Malformed("whole is neither true nor false")
     collector.add_frame(stamp, place)
     for box, label, score, depth, track_id in zip(boxes, labels, scores, depths, track_ids, strict=True):
         collector.add_box(box, label, score, place, depth, track_id)
+    return whole
 
 
 def _list(frame: dict[str, Any], name: str, default: list[None] | None = None) -> list[Any]:

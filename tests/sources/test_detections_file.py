@@ -1,5 +1,6 @@
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,15 @@ def test_optional_lists_are_left_out_where_nothing_is_known(tmp_path):
     ]
 
 
+def test_whole_is_kept_and_holds_where_every_frame_says_so(tmp_path):
+    file = tmp_path / "detections.jsonl"
+    write_detections(replace(_detections([(1.0, [(0, 0, 9, 9, "tag_1", 1.0, np.nan, -1)]), (2.0, [])]), whole=True), file)
+    assert read_detections(file, Ledger()).whole
+    with file.open("a") as lines:
+        lines.write(json.dumps(_GOOD | {"stamp": 3.0}))
+    assert not read_detections(file, Ledger()).whole
+
+
 def test_a_frame_as_the_format_describes_it(tmp_path):
     frame = {"stamp": 12.5, "boxes": [[1, 2, 30, 40], [5, 6, 7, 8.5]], "labels": ["cup", "Tür"], "scores": [0.9, 1]}
     detections, ledger, _ = _read(tmp_path, "# comment", frame | {"depths": [1.2, None], "track_ids": [None, 3], "more": 1})
@@ -128,6 +138,7 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         (_GOOD | {"track_ids": [1, 2]}, "boxes, labels, scores, depths and track_ids differ in length"),
         (_GOOD | {"track_ids": [1.5]}, "track_ids must hold integers and null only"),
         (_GOOD | {"track_ids": [2**63]}, "track_ids must hold integers and null only"),
+        (_GOOD | {"whole": 1}, "whole is neither true nor false"),
     ],
 )
 def test_a_malformed_frame_is_dropped_and_named(tmp_path, frame, reason):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from objslam.geometry import pose_from_quaternion
+from objslam.rays import project
 from objslam.types import Camera, Floats
 
 MAX_BOXES = 10_000
@@ -72,15 +73,8 @@ def boxes_of_points(camera: Camera, points: Floats) -> Floats:
 
     NaN where a tag is not in front of the camera.
     """
-    import cv2
-
-    flat = np.ascontiguousarray(points.reshape(-1, 1, 3))
-    still = np.zeros(3)
-    if camera.distortion_model == "equidistant":
-        pixels = cv2.fisheye.projectPoints(flat, still, still, camera.matrix, camera.distortion)[0]
-    else:
-        pixels = cv2.projectPoints(flat, still, still, camera.matrix, camera.distortion)[0]
-    pixels = pixels.reshape(-1, 5, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
     boxes = np.concatenate([pixels[:, 0] - reach, pixels[:, 0] + reach], axis=1)
     boxes[(points[:, :, 2] <= 0).any(axis=1)] = np.nan

@@ -19,7 +19,7 @@ from objslam.sources.ros.images import DEPTH_SCALE, extract_images
 from objslam.sources.ros.paths import Paths, read_paths
 from objslam.sources.ros.recording import find_recording
 from objslam.sources.ros.roles import parse_choices
-from objslam.sources.ros.survey import Survey, Topic, take_survey
+from objslam.sources.ros.survey import Survey, Topic, is_tags, take_survey
 from objslam.sources.ros.tf_tree import TfTree
 from objslam.types import Camera, CameraLog, Detections, Images, Log, Trajectory
 
@@ -182,4 +182,4 @@ def _detections(topic: Topic, camera: Camera, ledger: Ledger) -> Detections:
         projected = boxes_of_points(camera, np.array(list(topic.points.values())))
         for index, box in zip(topic.points, projected.tolist(), strict=True):
             boxes.boxes[index] = box
-    return boxes.checked(ledger)
+    return replace(boxes.checked(ledger), whole=is_tags(topic.type))
