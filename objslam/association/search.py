@@ -35,7 +35,7 @@ _MIN_SUPPORT = 2.5  # of a point in a search, where a ray that fits perfectly co
 _ABOVE = 3.0  # and by how many standard deviations it exceeds what strays give
 _CHANCE = 3.0  # log odds against strays that a point needs to be kept in the search
 _PARALLAX = np.radians(2.0)  # of two rays that make a point
-_NOISE = (0.3, 3.0)
+_NOISE = (1.0, 3.0)  # times the noise that was promised, never less: its tails are heavy
 _POOLED = 30.0  # rays of an object that weigh its own noise as much as that of its class
 
 
