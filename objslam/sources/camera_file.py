@@ -89,6 +89,12 @@ def _read(
     return Calibration(Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale), placed)
 
 
+def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
+    """The camera that a text with the keys of a camera file describes; place: what LogError calls it."""
+    path = Path(place)
+    return _read(path, _mapping(path, _compose(path, text), "the camera"), ledger, name, True, 1000.0).camera
+
+
 def write_camera(camera: Camera, path: Path) -> None:
     """Write a camera file; every number but the rotation, a quaternion, reads back as the same float."""
     xyzw = quaternion(camera.base_T_camera[None])[0]
@@ -111,8 +117,12 @@ def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -
 
 
 def _parse(path: Path) -> yaml.Node:
+    return _compose(path, read_bytes(path))
+
+
+def _compose(path: Path, text: bytes) -> yaml.Node:
     try:
-        node = yaml.compose(read_bytes(path).decode("utf-8-sig"), Loader=yaml.SafeLoader)
+        node = yaml.compose(text.decode("utf-8-sig"), Loader=yaml.SafeLoader)
     except UnicodeDecodeError as error:
         raise LogError(f"not UTF-8 text (byte {error.start})", where=str(path)) from error
     except yaml.MarkedYAMLError as error:

@@ -19,7 +19,7 @@ from objslam.types import Detections
 _NUMBERS = (int, float)  # compared by type(): a bool is an int to isinstance
 
 
-class _Malformed(ValueError):
+class Malformed(ValueError):
     """What is wrong with a line."""
 
 
@@ -36,7 +36,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
         place = f"{path}:{number}"
         try:
             whole &= _add_frame(text, place, collector)
-        except _Malformed as malformed:
+        except Malformed as malformed:
             ledger.drop(f"detection frame malformed: {malformed}", where=place)
     if not collector.stamps:
         state = f"none of its {len(lines)} lines is a detection frame" if lines else "no detection frame in it"
@@ -67,27 +67,27 @@ def _add_frame(text: str, place: str, collector: BoxCollector) -> bool:
     try:
         frame = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _Malformed("not JSON") from error
+        raise Malformed("not JSON") from error
     if type(frame) is not dict:
-        raise _Malformed("not a JSON object")
-    (stamp,) = _numbers([frame.get("stamp")], "stamp")
+        raise Malformed("not a JSON object")
+    (stamp,) = read_numbers([frame.get("stamp")], "stamp")
     if not math.isfinite(stamp):
-        raise _Malformed("stamp is not a finite number")
-    boxes = [_numbers(box, "a box") for box in _list(frame, "boxes")]
-    labels, scores = _list(frame, "labels"), _numbers(_list(frame, "scores"), "scores")
+        raise Malformed("stamp is not a finite number")
+    boxes = [read_numbers(box, "a box") for box in _list(frame, "boxes")]
+    labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
     depths = [_depth(depth) for depth in _list(frame, "depths")] if "depths" in frame else [math.nan] * len(boxes)
     track_ids = (
         [_track_id(track_id) for track_id in _list(frame, "track_ids")] if "track_ids" in frame else [-1] * len(boxes)
     )
     if any(type(label) is not str for label in labels):
-        raise _Malformed("a label is not a string")
+        raise Malformed("a label is not a string")
     if any(len(box) != 4 for box in boxes):
-        raise _Malformed("a box is not 4 numbers")
+        raise Malformed("a box is not 4 numbers")
     if not len(boxes) == len(labels) == len(scores) == len(depths) == len(track_ids):
-        raise _Malformed("boxes, labels, scores, depths and track_ids differ in length")
+        raise Malformed("boxes, labels, scores, depths and track_ids differ in length")
     whole = frame.get("whole", False)
     if type(whole) is not bool:
-        raise _Malformed("whole is neither true nor false")
+        raise Malformed("whole is neither true nor false")
     collector.add_frame(stamp, place)
     for box, label, score, depth, track_id in zip(boxes, labels, scores, depths, track_ids, strict=True):
         collector.add_box(box, label, score, place, depth, track_id)
@@ -97,23 +97,24 @@ def _add_frame(text: str, place: str, collector: BoxCollector) -> bool:
 def _list(frame: dict[str, Any], name: str, default: list[None] | None = None) -> list[Any]:
     value = frame.get(name, default)
     if type(value) is not list:
-        raise _Malformed(f"{name} is missing or not a list")
+        raise Malformed(f"{name} is missing or not a list")
     return value
 
 
-def _numbers(value: Any, name: str) -> list[float]:
+def read_numbers(value: Any, name: str) -> list[float]:
+    """A list of numbers as floats; Malformed where it is none."""
     if type(value) is not list or not all(type(item) in _NUMBERS for item in value):
-        raise _Malformed(f"{name} must hold numbers only")
+        raise Malformed(f"{name} must hold numbers only")
     try:
         return [float(item) for item in value]
     except OverflowError as error:
-        raise _Malformed(f"{name} holds an integer beyond every float") from error
+        raise Malformed(f"{name} holds an integer beyond every float") from error
 
 
 def _depth(value: Any) -> float:
     if value is None:
         return math.nan
-    (depth,) = _numbers([value], "depths")
+    (depth,) = read_numbers([value], "depths")
     return 0.0 if math.isnan(depth) else depth  # a NaN in the file is no measurement: counted like a zero
 
 
@@ -121,5 +122,5 @@ def _track_id(value: Any) -> int:
     if value is None:
         return -1
     if type(value) is not int or abs(value) >= 2**63:
-        raise _Malformed("track_ids must hold integers and null only")
+        raise Malformed("track_ids must hold integers and null only")
     return max(value, -1)

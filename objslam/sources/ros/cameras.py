@@ -94,7 +94,7 @@ def find_cameras(
         infos = pool.of("camera_info")
         seeds = [topic for topic in images if len(images) == 1 or any(info.frame == topic.frame for info in infos)]
     frames = list(dict.fromkeys(topic.frame for topic in seeds))
-    groups = zip(_names(frames), frames, strict=True)
+    groups = zip(camera_names(frames), frames, strict=True)
     alone = len(frames) == 1
     return tuple(
         _gather(pool, tree, name, frame, [t for t in seeds if t.frame == frame], None, rectified, alone)
@@ -148,17 +148,17 @@ def _gather(
     info = None
     if calibration is None:
         infos = pool.of("camera_info")
-        infos = [t for t in infos if t.frame == frame] or [t for t in infos if _closeness(t.name, near)] or infos
-        infos = sorted(infos, key=lambda topic: (-_closeness(topic.name, near), "depth" in topic.name.lower()))
+        infos = [t for t in infos if t.frame == frame] or [t for t in infos if closeness(t.name, near)] or infos
+        infos = sorted(infos, key=lambda topic: (-closeness(topic.name, near), "depth" in topic.name.lower()))
         same = len({key for topic in infos for key in topic.infos}) == 1
         info = pool.choose("camera_info", infos[:1] if same else infos, name)
         if info is not None and info.frame in tree.frames and frame not in tree.frames:
             frame = info.frame
     near = info.name if info else near
-    images = sorted(mine("image"), key=lambda topic: (-_closeness(topic.name, near), topic.type == COMPRESSED))
+    images = sorted(mine("image"), key=lambda topic: (-closeness(topic.name, near), topic.type == COMPRESSED))
     images.sort(key=lambda topic: is_rectified(topic.name) != bool(rectified))
     image = pool.choose("image", images, name)
-    depths = sorted(mine("depth"), key=lambda topic: (topic.type == COMPRESSED, -_closeness(topic.name, near)))
+    depths = sorted(mine("depth"), key=lambda topic: (topic.type == COMPRESSED, -closeness(topic.name, near)))
     depth = pool.choose("depth", depths, name)
     if rectified is None:
         rectified = is_rectified((image or detections or depth or seeds[0]).name) if image or detections or seeds else False
@@ -170,7 +170,7 @@ def _is_named(topic: Topic, name: str) -> bool:
     return name == topic.frame or name in topic.frame.split("/") or name in topic.name.split("/")
 
 
-def _closeness(a: str, b: str) -> int:
+def closeness(a: str, b: str) -> int:
     """How many leading parts two topic names share."""
     shared = 0
     for one, other in zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False):
@@ -180,7 +180,7 @@ def _closeness(a: str, b: str) -> int:
     return shared
 
 
-def _names(frames: Iterable[str]) -> list[str]:
+def camera_names(frames: Iterable[str]) -> list[str]:
     """A name that can be a file name for each frame, all different."""
     names: list[str] = []
     for frame in frames:

@@ -64,7 +64,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
     name, encoding = connection.type, connection.encoding
     if encoding not in ("ros1", "cdr"):
         raise Undecodable(f"encoded as {encoding[:40]!r}, which is not read")
-    stores = _stores(name, encoding, connection.definition, connection.language)
+    stores = typestores(name, encoding, connection.definition, connection.language)
 
     def decode(data: bytes) -> Any:
         from rosbags.serde import SerdeError
@@ -85,8 +85,11 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 
 @lru_cache(maxsize=256)
-def _stores(name: str, encoding: str, definition: str, language: str) -> list[Typestore]:
-    """What can decode a type, one for each layout; the files of a recording share them, as making them takes a while."""
+def typestores(name: str, encoding: str, definition: str, language: str) -> list[Typestore]:
+    """What can decode a type, one for each layout; the files of a recording share them, as making them takes a while.
+
+    Undecodable where there is no definition, or none that can be used.
+    """
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
     texts: tuple[str, ...] = (definition,) if definition else layouts.KNOWN.get(name, ())

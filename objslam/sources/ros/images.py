@@ -94,8 +94,38 @@ def _write(path: Path, content: bytes) -> None:
         raise LogError(f"an image cannot be written: {error.strerror or error}", where=str(path)) from error
 
 
+def colour_image(message: Any) -> NDArray[Any]:
+    """A sensor_msgs/Image or CompressedImage as pixels (H, W, 3), uint8, BGR; Undecodable where it is none, or depth."""
+    import cv2
+
+    if hasattr(message, "format"):
+        packed = np.frombuffer(message.data, dtype=np.uint8)
+        image = cv2.imdecode(packed, cv2.IMREAD_COLOR) if len(packed) else None
+        if image is None or "compresseddepth" in message.format.lower().replace(" ", ""):
+            raise Undecodable(f"not a colour image of the format {message.format[:40]!r}")
+        return np.asarray(image)
+    image, conversion = _pixels(message)
+    if image.dtype == np.float32:
+        raise Undecodable("it is of floats, which no colour image is")
+    if conversion is not None:
+        image = _convert(image, conversion)
+    if image.dtype == np.uint16:
+        image = (image // 256).astype(np.uint8)
+    return _convert(image, "COLOR_GRAY2BGR") if image.ndim == 2 else image
+
+
 def _raw(message: Any, depth: bool) -> tuple[bytes, str]:
     """A sensor_msgs/Image as the content of a PNG file."""
+    image, conversion = _pixels(message)
+    if depth:
+        return _encode(_depth_units(image)), ".png"
+    if image.dtype == np.float32:
+        raise Undecodable("it is of floats, which no colour image is")
+    return _encode(image if conversion is None else _convert(image, conversion)), ".png"
+
+
+def _pixels(message: Any) -> tuple[NDArray[Any], str | None]:
+    """The pixels of a sensor_msgs/Image, (H, W) or (H, W, C), and how their colours become BGR, as OpenCV calls it."""
     encoding, height, width = message.encoding.lower(), int(message.height), int(message.width)
     bayer = encoding.startswith("bayer_") and encoding.endswith("8")
     if encoding not in _PLAIN and not bayer:
@@ -110,11 +140,16 @@ def _raw(message: Any, depth: bool) -> tuple[bytes, str]:
     rows = np.lib.stride_tricks.as_strided(np.asarray(message.data, dtype=np.uint8), (height, row), (step, 1))
     image: NDArray[Any] = np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
     image = image.astype(dtype).reshape(height, width, channels) if channels > 1 else image.astype(dtype)
-    if depth:
-        image = _depth_units(image)
-    elif image.dtype == np.float32:
-        raise Undecodable("it is of floats, which no colour image is")
-    return _encode(image, _CONVERSIONS.get(encoding.removesuffix("8") if bayer else encoding)), ".png"
+    return image, _CONVERSIONS.get(encoding.removesuffix("8") if bayer else encoding)
+
+
+def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
+    import cv2
+
+    try:
+        return np.asarray(cv2.cvtColor(image, getattr(cv2, conversion)))
+    except cv2.error as error:
+        raise Undecodable("its colours cannot be converted") from error
 
 
 def _compressed(message: Any, depth: bool) -> tuple[bytes, str]:
@@ -160,13 +195,11 @@ def _depth_units(image: NDArray[Any]) -> NDArray[Any]:
     return np.where((units > 0) & (units < 1 << 16), units, 0).astype(np.uint16)
 
 
-def _encode(image: NDArray[Any], conversion: str | None = None) -> bytes:
-    """The image as PNG, its colours converted before as OpenCV calls it."""
+def _encode(image: NDArray[Any]) -> bytes:
+    """The image as PNG."""
     import cv2
 
     try:
-        if conversion is not None:
-            image = cv2.cvtColor(image, getattr(cv2, conversion))
         done, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     except cv2.error as error:
         raise Undecodable("it cannot be written as PNG") from error

@@ -52,6 +52,17 @@ VISION_MSGS_2 = _join(
     geometry_msgs__Pose2D="float64 x\nfloat64 y\nfloat64 theta\n",
     sensor_msgs__Image=_IMAGE,
 )
+VISION_MSGS_3D = _join(
+    _ARRAY.format("vision_msgs/Detection3D[]"),
+    **_HEADER,
+    **_POSE,
+    vision_msgs__Detection3D="std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nstring id\n",
+    vision_msgs__ObjectHypothesisWithPose="vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    vision_msgs__ObjectHypothesis="string class_id\nfloat64 score\n",
+    vision_msgs__BoundingBox3D="geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    geometry_msgs__Vector3="float64 x\nfloat64 y\nfloat64 z\n",
+)
 APRILTAG_MSGS = _join(
     _ARRAY.format("apriltag_msgs/AprilTagDetection[]"),
     **_HEADER,
@@ -62,6 +73,7 @@ APRILTAG_MSGS = _join(
 
 KNOWN: dict[str, tuple[str, ...]] = {
     "vision_msgs/msg/Detection2DArray": (VISION_MSGS_4, VISION_MSGS_2),
+    "vision_msgs/msg/Detection3DArray": (VISION_MSGS_3D,),
     "apriltag_msgs/msg/AprilTagDetectionArray": (APRILTAG_MSGS,),
 }
 """By type, the layouts to try in turn: a message fits only one of them, since each must use up all its bytes."""

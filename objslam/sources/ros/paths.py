@@ -15,8 +15,8 @@ from objslam.sources.ros.tf_tree import TfTree
 from objslam.sources.textfile import count_drops, in_order
 from objslam.types import Floats, Trajectory
 
-_WORLDS, _ODOM = {"map", "world"}, "odom"
-_BASES = ("base_footprint", "base_link")
+_WORLDS, ODOM = {"map", "world"}, "odom"
+BASES = ("base_footprint", "base_link")
 _NOT_THE_ROBOT = ("goal", "target", "initial", "setpoint", "waypoint", "truth", "mocap", "vrpn", "vicon")
 """Words in the names of pose topics that tell something other than where the robot takes itself to be."""
 
@@ -55,7 +55,7 @@ def read_paths(survey: Survey, tree: TfTree, choices: Choices, base_frame: str |
     renames the frame, and the odometry is given in it. LogError where frames that must be connected are not, or there is
     neither of the two.
     """
-    topics = [topic for topic in candidates(survey, "odometry") if not _is_world(_main_pair(topic)[0])]
+    topics = [topic for topic in candidates(survey, "odometry") if not is_world(_main_pair(topic)[0])]
     topic = choose("odometry", topics, choices, survey, ledger)
     odometry = None if topic is None else _from_topic(topic, "odometry message", ledger)
     moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(survey)), "")
@@ -76,7 +76,8 @@ def read_paths(survey: Survey, tree: TfTree, choices: Choices, base_frame: str |
     return paths
 
 
-def _is_world(frame: str) -> bool:
+def is_world(frame: str) -> bool:
+    """Whether a frame stands still in the world (map, world, robot1/map), as odom does not."""
     return not _WORLDS.isdisjoint(re.split(r"[^a-z]+", frame.rpartition("/")[2].lower()))
 
 
@@ -104,13 +105,13 @@ def _find_base(tree: TfTree, given: str | None, child: str, ledger: Ledger) -> s
     """The frame that is base: the one given, else what the odometry moves, else base_footprint or base_link."""
     if given is not None:
         return given.lstrip("/")
-    known = sorted(frame for frame in tree.frames if frame.rpartition("/")[2] in _BASES)
-    known.sort(key=lambda frame: _BASES.index(frame.rpartition("/")[2]))
+    known = sorted(frame for frame in tree.frames if frame.rpartition("/")[2] in BASES)
+    known.sort(key=lambda frame: BASES.index(frame.rpartition("/")[2]))
     if child and (child in tree.frames or not known):
         return child
     if child:
         ledger.warn(f"the path is that of {child!r}, which is not in tf: {known[0]!r} is taken to be the same")
-    return known[0] if known else _BASES[-1]
+    return known[0] if known else BASES[-1]
 
 
 def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _Odometry:
@@ -131,7 +132,7 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
 def _odometry_from_tf(tree: TfTree, base: str) -> _Odometry | None:
     if base not in tree.frames:
         return None
-    frame = next((name for name in tree.above(base) if name.rpartition("/")[2] == _ODOM), None)
+    frame = next((name for name in tree.above(base) if name.rpartition("/")[2] == ODOM), None)
     if frame is None or frame == base or tree.still(frame, base) is not None:
         return None
     stamps = tree.stamps(frame, base)
@@ -163,7 +164,7 @@ def _localized(
 
 
 def _pose_topics(survey: Survey) -> list[Topic]:
-    topics = [topic for topic in candidates(survey, "localization") if _is_world(_main_pair(topic)[0])]
+    topics = [topic for topic in candidates(survey, "localization") if is_world(_main_pair(topic)[0])]
     return [t for t in topics if t.type == ODOMETRY or not any(word in t.name.lower() for word in _NOT_THE_ROBOT)]
 
 
@@ -172,7 +173,7 @@ def _from_tf(tree: TfTree, odometry: _Odometry | None, base: str) -> tuple[Float
     frame = odometry.frame if odometry is not None and odometry.frame in tree.frames else base
     if frame not in tree.frames:
         return None
-    world = next((name for name in tree.above(frame) if _is_world(name)), frame)
+    world = next((name for name in tree.above(frame) if is_world(name)), frame)
     if world == frame:
         return None
     still = tree.still(world, frame)

@@ -44,6 +44,13 @@ class PoseRows:
         return stamps[good], pose_from_quaternion(values[good, :3], values[good, 3:])
 
 
+def one_pose(place: Any, turn: Any) -> Floats | None:
+    """The pose (4, 4) of a position (or translation) and an orientation message, None where they are no pose."""
+    xyz, xyzw = np.array([[place.x, place.y, place.z]], dtype=np.float64), np.array([[turn.x, turn.y, turn.z, turn.w]])
+    good = bool((np.abs(xyz) < _FAR).all()) and _SHORT < float(np.linalg.norm(xyzw)) < _LONG
+    return pose_from_quaternion(xyz, xyzw)[0] if good else None
+
+
 def choose_times(stamps: array[int], logged: array[int]) -> Ints:
     """(N,) ns: the header's stamps; the times of recording where all stamps are zero (nobody has set them)."""
     times = np.frombuffer(stamps, dtype=np.int64)

@@ -215,12 +215,12 @@ def _boxes(connection: Connection, topic: Topic, decode: Callable[[bytes], Any],
         for box, name, score, track, points in found:
             if points is not None:
                 topic.points[len(boxes.boxes)] = points
-            boxes.add_box(box, name or label, score, place, track_id=_track(track, topic.tracks))
+            boxes.add_box(box, name or label, score, place, track_id=track_number(track, topic.tracks))
 
     return handle
 
 
-def _track(name: str, tracks: dict[str, int]) -> int:
+def track_number(name: str, tracks: dict[str, int]) -> int:
     """A tracker's name for an object as a number: -1 for none, its own number if it is one, else a new one for each name."""
     if not name:
         return -1
