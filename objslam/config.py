@@ -217,6 +217,57 @@ class Joint(Section):
     max_iterations: Annotated[int, Field(ge=1)] = 100
 
 
+class Reconstruction(Section):
+    """The surface of the room, from depth images fused at the solved poses."""
+
+    use: bool = True
+    """whether there is one where the log has depth images."""
+    before: bool = False
+    """also one at the poses as the log brought them, to compare."""
+    cloud: bool = False
+    """also its points alone, with normals, in a file of their own."""
+    device: Device = "auto"
+    voxel: Positive = 0.02
+    """m; the size of a voxel."""
+    truncation: Positive = 0.08
+    """m; how far from a surface depths are averaged: more than they err, less than things are thick. At least 2 voxels."""
+    max_depth: Positive = 4.0
+    """m; depths beyond it are not used."""
+    min_views: Annotated[int, Field(ge=1)] = 3
+    """a surface counts once so many depth images saw it."""
+    stride: Annotated[int, Field(ge=1)] = 1
+    """every so many-th depth image is used."""
+    max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
+    """of more than that, evenly many are left out."""
+    max_blocks: Annotated[int, Field(ge=2048)] = 40_000
+    """the grid grows to so many blocks of 8^3 voxels; each takes 10 kB, and as much again while the surface is taken out."""
+
+
+class Live(Section):
+    """Mapping while the robot drives."""
+
+    keyframe_distance: NotNegative = 0.03
+    """m; a frame becomes a keyframe once its camera has moved so far since the last one,"""
+    keyframe_angle_deg: NotNegative = 2.0
+    """or turned so far, or shows a label that no keyframe since then has."""
+    max_keyframes: Annotated[int, Field(ge=50)] = 3000
+    """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them summed up:
+    what memory and time an update take stays bounded."""
+    max_lag: Positive = 0.4
+    """s; frames that had to wait for longer are dropped and counted."""
+    max_late: Positive = 2.0
+    """s; how far behind the newest pose a frame's stamp may be."""
+    max_frames_waiting: Annotated[int, Field(ge=1)] = 64
+    """of more than that the oldest is dropped and counted."""
+    max_speed: Positive = 5.0
+    """m/s; odometry that moves faster, or turns faster than 4 times that in rad/s, has jumped: it is taken to have started anew
+    where it was."""
+    min_rays: Annotated[int, Field(ge=3)] = 5
+    """boxes that must agree before an object enters the graph."""
+    forget: Positive = 5.0
+    """s; a few boxes that are not seen again for so long are left unexplained."""
+
+
 class Output(Section):
     """What a run writes."""
 
@@ -240,6 +291,8 @@ class Settings(Section):
     triangulation: Triangulation = Triangulation()
     fixed: Fixed = Fixed()
     joint: Joint = Joint()
+    live: Live = Live()
+    reconstruction: Reconstruction = Reconstruction()
     output: Output = Output()
 
 

@@ -29,6 +29,14 @@ class Ledger:
         if message not in self.warnings:
             self.warnings.append(message)
 
+    def add(self, other: Ledger) -> None:
+        """Take over what another ledger counted."""
+        for reason, count in other.dropped.items():
+            places = other.examples.get(reason, [])
+            self.drop(reason, count, places[0] if places else None)
+        for message in other.warnings:
+            self.warn(message)
+
     def lines(self) -> list[str]:
         """Every drop and warning as one line of text each, drops first."""
         lines = []

@@ -20,6 +20,7 @@ from objslam.geometry import widest_angle
 from objslam.keyframes import build_keyframes, correct_path
 from objslam.ledger import Ledger
 from objslam.rays import angles_off, build_rays
+from objslam.reconstruction import has_depth, reconstruct
 from objslam.results import RunResult
 from objslam.rounds import Progress, Solution, solve
 from objslam.types import Association, Camera, Floats, Log, MapObject, ObjectMap
@@ -48,6 +49,13 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     path = log.localization or log.odometry
     assert path is not None  # build_keyframes has refused such a log
+    path_after = correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base)
+    surface, before = None, None
+    if settings.reconstruction.use and has_depth(log):
+        with _stage("reconstruction", seconds, progress):
+            surface = reconstruct(log, path_after, settings, ledger, progress)
+            if settings.reconstruction.before:
+                before = reconstruct(log, path, settings, Ledger(), progress)  # what it drops has been said
     return RunResult(
         map=objects,
         keyframes=keyframes,
@@ -62,8 +70,10 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         settings=settings,
         cameras=cameras,
         path=path,
-        path_after=correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base),
+        path_after=path_after,
         trace=solution.trace,
+        surface=surface,
+        surface_before=before,
     )
 
 
@@ -106,7 +116,7 @@ def _describe(solution: Solution, cameras: tuple[Camera, ...], settings: Setting
         known = known and (ranged or parallax >= settings.triangulation.min_parallax_deg)
         if known:
             reach = np.median(np.linalg.norm(estimate.positions[j] - origins[kept], axis=1))
-            known = bool(np.sqrt(np.linalg.eigvalsh(covariance)[-1]) <= settings.triangulation.max_rel_sigma * reach)
+            known = bool(estimate.seen_sigma[j] <= settings.triangulation.max_rel_sigma * reach)
         stamps = keyframes.stamps[rays.keyframe[mine]]
         middle = kept[len(kept) // 2]
         objects.append(
@@ -152,7 +162,7 @@ def _summary(
     total = np.bincount(rays.label, minlength=len(rays.label_names))
     left = np.bincount(unexplained, minlength=len(rays.label_names))
     boxes = sum(len(c.detections) for c in log.cameras if c.detections is not None)
-    packages = ("gtsam", "torch", "numpy", "opencv-python-headless")
+    packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": log.name,
         "mode": settings.mode,

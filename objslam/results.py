@@ -23,18 +23,23 @@ from objslam.errors import LogError, OutputError
 from objslam.ledger import Ledger
 from objslam.matching import lay_truth
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
+from objslam.ply_file import write_cloud, write_mesh
 from objslam.sources.detections_file import write_detections
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
 from objslam.trace import Round
-from objslam.types import Association, Camera, CameraLog, Floats, Keyframes, ObjectMap, Rays, Trajectory, Truth
+from objslam.types import Association, Camera, CameraLog, Floats, Keyframes, ObjectMap, Rays, Surface, Trajectory, Truth
 
 OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
 PICTURE, RECORDING, SUMMARY = "map.png", "recording.rrd", "summary.json"
 GROUNDTRUTH = "groundtruth"
 TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth_objects.json", "groundtruth_trajectory.txt"
 DETECTIONS = "detections.jsonl"
-_LATER = ("reconstruction.ply", "evaluation.json")
-_OWN = (SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING, *_LATER)
+SURFACE, SURFACE_BEFORE, CLOUD = "reconstruction.ply", "reconstruction_before.ply", "reconstruction_cloud.ply"
+EVALUATION, REPORT = "evaluation.json", "report.html"
+_OWN = (
+    *(SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
+    *(SURFACE, SURFACE_BEFORE, CLOUD, EVALUATION, REPORT),
+)
 """Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
 _STAGING = ".objslam-staging"
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
@@ -49,7 +54,8 @@ class RunResult:
     index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
     the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
     path: the full path that the log brought, at its own rate, before estimation; path_after: the same path after it.
-    trace: the rounds of the estimation, for the recording.
+    trace: the rounds of the estimation, for the recording. surface: the room, where the log has depth images;
+    surface_before: the same at the poses as the log brought them, where the settings ask for it.
     """
 
     map: ObjectMap
@@ -67,6 +73,8 @@ class RunResult:
     path: Trajectory
     path_after: Trajectory
     trace: tuple[Round, ...] = ()
+    surface: Surface | None = None
+    surface_before: Surface | None = None
 
 
 def prepare_output(out: Path) -> None:
@@ -182,6 +190,12 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
         if camera_log.detections is not None:
             name = DETECTIONS if len(detected) == 1 else f"{camera_log.camera.name}.{DETECTIONS}"
             writers[name] = partial(write_detections, camera_log.detections)
+    if result.surface is not None:
+        writers[SURFACE] = partial(write_mesh, result.surface)
+        if result.settings.reconstruction.cloud:
+            writers[CLOUD] = partial(write_cloud, result.surface)
+    if result.surface_before is not None:
+        writers[SURFACE_BEFORE] = partial(write_mesh, result.surface_before)
     drawn = lay_truth(result.map, truth) if truth is not None else None
     if result.settings.output.picture:
         from objslam.picture import draw_map

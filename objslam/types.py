@@ -302,6 +302,17 @@ class ObjectMap:
         return tuple(o for o in self.objects if o.status == "ok")
 
 
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in map: vertices (V, 3) m and their normals (V, 3), float32; colours (V, 3) uint8 RGB, None where
+    unknown; triangles (T, 3) int32, indices of vertices."""
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8] | None
+    triangles: NDArray[np.int32]
+
+
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
     """Distinct names in sorted order, and each name's index (len(names),) into them."""
     table = tuple(sorted(set(names)))

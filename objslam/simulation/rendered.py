@@ -174,13 +174,13 @@ def render_drive(
 
     seeds = np.random.SeedSequence(seed).spawn(5)
     path_rng, odometry_rng, localization_rng = (np.random.default_rng(s) for s in seeds[:3])
-    sensor_seed, room_seed = seeds[3:]
+    sensor_seed = seeds[3]
     motion = settings.motion
     course = Course.lay(motion, path_rng)
-    stamps = START + np.arange(settings.frames) / settings.frame_rate
+    stamps = _stamps(settings)
     map_T_base = lift_se2(course.at(stamps))
     map_T_camera = map_T_base @ settings.camera.base_T_camera
-    caster = Caster(_good_room(settings, map_T_camera, room_seed), settings.camera, seed)
+    caster = Caster(drive_room(settings, seed), settings.camera, seed)
     caster.prepare()
     out.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
@@ -223,6 +223,17 @@ def render_drive(
 
 
 _KINDS = (("rgb", "jpg"), ("depth", "png"))
+
+
+def drive_room(settings: RenderSettings, seed: int) -> Room:
+    """The room of the drive that `render_drive` makes of the same settings and seed; ConfigError as there."""
+    seeds = np.random.SeedSequence(seed).spawn(5)
+    course = Course.lay(settings.motion, np.random.default_rng(seeds[0]))
+    return _good_room(settings, lift_se2(course.at(_stamps(settings))) @ settings.camera.base_T_camera, seeds[4])
+
+
+def _stamps(settings: RenderSettings) -> Floats:
+    return START + np.arange(settings.frames) / settings.frame_rate
 
 
 def _write_images(folder: Path, number: int, rgb: NDArray[np.uint8], depth: Reals) -> None:

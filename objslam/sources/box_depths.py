@@ -16,7 +16,8 @@ from objslam.types import Camera, Detections, Floats, Images
 
 _CENTRE = 0.5  # of the box's width and height: towards its edge, a box shows what stands behind the object
 _MIN_VALID = 0.1  # of the pixels there
-_MAX_LAG = 0.02  # s between a frame and its depth image, which some cameras stamp on their own
+MAX_LAG = 0.02
+"""s between a colour and a depth image of one frame, which some cameras stamp on their own."""
 
 
 def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledger: Ledger) -> Detections:
@@ -28,12 +29,12 @@ def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledg
     depths = np.full(len(detections), np.nan)
     frames, start, count = np.unique(detections.frame, return_index=True, return_counts=True)
     stamps = detections.frame_stamps[frames]
-    nearest = _nearest(images.stamps, stamps)
-    near = np.abs(images.stamps[nearest] - stamps) <= _MAX_LAG
+    closest = nearest(images.stamps, stamps)
+    near = np.abs(images.stamps[closest] - stamps) <= MAX_LAG
     if not near.all():
         ledger.drop("depth of a frame without a depth image", int((~near).sum()), f"stamp {stamps[~near][0]:.3f}")
-    for index, first, boxes in zip(nearest[near].tolist(), start[near].tolist(), count[near].tolist(), strict=True):
-        image = _read_image(images.paths[index], camera, ledger)
+    for index, first, boxes in zip(closest[near].tolist(), start[near].tolist(), count[near].tolist(), strict=True):
+        image = read_depth(images.paths[index], camera, ledger)
         if image is not None:
             mine = slice(first, first + boxes)
             depths[mine] = [box_depth(image, box) / camera.depth_scale for box in detections.boxes[mine]]
@@ -54,13 +55,15 @@ def box_depth(image: NDArray[Any], box: Floats) -> float:
     return float(np.median(valid)) if valid.size and valid.size >= _MIN_VALID * part.size else np.nan
 
 
-def _nearest(stamps: Floats, query: Floats) -> NDArray[np.int64]:
+def nearest(stamps: Floats, query: Floats) -> NDArray[np.int64]:
+    """For each stamp asked for (Q,), the index of the one nearest to it of stamps (N,), increasing."""
     after = np.clip(np.searchsorted(stamps, query), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(stamps[before] - query) <= np.abs(stamps[after] - query), before, after)
 
 
-def _read_image(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
+def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
+    """A depth image (H, W) in its own units; None, counted, where it cannot be decoded or has not the camera's size."""
     import cv2
 
     try:
