@@ -123,20 +123,25 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     back to base at j, drift[j] - drift[i] is then the covariance of the motion, lever arms of the heading included.
     """
     start_T_base = inverse(odometry.poses[0]) @ odometry.poses
-    twist = log_se3(inverse(start_T_base[:-1]) @ start_T_base[1:])
-    turn, way = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
-    angle = settings.yaw_per_m**2 * way + settings.yaw_per_rad**2 * turn
-    x = settings.x_per_m**2 * way + settings.xy_per_rad**2 * turn
-    y = settings.y_per_m**2 * way + settings.xy_per_rad**2 * turn
-    none = np.zeros_like(way)
-    planar = is_planar(start_T_base)
-    noise = np.stack([none, none, angle, x, y, none] if planar else [angle, angle, angle, x, x, x], axis=1)
-    moved = adjoint(start_T_base[1:])
+    steps = step_drift(start_T_base, settings, planar=is_planar(start_T_base))
     total = np.zeros((len(odometry), 36))
-    np.cumsum(np.einsum("nij,nj,nkj->nik", moved, noise, moved).reshape(-1, 36), axis=0, out=total[1:])
+    np.cumsum(steps.reshape(-1, 36), axis=0, out=total[1:])
     if len(odometry) == 1:
         return np.zeros((len(stamps), 6, 6))
     after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
     span = odometry.stamps[after] - odometry.stamps[after - 1]
     share = np.clip((stamps - odometry.stamps[after - 1]) / span, 0.0, 1.0)[:, None]
     return ((1 - share) * total[after - 1] + share * total[after]).reshape(-1, 6, 6)
+
+
+def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:
+    """Covariances (N-1, 6, 6) that the steps between poses (N, 4, 4) add, in the frame that the poses are given in."""
+    twist = log_se3(inverse(start_T_base[:-1]) @ start_T_base[1:])
+    turn, way = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
+    angle = settings.yaw_per_m**2 * way + settings.yaw_per_rad**2 * turn
+    x = settings.x_per_m**2 * way + settings.xy_per_rad**2 * turn
+    y = settings.y_per_m**2 * way + settings.xy_per_rad**2 * turn
+    none = np.zeros_like(way)
+    noise = np.stack([none, none, angle, x, y, none] if planar else [angle, angle, angle, x, x, x], axis=1)
+    moved = adjoint(start_T_base[1:])
+    return np.asarray(np.einsum("nij,nj,nkj->nik", moved, noise, moved))

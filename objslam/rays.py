@@ -68,16 +68,13 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
         boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
-        boxes = boxes.take(_usable(boxes, camera, settings, ledger))
-        directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
-        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
-        boxes, directions = boxes.take(valid), directions[valid]
+        boxes, directions, angle_sigma = box_rays(boxes, camera, settings, ledger)
         names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         columns.append(
             (
                 keyframe_of_frame[boxes.frame],
                 directions,
-                _angle_sigma(camera, directions, _centre_sigma(boxes.boxes, settings)),
+                angle_sigma,
                 boxes.depths,
                 names[boxes.label],
                 boxes.scores,
@@ -102,6 +99,17 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         track_id=track_id[order],
         label_names=label_names,
     )
+
+
+def box_rays(
+    detections: Detections, camera: Camera, settings: Settings, ledger: Ledger
+) -> tuple[Detections, Floats, Floats]:
+    """The usable boxes (M) of a camera, their directions (M, 3), unit, in its frame, and sigmas (M,), rad; drops are counted."""
+    boxes = detections.take(_usable(detections, camera, settings, ledger))
+    directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
+    ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+    boxes, directions = boxes.take(valid), directions[valid]
+    return boxes, directions, _angle_sigma(camera, directions, _centre_sigma(boxes.boxes, settings))
 
 
 def _usable(detections: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> Bools:

@@ -154,11 +154,13 @@ def motions(keyframes: Keyframes, settings: Settings) -> tuple[Floats, Floats]:
 
 def betweens(motion: Floats, covariance: Floats, first: int) -> list[gtsam.NonlinearFactor]:
     """Between-factors for camera motions (M, 4, 4) from X(first), X(first + 1), ... each to the next."""
-    make, noise = gtsam.BetweenFactorPose3, gtsam.noiseModel.Gaussian.Covariance
-    return [
-        make(x_key(first + i), x_key(first + i + 1), gtsam.Pose3(pose), noise(s))
-        for i, (pose, s) in enumerate(zip(motion, covariance, strict=True))
-    ]
+    return [between(first + i, first + i + 1, pose, s) for i, (pose, s) in enumerate(zip(motion, covariance, strict=True))]
+
+
+def between(before: int, after: int, motion: Floats, covariance: Floats) -> gtsam.NonlinearFactor:
+    """The between-factor of the camera motion (4, 4) with covariance (6, 6) from X(before) to X(after)."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.BetweenFactorPose3(x_key(before), x_key(after), gtsam.Pose3(motion), noise)
 
 
 def localizations(keyframes: Keyframes, settings: Settings) -> list[gtsam.NonlinearFactor]:
