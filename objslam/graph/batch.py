@@ -12,7 +12,7 @@ from objslam.config import Loss, Settings
 from objslam.geometry import inverse
 from objslam.graph import factors
 from objslam.graph.grow import anchor, grow, landmark_priors, range_factors, ray_factors
-from objslam.graph.marginals import marginal_covariances
+from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.optimise import (
     Optimum,
     Watch,
@@ -47,13 +47,16 @@ class Estimate:
     """What a solve found.
 
     map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN where not solved. solved: (N,) whether the
-    object was part of the graph. weight: (R,) each ray's robust weight in [0, 1], 0 without object or when rejected. The
-    costs are the graph's error at the first start and at the last optimum; for Eq. 1 its sum of distances, m.
+    object was part of the graph. seen_sigma: (N,) m, the largest standard deviation of its place as seen from a camera that
+    saw it: the map's own drift up to there is not in it. NaN where not solved. weight: (R,) each ray's robust weight in
+    [0, 1], 0 without object or when rejected. The costs are the graph's error at the first start and at the last optimum;
+    for Eq. 1 its sum of distances, m.
     """
 
     map_T_base: Floats
     positions: Floats
     covariance: Floats
+    seen_sigma: Floats
     solved: Bools
     weight: Floats
     cost_before: float
@@ -129,6 +132,7 @@ def solve_fixed(
         map_T_base=keyframes.map_T_base,
         positions=positions,
         covariance=covariance,
+        seen_sigma=largest_sigma(covariance),
         solved=start.ok,
         weight=weight,
         cost_before=optimum.cost_before,
@@ -187,11 +191,19 @@ def solve_joint(
     covariance = np.full((association.count, 3, 3), np.nan)
     gaussian, _ = _joint_graph(keyframes, rays, association, positions, used & (weight > 0), "gnc", settings)
     covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
-    covariance *= _widening(residual, association.object[used], association.count)[:, None, None]
+    seen_sigma = largest_sigma(covariance)
+    witness = _witnesses(rays, association, used & (weight > 0))
+    reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
+    far = np.flatnonzero(seen_sigma > settings.triangulation.max_rel_sigma * reach)
+    seen_sigma[far] = largest_sigma(seen_covariances(gaussian, optimum.values, far, witness[far], ledger))
+    widening = _widening(residual, association.object[used], association.count)
+    covariance *= widening[:, None, None]
+    seen_sigma *= np.sqrt(widening)
     return Estimate(
         map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
         positions=positions,
         covariance=covariance,
+        seen_sigma=seen_sigma,
         solved=np.isfinite(covariance[:, 0, 0]),
         weight=weight,
         cost_before=cost_before,
@@ -327,6 +339,17 @@ def _widening(residual: Floats, landmark: Ints, count: int) -> Floats:
     middle = np.clip(np.cumsum(number) - number + number // 2, 0, max(len(residual) - 1, 0))
     median = np.where(number > 5, residual[order][middle], 0.0) if len(residual) else np.zeros(count)
     return np.maximum(1.0, median / _RAYLEIGH_MEDIAN) ** 2
+
+
+def _witnesses(rays: Rays, association: Association, used: Bools) -> Ints:
+    """For each object (N,) the keyframe of the middle one of its used rays, 0 where it has none."""
+    object_, keyframe = association.object[used], rays.keyframe[used]
+    order = np.lexsort((keyframe, object_))
+    number = np.bincount(object_, minlength=association.count)
+    middle = np.cumsum(number) - number + number // 2
+    witness = np.zeros(association.count, dtype=np.int64)
+    witness[number > 0] = keyframe[order][middle[number > 0]]
+    return witness
 
 
 def _across(directions: Floats) -> Floats:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from objslam.graph.factors import l_key
+from objslam.geometry import skew
+from objslam.graph.factors import l_key, x_key
 from objslam.graph.optimise import indeterminate
 from objslam.ledger import Ledger
 from objslam.types import Floats, Ints
@@ -36,6 +37,42 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     without_prior = np.full_like(covariance, np.nan)
     without_prior[held_by_more] = np.linalg.inv(np.linalg.inv(covariance[held_by_more]) - np.eye(3) / _HELD**2)
     return without_prior
+
+
+def seen_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, witnesses: Ints, ledger: Ledger
+) -> Floats:
+    """Covariances (n, 3, 3), m^2, of landmarks (n,) in the frame of one camera each, keyframes (n,), at `values`.
+
+    What the graph does not know of the camera's own pose is not in them: far from where a map from odometry begins, that is
+    nearly all of a landmark's own covariance. NaN, and the ledger is warned, where the linear system is indeterminate.
+    """
+    covariance = np.full((len(landmarks), 3, 3), np.nan)
+    if len(landmarks) == 0:
+        return covariance
+    try:
+        marginals = gtsam.Marginals(graph, values)
+        for i, (j, k) in enumerate(zip(landmarks.tolist(), witnesses.tolist(), strict=True)):
+            x, landmark = x_key(k), l_key(j)
+            joint = marginals.jointMarginalCovariance([x, landmark])
+            pose = values.atPose3(x)
+            turn = pose.rotation().matrix().T
+            seen = turn @ (values.atPoint3(landmark) - pose.translation())
+            to_pose, to_point = np.hstack([skew(seen), -np.eye(3)]), turn
+            cross = to_pose @ joint.at(x, landmark) @ to_point.T
+            spread = to_pose @ joint.at(x, x) @ to_pose.T + to_point @ joint.at(landmark, landmark) @ to_point.T
+            covariance[i] = spread + cross + cross.T
+    except RuntimeError as error:
+        ledger.warn(f"covariances: {indeterminate(error).message}; objects far from the start are left unresolved")
+    return covariance
+
+
+def largest_sigma(covariances: Floats) -> Floats:
+    """The largest standard deviation (n,) m in any direction of covariances (n, 3, 3); NaN where they are."""
+    known = np.isfinite(covariances).all(axis=(1, 2))
+    sigma = np.full(len(covariances), np.nan)
+    sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[known])[:, -1], 0.0))
+    return sigma
 
 
 def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints) -> Floats:

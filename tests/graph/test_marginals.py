@@ -1,10 +1,14 @@
 """Marginal covariances against dense linear algebra, and the way out when the graph leaves something open."""
 
+import itertools
+
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from objslam.geometry import inverse
 from objslam.graph import factors
-from objslam.graph.marginals import marginal_covariances
+from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.optimise import build_graph, make_values
 from objslam.ledger import Ledger
 
@@ -88,4 +92,32 @@ def test_no_landmarks():
     values = make_values(CAMERAS, POINTS, np.zeros(0, dtype=np.int64))
     covariance = marginal_covariances(build_graph(anchors(range(3))), values, np.zeros(0, dtype=np.int64), ledger)
     assert covariance.shape == (0, 3, 3)
+    assert not ledger.lines()
+
+
+def test_seen_from_a_camera_the_covariance_is_that_of_a_map_that_begins_there():
+    """Whichever camera the graph is anchored at, the shape of what it holds is the same."""
+    rng = np.random.default_rng(3)
+    turned = CAMERAS.copy()
+    turned[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.3, size=(3, 3))).as_matrix()
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.05, 0.05, 0.2, 0.1, 0.05, 0.02]))
+    steps = [
+        gtsam.BetweenFactorPose3(factors.x_key(k), factors.x_key(k + 1), gtsam.Pose3(inverse(a) @ b), noise)
+        for k, (a, b) in enumerate(itertools.pairwise(turned))
+    ]
+    pairs = np.array([(k, j) for k in range(3) for j in range(3)])
+    to = np.einsum("rji,rj->ri", turned[pairs[:, 0], :3, :3], POINTS[pairs[:, 1]] - turned[pairs[:, 0], :3, 3])
+    unit = to / np.linalg.norm(to, axis=1, keepdims=True)
+    rays = factors.bearing(pairs[:, 0], unit, pairs[:, 1], [gtsam.noiseModel.Isotropic.Sigma(2, 0.02)] * len(pairs))
+    values, ledger = make_values(turned, POINTS, np.arange(3)), Ledger()
+
+    def anchored_at(k):
+        anchor = gtsam.PriorFactorPose3(factors.x_key(k), gtsam.Pose3(turned[k]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+        return build_graph(rays, steps, [anchor])
+
+    seen = seen_covariances(anchored_at(0), values, np.arange(3), np.array([2, 2, 2]), ledger)
+    there = marginal_covariances(anchored_at(2), values, np.arange(3), ledger)
+    turn = turned[2, :3, :3]
+    np.testing.assert_allclose(turn @ seen @ turn.T, there, rtol=1e-4, atol=1e-8)
+    assert (largest_sigma(seen) < largest_sigma(marginal_covariances(anchored_at(0), values, np.arange(3), ledger))).any()
     assert not ledger.lines()
