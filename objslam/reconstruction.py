@@ -226,7 +226,9 @@ class Grid:
     def add(self, depth: NDArray[np.float32], colour: NDArray[np.float32] | None, matrix: Floats, pose: Floats) -> None:
         """Fuse one frame: depth (H, W) m, colour (H, W, 3) in [0, 1], seen from map_T_camera (4, 4) by a pinhole camera."""
         images = [self._image(image) for image in (depth, colour) if image is not None]
-        k, camera_T_map = self._core.Tensor(matrix), self._core.Tensor(inverse(pose))
+        # Open3D takes the pixel at the whole number below, we have pixel centres there: half a pixel makes it the nearest
+        shift = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+        k, camera_T_map = self._core.Tensor(matrix + shift), self._core.Tensor(inverse(pose))
         reach = (1.0, self._max_depth, self._truncation)
         touched = self._grid.compute_unique_block_coordinates(images[0], k, camera_T_map, *reach)
         for part in self._with_room(touched):
@@ -258,7 +260,7 @@ class Grid:
         """The triangles between voxels that at least so many frames saw; None without one."""
         if not self.blocks:
             return None
-        mesh = self._grid.extract_triangle_mesh(float(min_views)).cpu()
+        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D wants more than it is told
         if not len(mesh.triangle.indices):
             return None
         colours = None
