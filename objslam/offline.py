@@ -165,6 +165,7 @@ def _summary(
     packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": log.name,
+        "log_path": None if log.path is None else str(log.path),
         "mode": settings.mode,
         "counts": {
             "detection_frames": sum(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None),

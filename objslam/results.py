@@ -233,6 +233,7 @@ def _rays_parquet(result: RunResult) -> bytes:
     ids = np.array([o.id for o in result.map.objects] or [0], dtype=np.int64)
     index = result.association.object
     names = np.array([_encode(name).decode() for name in result.rays.label_names], dtype=object)
+    cameras = np.array([_encode(camera.name).decode() for camera in result.cameras], dtype=object)
     table = pa.table(
         {
             "stamp": pa.array(result.keyframes.stamps[result.rays.keyframe]),
@@ -242,6 +243,9 @@ def _rays_parquet(result: RunResult) -> bytes:
             "residual": pa.array(result.residual, mask=np.isnan(result.residual)),
             "weight": pa.array(result.weight),
             "label": pa.array(names[result.rays.label], type=pa.string()),
+            "score": pa.array(result.rays.score),
+            "camera": pa.array(cameras[result.keyframes.camera[result.rays.keyframe]], type=pa.string()),
+            "box": pa.FixedSizeListArray.from_arrays(pa.array(result.rays.box.ravel()), 4),
         }
     )
     buffer = io.BytesIO()

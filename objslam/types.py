@@ -161,13 +161,17 @@ class Truth:
 
 @dataclass(frozen=True)
 class Log:
-    """A robot's log: odometry is odom_T_base, localization is map_T_base; at least one of the two is there."""
+    """A robot's log: odometry is odom_T_base, localization is map_T_base; at least one of the two is there.
+
+    path: the recording that it was read from, absolute; None where it was not.
+    """
 
     name: str
     cameras: tuple[CameraLog, ...]
     odometry: Trajectory | None = None
     localization: Trajectory | None = None
     truth: Truth | None = None
+    path: Path | None = None
 
 
 @dataclass(frozen=True)

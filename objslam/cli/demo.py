@@ -28,7 +28,8 @@ def demo(
     from objslam.ledger import Ledger
     from objslam.results import prepare_output
     from objslam.simulation import preset, simulate
-    from objslam.sources.folder import read_log_folder, write_log_folder
+    from objslam.sources import read
+    from objslam.sources.folder import write_log_folder
 
     prepare_output(out)
     log, model = out / "log", None
@@ -50,7 +51,7 @@ def demo(
         settings = settings_of(mode, None, changes)
         shown = " ".join(["objslam run", str(log), "-o", str(out / mode), "--mode", mode, *(f"--set {c}" for c in changes)])
         say(f"\n[bold]{shown}{f' --detector {model}' if model else ''}[/]", markup=True)
-        run_log(read_log_folder(log, ledger), settings, ledger, out / mode, model)
+        run_log(read(log, ledger), settings, ledger, out / mode, model)
         # a map from odometry alone begins where the odometry does: how it lies in the room is not its to say
         evaluate_folder(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
     say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: rerun {out / 'joint' / 'recording.rrd'}")

@@ -6,7 +6,7 @@ One file a kind of recording. `SOURCES` is the table of them: a new kind is one 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from objslam.errors import ConfigError, LogError
@@ -118,7 +118,7 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     for option in (field.name for field in fields(options) if field.name != "format"):
         if option not in source.takes and getattr(options, option) != getattr(default, option):
             ledger.warn(f"{path}: the option {option} has no meaning for a {source.name} recording")
-    return source.reads(path, ledger, options)
+    return replace(source.reads(path, ledger, options), path=path.resolve())
 
 
 def _choose(path: Path, name: str | None) -> Source:
