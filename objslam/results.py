@@ -20,6 +20,7 @@ import numpy as np
 
 from objslam.config import Settings, dump_settings
 from objslam.errors import LogError, OutputError
+from objslam.folders import no_empty_folders
 from objslam.ledger import Ledger
 from objslam.matching import lay_truth
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
@@ -27,7 +28,19 @@ from objslam.ply_file import write_cloud, write_mesh
 from objslam.sources.detections_file import write_detections
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
 from objslam.trace import Round
-from objslam.types import Association, Camera, CameraLog, Floats, Keyframes, ObjectMap, Rays, Surface, Trajectory, Truth
+from objslam.types import (
+    Association,
+    Camera,
+    CameraLog,
+    Floats,
+    Images,
+    Keyframes,
+    ObjectMap,
+    Rays,
+    Surface,
+    Trajectory,
+    Truth,
+)
 
 OBJECTS, TRAJECTORY, RAYS, CONFIG = "objects.json", "trajectory.txt", "rays.parquet", "config.yaml"
 PICTURE, RECORDING, SUMMARY = "map.png", "recording.rrd", "summary.json"
@@ -54,8 +67,8 @@ class RunResult:
     index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
     the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
     path: the full path that the log brought, at its own rate, before estimation; path_after: the same path after it.
-    trace: the rounds of the estimation, for the recording. surface: the room, where the log has depth images;
-    surface_before: the same at the poses as the log brought them, where the settings ask for it.
+    trace: the rounds of the estimation, and images: those of each camera, for the recording. surface: the room, where the
+    log has depth images; surface_before: the same at the poses as the log brought them, where the settings ask for it.
     """
 
     map: ObjectMap
@@ -73,6 +86,7 @@ class RunResult:
     path: Trajectory
     path_after: Trajectory
     trace: tuple[Round, ...] = ()
+    images: tuple[Images | None, ...] = ()
     surface: Surface | None = None
     surface_before: Surface | None = None
 
@@ -88,6 +102,14 @@ def prepare_output(out: Path) -> None:
                 raise OutputError("a folder stands where a file of the result goes", where=str(out / name))
         with _staged(out) as staging:
             _write(staging / "probe", b"objslam")
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """The folder for a result, tried before the work that goes on inside; work that fails leaves no empty folder behind."""
+    with no_empty_folders(out):
+        prepare_output(out)
+        yield
 
 
 def write_result(result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()) -> None:

@@ -179,6 +179,15 @@ def test_convert_never_writes_over_anything_unasked(objslam, log_folder, variant
     objslam("convert", log_folder, tmp_path / "photos", "--overwrite").says("no log")
 
 
+def test_info_of_a_log_folder(objslam, log_folder, variant):
+    info = objslam("info", log_folder)
+    assert (info.code, info.err) == (0, "")
+    for words in ("small: log", "odometry", "detections", "640x480", "nothing is missing for a run"):
+        assert words in info.out
+    (variant / "detections.jsonl").unlink()
+    assert "no detections; and no images either" in objslam("info", variant).out
+
+
 def test_config_dump_is_what_config_reads(objslam, tmp_path):
     dumped = objslam("config", "dump", "--set", "joint.loss=l1", "--set", "poses.max_gap=3")
     assert dumped.code == 0
@@ -230,7 +239,9 @@ def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_pat
 # How it answers at once
 
 
-@pytest.mark.parametrize("command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("config",), ("config", "dump")])
+@pytest.mark.parametrize(
+    "command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("info",), ("config",), ("config", "dump")]
+)
 def test_help(objslam, command):
     help_ = objslam(*command, "--help")
     assert help_.code == 0
@@ -330,9 +341,10 @@ def test_wrong_arguments_are_wrong_use(objslam, tmp_path, monkeypatch, arguments
 @pytest.mark.parametrize(("name", "word"), [("nowhere", "No such file"), ("empty", "nothing here that objslam reads")])
 def test_no_log_there(objslam, tmp_path, command, name, word):
     (tmp_path / "empty").mkdir()
-    failed = objslam(*((command, tmp_path / name) + (("-o",) if command == "run" else ()) + (tmp_path / "out",)))
+    failed = objslam(*((command, tmp_path / name) + (("-o",) if command == "run" else ()) + (tmp_path / "new" / "out",)))
     assert failed.code == 1
     failed.says(name, word)
+    assert not (tmp_path / "new").exists()
 
 
 def without_path(folder):

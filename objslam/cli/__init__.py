@@ -12,6 +12,7 @@ from objslam.cli.console import say
 from objslam.cli.convert import convert
 from objslam.cli.demo import demo
 from objslam.cli.evaluate import evaluate_result
+from objslam.cli.info import info
 from objslam.cli.run import run
 from objslam.errors import ObjslamError
 
@@ -26,6 +27,7 @@ app.command()(run)
 app.command(name="eval")(evaluate_result)
 app.command()(demo)
 app.command()(convert)
+app.command()(info)
 config_app = typer.Typer(no_args_is_help=True, help="Look at the settings.")
 config_app.command("dump")(config_dump)
 app.add_typer(config_app, name="config")

@@ -10,16 +10,21 @@ import typer
 from objslam.cli.console import console, progress_bar, report, say
 from objslam.cli.options import (
     Anonymous,
+    BaseFrame,
+    CameraInfo,
     Config,
     DetectorModel,
     Format,
     Label,
     Mode,
     Out,
+    Rectified,
     Robot,
     Set,
+    Topics,
     WithoutRange,
     settings_of,
+    source_options,
 )
 
 if TYPE_CHECKING:
@@ -31,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def run(
-    log: Annotated[Path, typer.Argument(help="A log folder, or anything that `objslam convert` reads.")],
+    log: Annotated[Path, typer.Argument(help="A log folder, a ROS bag, or anything that `objslam info` knows.")],
     out: Out = Path("out"),
     mode: Mode = None,
     config: Config = None,
@@ -41,18 +46,22 @@ def run(
     without_range: WithoutRange = False,
     anonymous: Anonymous = False,
     label: Label = None,
+    topic: Topics = None,
+    camera_info: CameraInfo = None,
+    base_frame: BaseFrame = None,
+    rectified: Rectified = None,
     detector: DetectorModel = None,
 ) -> None:
     """Map the objects of a log and write the result to a folder."""
     from objslam.ledger import Ledger
-    from objslam.results import prepare_output
-    from objslam.sources import SourceOptions, read
+    from objslam.results import output_folder
+    from objslam.sources import read
 
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
-    prepare_output(out)
-    options = SourceOptions(format_, robot, not without_range, anonymous, label)
-    run_log(read(log, ledger, options), settings, ledger, out, detector)
+    options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
+    with output_folder(out):
+        run_log(read(log, ledger, options), settings, ledger, out, detector)
 
 
 def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:

@@ -6,6 +6,7 @@ One file a kind of recording. `SOURCES` is the table of them: a new kind is one 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -113,7 +114,7 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     ConfigError for a format that does not exist.
     """
     options = options or SourceOptions()
-    source = _choose(path, options.format)
+    source = choose(path, options.format)
     default = SourceOptions()
     for option in (field.name for field in fields(options) if field.name != "format"):
         if option not in source.takes and getattr(options, option) != getattr(default, option):
@@ -121,7 +122,22 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     return replace(source.reads(path, ledger, options), path=path.resolve())
 
 
-def _choose(path: Path, name: str | None) -> Source:
+def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:
+    """Read a recording of any kind and write it as a log folder, with the images and depth images that it brings.
+
+    Images that a recording holds inside it are extracted right beside the log folder and then take their place in it: they
+    are written once. Errors as in `read` and `folder.write_log_folder`.
+    """
+    takes = choose(source, options.format).takes
+    folder.check_target(log, overwrite)
+    with ExitStack() as stack:
+        if "extract" in takes and options.extract is None:
+            options = replace(options, extract=stack.enter_context(folder.beside(log)))
+        folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
+
+
+def choose(path: Path, name: str | None = None) -> Source:
+    """The kind of recording that a path holds, or the one with that name; errors as in `read`."""
     if name is not None:
         for source in SOURCES:
             if source.name == name:

@@ -6,12 +6,14 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
 from objslam.errors import LogError, OutputError
+from objslam.folders import no_empty_folders
 from objslam.ledger import Ledger
 from objslam.objects_file import FORMAT, read_truth_objects
 from objslam.sources.camera_file import read_camera, write_camera
@@ -75,21 +77,55 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     names = [camera_log.camera.name for camera_log in log.cameras]
     if len(set(names)) < len(names) or (len(names) > 1 and not all(_is_file_name(name) for name in names)):
         raise OutputError(f"the cameras' names must differ and be file names, got {names}", where=log.name)
-    try:
-        _check_target(path, overwrite)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    check_target(path, overwrite)
+    with beside(path) as work, _writing(path):
+        fresh = work / "new"
+        fresh.mkdir()
+        _write_content(log, fresh, path)
         try:
-            fresh = work / "new"
-            fresh.mkdir()
-            _write_content(log, fresh, path)
             if path.exists():
                 path.rename(work / "old")
             fresh.rename(path)
         finally:
             if (work / "old").exists() and not path.exists():
                 (work / "old").rename(path)
+
+
+@contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """An empty folder next to where a log folder is to be: what is made in it can be moved there. It is gone afterwards."""
+    path = Path(os.path.realpath(path))
+    with no_empty_folders(path.parent):
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        try:
+            yield work
+        finally:
             shutil.rmtree(work, ignore_errors=True)
+
+
+def check_target(path: Path, overwrite: bool) -> None:
+    """OutputError where a log folder could not be written: something is there already that must not be replaced."""
+    with _writing(path):
+        if not path.exists():
+            return
+        if not path.is_dir():
+            raise OutputError("a file is in the way", where=str(path))
+        if not any(path.iterdir()):
+            return
+        if not is_log_folder(path):
+            raise OutputError(
+                "the folder holds something that is no log", where=str(path), hint="name a new or empty folder"
+            )
+        if not overwrite:
+            raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         where = str(error.filename or path)
         raise OutputError(f"cannot be written: {error.strerror or error}", where=where) from error
@@ -149,19 +185,6 @@ def _optional(read: Callable[[Path], _T], file: Path, ledger: Ledger) -> _T | No
 
 def _is_file_name(name: str) -> bool:
     return bool(name) and not name.startswith(".") and "/" not in name and name.isprintable()
-
-
-def _check_target(path: Path, overwrite: bool) -> None:
-    if not path.exists():
-        return
-    if not path.is_dir():
-        raise OutputError("a file is in the way", where=str(path))
-    if not any(path.iterdir()):
-        return
-    if not is_log_folder(path):
-        raise OutputError("the folder holds something that is no log", where=str(path), hint="name a new or empty folder")
-    if not overwrite:
-        raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
 
 
 def _write_content(log: Log, folder: Path, final: Path) -> None:

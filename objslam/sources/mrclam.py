@@ -51,7 +51,7 @@ def read_mrclam(folder: Path, robot: int | None, *, with_range: bool = True, ano
         if robot not in robots(folder):
             there = ", ".join(map(str, robots(folder))) or "none"
             what = "no robot is chosen" if robot is None else f"there is no robot {robot}"
-            raise LogError(f"{what}, the folder has: {there}", where=str(folder), hint="choose one of them")
+            raise LogError(f"{what}, the folder has: {there}", where=str(folder), hint="--robot chooses one of them")
         prefix = f"Robot{robot}"
         camera = Camera("camera", _WIDTH, _HEIGHT, _matrix(), base_T_camera=_FORWARD)
         return Log(

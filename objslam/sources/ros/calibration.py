@@ -37,7 +37,7 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
     sane = bool((np.abs(matrix) < _MAX_FOCAL).all()) and matrix[0, 0] > 0 and matrix[1, 1] > 0
     if not (sane and 0 < width < _MAX_PIXELS > height > 0):
         which = "P" if rectified else "K"
-        hint = "a calibration file can stand in for it"
+        hint = "--camera-info FILE can stand in for it"
         raise LogError(f"the camera is not calibrated ({which} or the size of the image is zero)", where=topic, hint=hint)
     matrix[0, 1] = matrix[1, 0] = matrix[2, 0] = matrix[2, 1] = 0.0
     matrix[2, 2] = 1.0
@@ -77,7 +77,7 @@ def _distortion(info: Any, topic: str) -> tuple[DistortionModel, Floats]:
     if not values.any() and name in _UNDISTORTED:
         return "plumb_bob", np.zeros(5)
     model = next((known for known in get_args(DistortionModel) if known == name), None)
-    hint = "a calibration file can stand in for it"
+    hint = "--camera-info FILE can stand in for it"
     if model is None:
         raise LogError(f"unknown distortion_model {given[:40]!r}, known: {', '.join(COEFFICIENTS)}", where=topic, hint=hint)
     if len(values) not in COEFFICIENTS[model]:

@@ -115,7 +115,7 @@ def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) 
         info = next(iter(topics.info.infos.values()))
         camera, correction = camera_of(info, topics.name, topics.info.name, topics.rectified)
     else:
-        hint = "--topic camera_info=/name, or a calibration file"
+        hint = "--topic camera_info=/name, or --camera-info FILE"
         raise LogError(f"no CameraInfo belongs to it (frame {topics.frame!r})", where=f"camera {topics.name}", hint=hint)
     base_T_frame = tree.still(base, topics.frame)
     if base_T_frame is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from objslam.errors import LogError
 from objslam.ledger import Ledger
+from objslam.sources.contents import Timing, timing
 from objslam.sources.ros.log import Assembly, BagOptions, assemble
 from objslam.sources.ros.survey import COMPRESSED, TF, Topic
 from objslam.sources.ros.tf_tree import TfTree
@@ -18,19 +19,17 @@ from objslam.types import Camera, Floats
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic. Times are the header's where the type matters to objslam, else those of recording; s, Hz.
+    """One topic.
 
-    role: what a run would use it for, "" for nothing. frame: its frame_id. longest_gap: between two of its messages. detail:
-    what its messages hold, in a few words.
+    messages: all of them. timing: of those that can be used, by the header's stamps where the type matters to objslam, else
+    by the times of recording. role: what a run would use it for, "" for nothing. frame: its frame_id. detail: what its
+    messages hold, in a few words. refused: why messages cannot be used, with their number.
     """
 
     name: str
     type: str
     messages: int
-    start: float
-    end: float
-    rate: float
-    longest_gap: float
+    timing: Timing
     role: str = ""
     frame: str = ""
     detail: str = ""
@@ -131,16 +130,12 @@ def _roles(assembly: Assembly) -> dict[str, str]:
 
 
 def _topic_info(topic: Topic, role: str) -> TopicInfo:
-    times = np.sort((topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)) / 1e9)
-    span = float(times[-1] - times[0])
+    stamps = topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)
     return TopicInfo(
         name=topic.name,
         type=topic.type,
         messages=len(topic.logged),
-        start=float(times[0]),
-        end=float(times[-1]),
-        rate=(len(times) - 1) / span if span > 0 else 0.0,
-        longest_gap=float(np.diff(times).max()) if len(times) > 1 else 0.0,
+        timing=timing(stamps / 1e9),
         role=role,
         frame=topic.frame,
         detail=_detail(topic),

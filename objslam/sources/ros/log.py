@@ -134,7 +134,7 @@ def _no_camera(survey: Survey) -> LogError:
     types = {topic.type for topic in survey.topics.values()}
     images = any(name.endswith(("/Image", "/CompressedImage")) for name in types)
     what = "images, but none with a CameraInfo" if images else "no images and no detections"
-    hint = "vision_msgs/Detection2DArray, AprilTag detections, or images with CameraInfo (or a calibration file) are needed"
+    hint = "vision_msgs/Detection2DArray, AprilTag detections, or images with CameraInfo (or --camera-info FILE) are needed"
     return LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint)
 
 

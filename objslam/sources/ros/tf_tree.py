@@ -152,7 +152,7 @@ class TfTree:
         if common is None:
             raise LogError(
                 f"tf does not connect {a!r} and {b!r}: {self._part(a)}; {self._part(b)}",
-                hint="was /tf_static recorded? a camera's place can be given in a calibration file",
+                hint="was /tf_static recorded? a camera's place can be given in --camera-info FILE",
             )
         return above_a[: above_a.index(common)], above_b[: above_b.index(common)]
 

@@ -39,12 +39,12 @@ def test_a_drive_at_a_glance(makers, tmp_path, log, kind):
     assert odometry.frame == "odom"
     assert odometry.detail == "odom -> base_footprint"
     assert odometry.messages == sum(1 for topic, _, _ in rows if topic == "/odom")
-    np.testing.assert_allclose([odometry.start, odometry.end], log.odometry.stamps[[0, -1]], atol=1e-9)
-    assert 2.0 <= odometry.longest_gap <= 2.1
-    span = odometry.end - odometry.start
-    assert np.isclose(odometry.rate, (odometry.messages - 1) / span)
+    np.testing.assert_allclose([odometry.timing.start, odometry.timing.end], log.odometry.stamps[[0, -1]], atol=1e-9)
+    assert 2.0 <= odometry.timing.longest_gap <= 2.1
+    span = odometry.timing.end - odometry.timing.start
+    assert np.isclose(odometry.timing.rate, (odometry.messages - 1) / span)
     assert topics["/front/detections"].detail.startswith(f"{len(log.cameras[0].detections)} boxes of")
-    assert topics["/front/camera_info"].rate == 0
+    assert topics["/front/camera_info"].timing.rate == 0
     assert (info.base, info.odometry, info.localization) == ("base_footprint", "/odom", "/amcl_pose")
     (place,) = info.places
     assert place.chain == ("base_footprint", "base_link", "front_link", "front_optical_frame")

@@ -1,0 +1,149 @@
+"""objslam info: what is inside a recording, and what a run would make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import report, say
+from objslam.cli.options import (
+    Anonymous,
+    BaseFrame,
+    CameraInfo,
+    Format,
+    Label,
+    Rectified,
+    Robot,
+    Topics,
+    WithoutRange,
+    source_options,
+)
+
+if TYPE_CHECKING:
+    from objslam.sources import SourceOptions
+    from objslam.sources.contents import Contents, Timing
+    from objslam.sources.ros import BagInfo
+    from objslam.types import Camera, Floats
+
+_EPOCH = 1e8  # s; stamps above it count from 1970
+_NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")
+
+
+def info(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or a data set that is read.")],
+    format_: Format = None,
+    robot: Robot = None,
+    without_range: WithoutRange = False,
+    anonymous: Anonymous = False,
+    label: Label = None,
+    topic: Topics = None,
+    camera_info: CameraInfo = None,
+    base_frame: BaseFrame = None,
+    rectified: Rectified = None,
+) -> None:
+    """Say what is inside a recording: streams, rates, gaps, times, the role of each topic, and what a run would miss."""
+    from objslam.ledger import Ledger
+    from objslam.sources import choose, read
+    from objslam.sources.contents import contents
+
+    options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
+    kind = choose(source, format_)
+    if kind.name == "ros":
+        _show_bag(source, options)
+        return
+    ledger = Ledger()
+    log = read(source, ledger, options)
+    _show_log(contents(log), kind.name)
+    report(ledger)
+
+
+def _show_log(found: Contents, kind: str) -> None:
+    starts, ends = ([getattr(s.timing, end) for s in found.streams] for end in ("start", "end"))
+    begin = min(starts, default=0.0)
+    say(f"{found.name}: {kind}; {_span(begin, max(ends, default=0.0))}")
+    rows = [
+        (stream.role, str(stream.timing.count), *_numbers(stream.timing, begin), stream.detail) for stream in found.streams
+    ]
+    _table(("role", *_NUMERIC, "what"), rows)
+    _show_cameras(found.cameras)
+    _list("missing for a run", found.missing, "nothing is missing for a run")
+
+
+def _show_bag(source: Path, options: SourceOptions) -> None:
+    from objslam.sources.ros import describe
+
+    bag = describe(source, options.of_bag())
+    files = f"{len(bag.files)} file{'s' if len(bag.files) > 1 else ''}"
+    lost = f" ({bag.lost} lost)" if bag.lost else ""
+    say(f"{bag.name}: {bag.format}, {files}, {bag.messages} messages{lost}; {_span(bag.start, bag.end)}")
+    parts = (("base frame", bag.base), ("odometry", bag.odometry), ("localisation", bag.localization))
+    say("; ".join(f"{name} {value or 'none'}" for name, value in parts))
+    topics = sorted(bag.topics, key=lambda topic: (not topic.role, topic.name))
+    rows = [
+        (t.name, t.role, t.type.replace("/msg/", "/"), str(t.messages), *_numbers(t.timing, bag.start), t.frame, t.detail)
+        for t in topics
+    ]
+    _table(("topic", "role", "type", *_NUMERIC, "frame", "what"), rows)
+    _show_cameras(bag.cameras)
+    _show_places(bag)
+    refused = [f"{topic.name}: {reason}" for topic in bag.topics for reason in topic.refused]
+    _list("messages that cannot be used", refused)
+    _list("damage", bag.damage)
+    _list("warnings", [line for line in bag.warnings if not line.startswith("dropped")])
+    _list("missing for a run", bag.missing, "nothing is missing for a run")
+
+
+def _show_cameras(cameras: Iterable[Camera]) -> None:
+    for camera in cameras:
+        fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
+        say(
+            f"camera {camera.name}: {camera.width}x{camera.height}, f {fx:.1f} {fy:.1f} px, {camera.distortion_model}, "
+            f"at {_place(camera.base_T_camera)} in base"
+        )
+
+
+def _show_places(bag: BagInfo) -> None:
+    for place in bag.places:
+        where = "moves" if place.base_T_frame is None else _place(place.base_T_frame)
+        say(f"{' -> '.join(place.chain)}: {where}")
+
+
+def _place(pose: Floats) -> str:
+    from objslam.geometry import quaternion
+
+    x, y, z = pose[:3, 3]
+    turn = ", ".join(f"{value + 0.0:.4f}" for value in quaternion(pose[None])[0])
+    return f"({x:.4f}, {y:.4f}, {z:.4f}) m, xyzw ({turn})"
+
+
+def _numbers(when: Timing, begin: float) -> tuple[str, ...]:
+    rate, gap = f"{when.rate:.1f}" if when.rate else "", f"{when.longest_gap:.2f}" if when.count > 1 else ""
+    return rate, gap, f"{when.start - begin:.2f}", f"{when.end - begin:.2f}"
+
+
+def _span(start: float, end: float) -> str:
+    if start > _EPOCH:
+        first = datetime.fromtimestamp(start, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return f"{end - start:.1f} s from {first}"
+    return f"{end - start:.1f} s from {start:.3f} s"
+
+
+def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Columns of text, none of it cut off, however long a topic's name is."""
+    widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
+    for row in (names, *rows):
+        cells = (c.rjust(w) if name in _NUMERIC else c.ljust(w) for c, w, name in zip(row, widths, names, strict=True))
+        say("  ".join(cells).rstrip())
+
+
+def _list(title: str, lines: Sequence[str], otherwise: str = "") -> None:
+    if lines:
+        say(f"{title}:")
+        for line in lines:
+            say(f"  {line}")
+    elif otherwise:
+        say(otherwise)
