@@ -13,6 +13,7 @@ from objslam.cli.convert import convert
 from objslam.cli.demo import demo
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.info import info
+from objslam.cli.report import report_result
 from objslam.cli.run import run
 from objslam.errors import ObjslamError
 
@@ -25,6 +26,7 @@ app = typer.Typer(
 )
 app.command()(run)
 app.command(name="eval")(evaluate_result)
+app.command(name="report")(report_result)
 app.command()(demo)
 app.command()(convert)
 app.command()(info)

@@ -1,0 +1,114 @@
+"""Pictures of an object: its best boxes, cut out of the log's images where these are still there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.detection.frames import decode_image
+from objslam.errors import ObjslamError
+from objslam.ledger import Ledger
+from objslam.report.rays_table import RaysTable
+from objslam.scene import REJECTED_BELOW
+from objslam.sources import SourceOptions, read
+from objslam.sources.box_depths import MAX_LAG, nearest
+from objslam.sources.textfile import read_bytes
+from objslam.types import Floats, Images, Ints
+
+_SIDE = 144  # px, the height of a picture in the page
+_WIDEST = 2.2  # times that
+_AROUND = 0.25  # of the box's size is shown beside it
+_LEAST = 24  # px around small boxes
+_FRAME = (60, 190, 255)  # BGR
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A JPEG with what a box shows: its width and height, px, and where it is from."""
+
+    jpeg: bytes
+    width: int
+    height: int
+    stamp: float
+    score: float
+    camera: str
+
+
+def images_of(log: Path | None) -> tuple[dict[str, Images], str | None]:
+    """The images of a log by camera, and if there are none, why in words. Only images inside the log are listed."""
+    if log is None:
+        return {}, "The result does not say which log it is from."
+    if not log.exists():
+        return {}, f"The log is not at {log} any more: objslam report --log LOG says where it is."
+    try:
+        cameras = read(log, Ledger(), SourceOptions(with_range=False, with_images=False)).cameras
+    except ObjslamError as error:
+        return {}, f"The log cannot be read again: {error}"
+    images = {c.camera.name: c.rgb for c in cameras if c.rgb is not None}
+    return images, None if images else "The log has no images."
+
+
+def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
+    """Of an object's rays (M,), indices in the order of time, the best in each of `count` parts of them (at most count,)."""
+    kept = mine[rays.weight[mine] >= REJECTED_BELOW]
+    parts = np.array_split(kept, min(count, len(kept))) if len(kept) else []
+    size = np.sqrt(np.prod(rays.box[:, 2:] - rays.box[:, :2], axis=1))
+    return np.array([part[np.lexsort((size[part], rays.score[part]))[-1]] for part in parts], dtype=np.int64)
+
+
+def cut_crops(
+    rays: RaysTable, chosen: Ints, images: dict[str, Images], progress: Callable[[int, int], None]
+) -> dict[int, Crop]:
+    """The pictures of the chosen rays (C,), by ray; a ray without a readable image within 20 ms has none."""
+    files = {int(i): file for i in chosen if (file := _file(rays, int(i), images)) is not None}
+    by_file: dict[Path, list[int]] = {}
+    for ray, file in files.items():
+        by_file.setdefault(file, []).append(ray)
+    crops = {}
+    for done, (file, wanted) in enumerate(by_file.items()):
+        try:
+            image = decode_image(read_bytes(file))
+        except ObjslamError:
+            image = None
+        for ray in wanted if image is not None else ():
+            picture = _cut(image, rays.box[ray])
+            if picture is not None:
+                jpeg, width, height = picture
+                crops[ray] = Crop(jpeg, width, height, float(rays.stamp[ray]), float(rays.score[ray]), str(rays.camera[ray]))
+        progress(done + 1, len(by_file))
+    return crops
+
+
+def _file(rays: RaysTable, ray: int, images: dict[str, Images]) -> Path | None:
+    listed = images.get(str(rays.camera[ray]))
+    if listed is None:
+        return None
+    index = int(nearest(listed.stamps, rays.stamp[ray : ray + 1])[0])
+    return listed.paths[index] if abs(listed.stamps[index] - rays.stamp[ray]) <= MAX_LAG else None
+
+
+def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
+    """A box with what is around it, framed, as JPEG with its width and height; None for a box outside the image."""
+    import cv2
+
+    height, width = image.shape[:2]
+    size = box[2:] - box[:2]
+    margin = np.maximum(_AROUND * size, (_LEAST - size) / 2)
+    # no wider than the page has room for, no narrower than half as wide as high
+    margin[0] = max(margin[0], (0.5 * (size[1] + 2 * margin[1]) - size[0]) / 2)
+    margin[1] = max(margin[1], ((size[0] + 2 * margin[0]) / _WIDEST - size[1]) / 2)
+    low = np.clip(np.floor(box[:2] - margin), 0, [width, height]).astype(int)
+    high = np.clip(np.ceil(box[2:] + margin), 0, [width, height]).astype(int)
+    if (high - low < 2).any():
+        return None
+    part = image[low[1] : high[1], low[0] : high[0]]
+    scale = _SIDE / part.shape[0]
+    shape = (min(max(round(part.shape[1] * scale), 1), 4 * _SIDE), _SIDE)
+    part = cv2.resize(part, shape, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    corners = np.rint((box.reshape(2, 2) - low) * [shape[0] / (high[0] - low[0]), scale]).astype(int)
+    cv2.rectangle(part, corners[0].tolist(), corners[1].tolist(), _FRAME, 1, cv2.LINE_AA)
+    return cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes(), shape[0], shape[1]

@@ -1,0 +1,230 @@
+"""From a result folder to the page: everything is gathered here, the template only lays it out."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.config import Settings, dump_settings, load_settings
+from objslam.errors import OutputError
+from objslam.evaluation import Evaluation, evaluate
+from objslam.matching import lay_truth
+from objslam.report.charts import Histogram, axis_end, histogram
+from objslam.report.crops import Crop, best_rays, cut_crops, images_of
+from objslam.report.rays_table import RaysTable, read_rays
+from objslam.results import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY, load_map, load_trajectory, load_truth, write_file
+from objslam.scene import REJECTED_BELOW, captions, label_colours
+from objslam.types import MapObject, ObjectMap
+
+_UNIX_TIME = 1e8  # s; stamps beyond it are dates
+_BINS, _FEW_BINS = 32, 16
+_EXPLAINED = {
+    "detection_frames": "camera frames",
+    "frames_on_path": "of them on the path",
+    "keyframes": "of them with a usable box",
+    "detections": "boxes",
+    "rays": "usable boxes (rays)",
+    "rays_rejected": "rays rejected as outliers",
+    "rays_unexplained": "rays that no object explains",
+    "objects": "objects",
+    "unresolved": "of them unresolved",
+}
+
+
+@dataclass(frozen=True)
+class Card:
+    """An object with all that the page says of it; times in s since the first ray."""
+
+    object: MapObject
+    caption: str
+    colour: str
+    sigma: tuple[float, float, float] | None
+    largest_sigma: float | None
+    seen: tuple[float, float]
+    rejected: int
+    error: float | None
+    matched: str | None
+    histogram: Histogram | None
+    crops: tuple[Crop, ...]
+
+
+def write_report(
+    out: Path,
+    *,
+    log: Path | None = None,
+    crops: int = 4,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Path:
+    """Write report.html into the result folder `out` and return its path.
+
+    log: the log that the result is from, for the pictures; where summary.json says it is if not given. crops: pictures an
+    object. OutputError when the result cannot be read or the page not written; LogError for a truth that cannot be read.
+    """
+    file = out / REPORT
+    write_file(file, render(out, log=log, crops=crops, progress=progress).encode("utf-8", errors="replace"))
+    return file
+
+
+def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, int, int], None]) -> str:
+    """The page of a result folder as text; all text of others in it is escaped."""
+    import jinja2
+
+    progress("reading the result", 0, 0)
+    objects, rays, summary = load_map(out), read_rays(out), _json(out / SUMMARY)
+    settings = load_settings(out / CONFIG)
+    errors, scores = _evaluation(out, objects)
+    mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
+    chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
+    images, no_images = images_of(log or _log_path(summary)) if crops else ({}, None)
+    wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
+    pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
+    begin = float(rays.stamp.min()) if len(rays) else 0.0
+    kept = rays.residual[(rays.weight >= REJECTED_BELOW) & np.isfinite(rays.residual)]
+    top = axis_end(kept) if len(kept) else None
+    colours = label_colours(objects)
+    cards = [
+        _card(
+            o,
+            caption,
+            "#" + "".join(f"{round(255 * c):02x}" for c in colours[o.label]),
+            rays,
+            mine[o.id],
+            top,
+            begin,
+            tuple(pictures[int(i)] for i in chosen[o.id] if int(i) in pictures),
+            errors,
+        )
+        for o, caption in zip(objects.objects, captions(objects), strict=True)
+    ]
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("objslam.report", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
+    picture = out / PICTURE
+    return environment.get_template("page.html.jinja").render(
+        style=_resource("page.css"),
+        script=_resource("page.js"),
+        name=str(summary.get("log", out.resolve().name)),
+        folder=out.resolve().name,
+        mode=settings.mode,
+        frame=objects.frame,
+        start=_date(begin) if begin > _UNIX_TIME else None,
+        duration=float(rays.stamp.max()) - begin if len(rays) else 0.0,
+        picture=picture.read_bytes() if picture.is_file() else None,
+        cards=cards,
+        with_errors=any(card.error is not None for card in cards),
+        histogram=histogram(rays.residual, rays.weight, _BINS),
+        scores=scores,
+        no_images=no_images,
+        counts=[(_EXPLAINED.get(key, key), value) for key, value in summary.get("counts", {}).items()],
+        unexplained=summary.get("unexplained_share", {}),
+        dropped=_dropped(summary),
+        warnings=summary.get("warnings", []),
+        seconds=summary.get("seconds", {}),
+        versions=summary.get("versions", {}),
+        costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if key in summary},
+        changed=_changed(settings),
+        settings=dump_settings(settings),
+    )
+
+
+def _card(
+    o: MapObject,
+    caption: str,
+    colour: str,
+    rays: RaysTable,
+    mine: np.ndarray,
+    top: float | None,
+    begin: float,
+    crops: tuple[Crop, ...],
+    errors: dict[int, tuple[float, str]],
+) -> Card:
+    weight = rays.weight[mine]
+    covariance = o.covariance
+    sigma = None if covariance is None else np.sqrt(np.diag(covariance)).tolist()
+    return Card(
+        object=o,
+        caption=caption,
+        colour=colour,
+        sigma=(sigma[0], sigma[1], sigma[2]) if sigma else None,
+        largest_sigma=None if covariance is None else float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])),
+        seen=(o.first_seen - begin, o.last_seen - begin),
+        rejected=int((weight < REJECTED_BELOW).sum()),
+        error=errors[o.id][0] if o.id in errors else None,
+        matched=errors[o.id][1] if o.id in errors else None,
+        histogram=histogram(rays.residual[mine], weight, _FEW_BINS, top),
+        crops=crops,
+    )
+
+
+def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
+    """The errors of the matched objects by id, and what evaluation.json holds; from the truth, if there is one but no such file.
+
+    Then, a map that lies in a frame of its own is first laid onto the truth.
+    """
+    if (out / EVALUATION).is_file():
+        scores = _json(out / EVALUATION)
+    else:
+        truth = load_truth(out)
+        if truth is None:
+            return {}, None
+        align = "none" if lay_truth(objects, truth) is truth else "se2"
+        evaluation: Evaluation = evaluate(objects, truth, load_trajectory(out), align=align)  # type: ignore[arg-type]
+        scores = evaluation.to_dict()
+    matched = scores.get("objects", [])
+    return {o["id"]: (float(o["error"]), f"{o['label']} {o['truth_id']}") for o in matched}, scores
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
+    except ValueError as error:
+        raise OutputError(f"is not JSON: {error}", where=str(file)) from error
+    if not isinstance(data, dict):
+        raise OutputError("is not a JSON object", where=str(file))
+    return data
+
+
+def _log_path(summary: dict[str, Any]) -> Path | None:
+    path = summary.get("log_path")
+    return Path(path) if isinstance(path, str) else None
+
+
+def _dropped(summary: dict[str, Any]) -> list[tuple[str, int, str]]:
+    examples = summary.get("dropped_examples", {})
+    return [(why, count, ", ".join(examples.get(why, []))) for why, count in summary.get("dropped", {}).items()]
+
+
+def _changed(settings: Settings) -> list[tuple[str, Any, Any]]:
+    """Settings that are not at their default: name, value, default."""
+    now, default = _flat(settings.model_dump(mode="json")), _flat(Settings().model_dump(mode="json"))
+    return [(key, value, default[key]) for key, value in now.items() if value != default.get(key)]
+
+
+def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
+    return flat
+
+
+def _date(stamp: float) -> str:
+    return datetime.fromtimestamp(stamp, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _resource(name: str) -> str:
+    return resources.files("objslam.report").joinpath(name).read_text(encoding="utf-8")
