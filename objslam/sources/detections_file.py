@@ -35,7 +35,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
     for number, text in lines:
         place = f"{path}:{number}"
         try:
-            whole &= _add_frame(text, place, collector)
+            whole &= add_frame(parse_object(text), place, collector)
         except Malformed as malformed:
             ledger.drop(f"detection frame malformed: {malformed}", where=place)
     if not collector.stamps:
@@ -62,17 +62,28 @@ def write_detections(detections: Detections, path: Path) -> None:
             file.write(json.dumps(frame, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def _add_frame(text: str, place: str, collector: BoxCollector) -> bool:
-    """Add the frame of a line; whether it says that its boxes are whole."""
+def parse_object(text: str | bytes) -> dict[str, Any]:
+    """The JSON object that a line is; Malformed otherwise."""
     try:
-        frame = json.loads(text)
+        value = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise Malformed("not JSON") from error
-    if type(frame) is not dict:
+    if type(value) is not dict:
         raise Malformed("not a JSON object")
-    (stamp,) = read_numbers([frame.get("stamp")], "stamp")
+    return value
+
+
+def read_stamp(message: dict[str, Any]) -> float:
+    """The stamp of a message, s; Malformed where it is not a finite number."""
+    (stamp,) = read_numbers([message.get("stamp")], "stamp")
     if not math.isfinite(stamp):
         raise Malformed("stamp is not a finite number")
+    return stamp
+
+
+def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
+    """Add a frame with its boxes; whether it says that they are whole. Malformed where it is no frame."""
+    stamp = read_stamp(frame)
     boxes = [read_numbers(box, "a box") for box in _list(frame, "boxes")]
     labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
     depths = [_depth(depth) for depth in _list(frame, "depths")] if "depths" in frame else [math.nan] * len(boxes)

@@ -1,0 +1,138 @@
+"""Anything else: JSON lines on standard input, one message each.
+
+{"type": "camera", "name": "front", ...the keys of camera.yaml...}
+{"type": "odometry", "stamp": 12.5, "translation": [x, y, z], "rotation_xyzw": [x, y, z, w]}    odom_T_base
+{"type": "localization", ...the same...}    map_T_base
+{"type": "mount", "camera": "front", ...the same...}    base_T_camera from this stamp on
+{"type": "detections", "camera": "front", ...a line of detections.jsonl...}
+
+Poses may be planar, "x", "y", "yaw" in place of translation and rotation, and odometry and localization may have a
+"covariance" of 36 numbers. "camera" may be left out where there is one, which is then called "camera", as is its "name".
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import threading
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from objslam.errors import LogError
+from objslam.geometry import lift_se2, pose_from_quaternion
+from objslam.ledger import Ledger
+from objslam.live.interface import Sink
+from objslam.sources.boxes import BoxCollector
+from objslam.sources.camera_file import parse_camera
+from objslam.sources.detections_file import Malformed, add_frame, parse_object, read_numbers, read_stamp
+from objslam.types import Floats
+
+_CAMERA = "camera"
+_TYPES = ("camera", "odometry", "localization", "mount", "detections")
+_LONGEST = 1 << 20  # bytes; a line beyond it is skipped
+_CHUNK = 1 << 16
+_WAIT = 0.1  # s: how soon a stop is seen
+
+
+@dataclass
+class StdinAdapter:
+    """Reads messages from a stream, line by line; lines that are no message are counted with their numbers."""
+
+    sink: Sink
+    stream: BinaryIO
+    name: str = "stdin"
+    ledger: Ledger = field(default_factory=Ledger)
+
+    def run(self, stop: threading.Event) -> None:
+        """Hand messages on until the stream ends or stop is set."""
+        number, rest, skipping = 0, b"", False
+        while not stop.is_set() and (chunk := self._read(stop)):
+            *lines, rest = (rest + chunk).split(b"\n")
+            for line in lines:
+                number += 1
+                if not skipping:
+                    self._take(line, number)
+                skipping = False
+            if len(rest) > _LONGEST:
+                if not skipping:
+                    self.ledger.drop(f"line longer than {_LONGEST} bytes", where=f"{self.name}:{number + 1}")
+                rest, skipping = b"", True
+        if rest and not skipping and not stop.is_set():
+            self._take(rest, number + 1)
+
+    def _read(self, stop: threading.Event) -> bytes:
+        """The next bytes, b"" at the end or when stop is set."""
+        source = self.stream.fileno()
+        while not stop.is_set():
+            if select.select([source], [], [], _WAIT)[0]:
+                return os.read(source, _CHUNK)
+        return b""
+
+    def _take(self, line: bytes, number: int) -> None:
+        if not line.strip():
+            return
+        place = f"{self.name}:{number}"
+        try:
+            self._push(parse_object(line), place)
+        except Malformed as malformed:
+            self.ledger.drop(f"line malformed: {malformed}", where=place)
+        except LogError as error:
+            self.ledger.drop("line malformed: not a camera", where=str(error))
+
+    def _push(self, message: dict[str, Any], place: str) -> None:
+        kind = message.get("type")
+        if kind == "camera":
+            keys = {key: value for key, value in message.items() if key not in ("type", "name")}
+            text = json.dumps(keys).encode()
+            self.sink.push_camera(parse_camera(text, place, self.ledger, _name(message, "name")))
+        elif kind == "odometry":
+            self.sink.push_odometry(read_stamp(message), _pose(message), _covariance(message))
+        elif kind == "localization":
+            self.sink.push_localization(read_stamp(message), _pose(message), _covariance(message))
+        elif kind == "mount":
+            self.sink.push_mount(read_stamp(message), _name(message, _CAMERA), _pose(message))
+        elif kind == "detections":
+            self._push_detections(message, place)
+        else:
+            raise Malformed(f"type is none of {', '.join(_TYPES)}")
+
+    def _push_detections(self, message: dict[str, Any], place: str) -> None:
+        collector = BoxCollector()
+        add_frame(message, place, collector)
+        boxes = np.array(collector.boxes, dtype=np.float64).reshape(-1, 4)
+        scores, depths = np.array(collector.scores, dtype=np.float64), np.array(collector.depths, dtype=np.float64)
+        camera, tracks = _name(message, _CAMERA), collector.track_ids
+        self.sink.push_detections(collector.stamps[0], camera, boxes, collector.labels, scores, depths, tracks)
+
+
+def _name(message: dict[str, Any], key: str) -> str:
+    name = message.get(key, _CAMERA)
+    if type(name) is not str or not name:
+        raise Malformed(f"{key} is not a name")
+    return name
+
+
+def _pose(message: dict[str, Any]) -> Floats:
+    if "yaw" in message:
+        return lift_se2(np.array(_finite([message.get(key) for key in ("x", "y", "yaw")], "x, y, yaw", 3)))
+    place = _finite(message.get("translation"), "translation", 3)
+    xyzw = _finite(message.get("rotation_xyzw"), "rotation_xyzw", 4)
+    if not abs(float(np.linalg.norm(xyzw)) - 1) < 0.01:
+        raise Malformed("rotation_xyzw has not the length 1")
+    return pose_from_quaternion(np.array([place]), np.array([xyzw]))[0]
+
+
+def _covariance(message: dict[str, Any]) -> Floats | None:
+    if "covariance" not in message:
+        return None
+    return np.array(_finite(message["covariance"], "covariance", 36)).reshape(6, 6)
+
+
+def _finite(value: Any, name: str, count: int) -> list[float]:
+    numbers = read_numbers(value, name)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise Malformed(f"{name} is not {count} finite numbers")
+    return numbers
