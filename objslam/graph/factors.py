@@ -163,13 +163,16 @@ def between(before: int, after: int, motion: Floats, covariance: Floats) -> gtsa
     return gtsam.BetweenFactorPose3(x_key(before), x_key(after), gtsam.Pose3(motion), noise)
 
 
-def localizations(keyframes: Keyframes, settings: Settings) -> list[gtsam.NonlinearFactor]:
-    """Absolute pose priors on every keyframe, with Huber's loss, for a localisation may jump.
+def localizations(
+    keyframes: Keyframes, settings: Settings, first: int = 0, on_plane: bool | None = None
+) -> list[gtsam.NonlinearFactor]:
+    """Absolute pose priors on every keyframe, X(first) and on, with Huber's loss, for a localisation may jump.
 
-    Keyframes that share a measurement share its information.
+    Keyframes that share a measurement share its information. on_plane: whether the path is planar, None to see.
     """
     of, planar = settings.localization, settings.planar
-    tilt, z = (planar.tilt, planar.z) if is_planar(keyframes.map_T_base) else (of.yaw, of.xy)
+    on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
+    tilt, z = (planar.tilt, planar.z) if on_plane else (of.yaw, of.xy)
     s = np.diag([tilt, tilt, of.yaw, of.xy, of.xy, z]) ** 2 * keyframes.localized_every
     to_camera = adjoint(inverse(keyframes.base_T_camera))
     covariance = to_camera @ s @ np.swapaxes(to_camera, 1, 2)
@@ -177,6 +180,6 @@ def localizations(keyframes: Keyframes, settings: Settings) -> list[gtsam.Nonlin
     loss = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K)
     noise = gtsam.noiseModel
     return [
-        gtsam.PriorFactorPose3(x_key(k), gtsam.Pose3(pose), noise.Robust.Create(loss, noise.Gaussian.Covariance(c)))
+        gtsam.PriorFactorPose3(x_key(first + k), gtsam.Pose3(pose), noise.Robust.Create(loss, noise.Gaussian.Covariance(c)))
         for k, (pose, c) in enumerate(zip(keyframes.map_T_camera, covariance, strict=True))
     ]

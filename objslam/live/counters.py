@@ -1,0 +1,53 @@
+"""What a session counts: accepted messages, drops by reason, and how long updates take."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+
+import numpy as np
+
+from objslam.ledger import Ledger
+
+_WINDOW = 2000  # updates that the percentiles are of
+
+
+class Counters:
+    """Counts from any thread; `ledger` holds the drops with the first few places, as everywhere."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._accepted: Counter[str] = Counter()
+        self._seconds: deque[float] = deque(maxlen=_WINDOW)
+        self.ledger = Ledger()
+
+    def accept(self, kind: str, count: int = 1) -> None:
+        """One more message, or event, of a kind."""
+        with self._lock:
+            self._accepted[kind] += count
+
+    def drop(self, reason: str, where: str | None = None, count: int = 1) -> None:
+        """One more message dropped for a reason."""
+        with self._lock:
+            self.ledger.drop(reason, count, where)
+
+    def updated(self, seconds: float) -> None:
+        """A frame is in the map so many seconds after it was pushed."""
+        with self._lock:
+            self._seconds.append(seconds)
+
+    def accepted(self) -> dict[str, int]:
+        """Messages and events by kind."""
+        with self._lock:
+            return dict(self._accepted)
+
+    def dropped(self) -> dict[str, int]:
+        """Drops by reason."""
+        with self._lock:
+            return dict(self.ledger.dropped)
+
+    def update(self) -> tuple[float, float]:
+        """Median and 99th percentile of the last updates, s; 0 before the first."""
+        with self._lock:
+            seconds = np.array(self._seconds)
+        return (float(np.median(seconds)), float(np.quantile(seconds, 0.99))) if len(seconds) else (0.0, 0.0)

@@ -1,0 +1,199 @@
+"""The journal: what a session accepted, record by record, so that nothing of it is lost when the process is killed.
+
+A file that only grows: 8 bytes that say what it is, then records of length (4 bytes, little endian), CRC-32 (4 bytes) and
+content. A record is with the kernel before its message counts, so that a killed process loses none; the disk has it a second
+later at the most, so that a power failure loses no more than that.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from objslam.errors import LogError, OutputError
+from objslam.geometry import make_pose
+from objslam.ledger import Ledger
+from objslam.live.messages import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage, decode, encode
+from objslam.types import Camera, CameraLog, Detections, Floats, Log, Trajectory, label_table
+
+NAME = "journal.objslam"
+MAGIC = b"OBJSLAM1"
+_HEAD = struct.Struct("<II")
+_LONGEST = 1 << 26  # bytes of a record: what claims more is damage
+_SYNC_EVERY = 1.0  # s
+
+
+class Journal:
+    """A journal that is written to, by one process at a time; OutputError where the disk refuses."""
+
+    def __init__(self, file: Path, resume: bool = False) -> None:
+        """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use."""
+        self.file = file
+        self._synced = time.monotonic()
+        try:
+            self._stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise OutputError(f"cannot open the journal: {error.strerror}", where=str(file)) from error
+        try:
+            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(self._stream)
+            raise OutputError("another session writes this journal", where=str(file)) from error
+        end = _sound_end(file) if resume else 0
+        os.ftruncate(self._stream, end)
+        os.lseek(self._stream, 0, os.SEEK_END)
+        self._end = end
+        if end == 0:
+            self._append(MAGIC)
+
+    def write(self, message: Message) -> None:
+        """Append one message. When this returns, a killed process has not lost it."""
+        content = encode(message)
+        self._append(_HEAD.pack(len(content), zlib.crc32(content)) + content)
+        now = time.monotonic()
+        if now - self._synced > _SYNC_EVERY:
+            self._synced = now
+            os.fdatasync(self._stream)
+
+    def close(self) -> None:
+        """All of it to the disk; nothing is written any more."""
+        if self._stream >= 0:
+            os.fsync(self._stream)
+            os.close(self._stream)
+            self._stream = -1
+
+    def _append(self, data: bytes) -> None:
+        try:
+            done = 0
+            while done < len(data):
+                done += os.write(self._stream, data[done:])
+        except OSError as error:
+            os.ftruncate(self._stream, self._end)  # no half record between whole ones
+            os.lseek(self._stream, 0, os.SEEK_END)
+            raise OutputError(f"cannot write the journal: {error.strerror}", where=str(self.file)) from error
+        self._end += len(data)
+
+
+def is_journal(path: Path) -> bool:
+    """Whether this is a journal, or a folder with one."""
+    file = _file(path)
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(len(MAGIC)) == MAGIC
+
+
+def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
+    """The messages of a journal in their order. A torn end is dropped and counted; LogError where it is no journal."""
+    file = _file(path)
+    if not is_journal(path):
+        raise LogError("no journal", where=str(path))
+    with file.open("rb") as stream:
+        for content in _records(stream):
+            try:
+                yield decode(content)
+            except LogError as error:  # whole by its checksum: another version of objslam wrote it
+                ledger.drop(error.message, where=f"{file}:{stream.tell()}")
+        rest = file.stat().st_size - stream.tell()
+    if rest:
+        ledger.drop("torn record at the end of the journal", where=f"{file}, {rest} bytes")
+
+
+def read_journal(path: Path, ledger: Ledger) -> Log:
+    """The log that a journal holds: what the session accepted, on its clock. LogError where it holds no frames."""
+    poses: dict[str, list[PoseMessage]] = {"odometry": [], "localization": []}
+    cameras: dict[str, Camera] = {}
+    frames: dict[str, list[FrameMessage]] = {}
+    mounts: dict[str, list[MountMessage]] = {}
+    for message in messages(path, ledger):
+        if isinstance(message, PoseMessage):
+            poses[message.path].append(message)
+        elif isinstance(message, CameraMessage):
+            cameras[message.camera.name] = message.camera
+        elif isinstance(message, FrameMessage):
+            frames.setdefault(message.camera, []).append(message)
+        elif isinstance(message, MountMessage):
+            mounts.setdefault(message.camera, []).append(message)
+    if not frames:
+        raise LogError("the journal holds no frames", where=str(path))
+    return Log(
+        name=_file(path).resolve().parent.name,
+        cameras=tuple(_camera_log(camera, frames.get(name, []), mounts.get(name, [])) for name, camera in cameras.items()),
+        odometry=_trajectory(poses["odometry"]),
+        localization=_trajectory(poses["localization"]),
+    )
+
+
+def _file(path: Path) -> Path:
+    return path / NAME if path.is_dir() else path
+
+
+def _records(stream: BinaryIO) -> Iterator[bytes]:
+    """The contents of the records up to the first that is torn; the stream then stands where that begins."""
+    stream.seek(len(MAGIC))
+    while True:
+        start = stream.tell()
+        head = stream.read(_HEAD.size)
+        if len(head) == _HEAD.size:
+            length, checksum = _HEAD.unpack(head)
+            content = stream.read(length) if length <= _LONGEST else b""
+            if len(content) == length and zlib.crc32(content) == checksum:
+                yield content
+                continue
+        stream.seek(start)
+        return
+
+
+def _sound_end(file: Path) -> int:
+    """Where the whole records end, 0 for an empty file; OutputError where the file is no journal."""
+    size = file.stat().st_size
+    if size == 0:
+        return 0
+    with file.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            raise OutputError("there is no journal to go on with", where=str(file))
+        for _ in _records(stream):
+            pass
+        return stream.tell()
+
+
+def _trajectory(found: list[PoseMessage]) -> Trajectory | None:
+    if not found:
+        return None
+    stamps, poses = np.array([m.stamp for m in found]), np.array([m.pose for m in found])
+    first = np.append(True, np.diff(stamps) > 0)
+    return Trajectory(stamps[first], poses[first])
+
+
+def _camera_log(camera: Camera, frames: list[FrameMessage], mounts: list[MountMessage]) -> CameraLog:
+    frames = sorted(frames, key=lambda frame: frame.stamp)
+    stamps = np.array([frame.stamp for frame in frames])
+    names, label = label_table([name for frame in frames for name in frame.labels])
+    detections = Detections(
+        frame_stamps=stamps,
+        frame=np.repeat(np.arange(len(frames)), [len(frame) for frame in frames]),
+        boxes=np.concatenate([np.zeros((0, 4)), *(frame.boxes for frame in frames)]),
+        label=label,
+        scores=np.concatenate([np.zeros(0), *(frame.scores for frame in frames)]),
+        depths=np.concatenate([np.zeros(0), *(frame.depths for frame in frames)]),
+        track_ids=np.concatenate([np.zeros(0, dtype=np.int64), *(frame.track_ids for frame in frames)]),
+        label_names=names,
+    )
+    return CameraLog(camera, detections, mount=Trajectory(stamps, held_mounts(camera, mounts, stamps)) if mounts else None)
+
+
+def held_mounts(camera: Camera, mounts: list[MountMessage], stamps: Floats) -> Floats:
+    """base_T_camera (F, 4, 4) at the stamps (F,): of the last mount by then, before the first that of the camera."""
+    times = np.array([m.stamp for m in mounts])
+    poses = np.array([camera.base_T_camera, *(m.pose for m in mounts)])
+    order = np.argsort(times, kind="stable")
+    which = np.append(0, order + 1)[np.searchsorted(times[order], stamps, side="right")]
+    return make_pose(poses[which, :3, :3], poses[which, :3, 3])

@@ -1,0 +1,73 @@
+"""The landmarks of a session: where they are, how well that is known, and how often they were seen where they should be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.geometry import skew
+from objslam.live.table import Table
+from objslam.types import Bools, Camera, Floats, Ints
+
+_FLOOR = 0.01  # m; landmarks are never taken to be known better than that
+_NOISE = (1.0, 3.0)  # times the noise that was promised
+_POOLED = 20.0  # rays that weigh an object's own noise as much as the promised one
+_INNER = 0.05  # share of the image along its edge where a box may be cut off
+_NEAREST = 0.3  # m; nearer things do not fit into the image
+_FURTHER = 1.1  # times the distance from which an object was seen, it should be seen from
+
+
+def new_landmarks() -> Table:
+    """No landmarks yet. id; position (3,) m; information (3, 3) m^-2 of its rays; label; drift (6, 6) gathered when it was
+    last seen, and stamps first and last; seen and expected, frames; far, m, the greatest distance it was seen from; squared,
+    the sum of squared deviations of its rays; rejected, rays that did not fit."""
+    return Table(
+        id=(np.int64, ()),
+        position=(np.float64, (3,)),
+        information=(np.float64, (3, 3)),
+        label=(np.int64, ()),
+        drift=(np.float64, (6, 6)),
+        first=(np.float64, ()),
+        last=(np.float64, ()),
+        seen=(np.int64, ()),
+        expected=(np.int64, ()),
+        far=(np.float64, ()),
+        squared=(np.float64, ()),
+        rejected=(np.int64, ()),
+    )
+
+
+def noise(known: Table, rows: Ints) -> Floats:
+    """By what factor (n,) the rays of landmarks are noisier than promised."""
+    seen = known.seen[rows]
+    return np.clip(np.sqrt((known.squared[rows] / 2 + _POOLED) / (seen + _POOLED)), *_NOISE)
+
+
+def covariances(known: Table, rows: Ints) -> Floats:
+    """Covariances (n, 3, 3), m^2, of landmarks from their rays, as if the poses were known."""
+    return np.linalg.inv(known.information[rows] + 1e-4 * np.eye(3)) + _FLOOR**2 * np.eye(3)
+
+
+def carried(to: Floats, drift: Floats, map_T_camera: Floats, camera_from_drift: Floats) -> Floats:
+    """What covariances (n, 6, 6) of the camera, or one (6, 6), make of landmarks `to` (n, 3) away: (n, 3, 3), m^2.
+
+    camera_from_drift: (6, 6) takes the covariances to the camera's frame.
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = map_T_camera[:3, :3]
+    lever = skew(to)
+    jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2) @ (turn @ camera_from_drift)
+    return np.asarray(jacobian @ drift @ np.swapaxes(jacobian, 1, 2))
+
+
+def in_view(known: Table, camera: Camera, map_T_camera: Floats) -> Bools:
+    """Which landmarks (N,) should be seen: well inside the image, and from no further than they were seen."""
+    from objslam.rays import project
+
+    local = (known.position - map_T_camera[:3, 3]) @ map_T_camera[:3, :3]
+    distance = np.linalg.norm(local, axis=1)
+    ahead = np.flatnonzero((local[:, 2] > _NEAREST) & (local[:, 2] > 0.3 * distance) & (distance < _FURTHER * known.far))
+    seen = np.zeros(len(known), dtype=bool)
+    pixels = project(camera, local[ahead])
+    size = np.array([camera.width, camera.height])
+    seen[ahead] = ((pixels > _INNER * size) & (pixels < (1 - _INNER) * size)).all(axis=1)
+    return seen

@@ -1,0 +1,164 @@
+"""The boxes of one frame to landmarks and candidates: predicted bearing, its covariance, a gate, and the best assignment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.association.assign import gate_limit
+from objslam.association.landmarks import RANGE_LOSS, Landmarks
+from objslam.association.matches import Edges, choose, gated_edges
+from objslam.association.sightings import Sightings
+from objslam.live.candidates import Candidate
+from objslam.live.known import carried, covariances, noise
+from objslam.live.meeting import sightings
+from objslam.live.table import Table
+from objslam.types import Floats, Ints
+
+_VIEW = np.cos(np.radians(40.0))  # landmarks further off every box of a frame are not looked at
+_CLEAR = 6.0  # squared deviations by which the best of several places that are all uncertain must be better
+_LOOSE = 3.0  # times the noise of a ray: a bearing that is predicted less well is uncertain
+_BY_LABEL = 4.0  # times the gate, where only one object has the label
+
+
+@dataclass(frozen=True)
+class FrameRays:
+    """The usable boxes of one frame: direction (n, 3) in the camera, sigma (n,) rad, range, range_sigma (n,) m, label, score,
+    box (n, 4) px, track (n,)."""
+
+    direction: Floats
+    sigma: Floats
+    range: Floats
+    range_sigma: Floats
+    label: Ints
+    score: Floats
+    box: Floats
+    track: Ints
+
+    def __len__(self) -> int:
+        return len(self.direction)
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How little the camera's pose is known: drift (6, 6) gathered by now, in a frame from which camera_from_drift (6, 6) goes
+    to the camera's; pose (6, 6), the covariance of the pose itself, in the camera's frame."""
+
+    drift: Floats
+    camera_from_drift: Floats
+    pose: Floats
+
+
+def match(
+    rays: FrameRays,
+    map_T_camera: Floats,
+    known: Table,
+    candidates: list[Candidate],
+    doubt: Doubt,
+    labels: int,
+    gate: float,
+    tracks: dict[int, int],
+) -> Ints:
+    """For each ray (n,) the row of its landmark, len(known) + the index of its candidate, or -1.
+
+    tracks: the landmark (id) that a detector's track was given last.
+    """
+    rows, position, spread, noises = predicted(rays, map_T_camera, known, doubt)
+    waiting = [i for i, c in enumerate(candidates) if not c.by_label and c.label in rays.label]
+    if not len(rows) and not waiting:
+        return np.full(len(rays), -1, dtype=np.int64)
+    ours = [candidates[i] for i in waiting]
+    places = np.concatenate([position, *(c.position[None] for c in ours)])
+    moved = [carried(c.position[None] - map_T_camera[:3, 3], doubt.drift - c.drift, map_T_camera, doubt.camera_from_drift)
+             for c in ours]  # fmt: skip
+    covariance = np.concatenate([spread, *(c.covariance + m for c, m in zip(ours, moved, strict=True))])
+    label = np.concatenate([known.label[rows], np.array([c.label for c in ours], dtype=np.int64)])
+    accepts = label[:, None] == np.arange(labels)
+    s = in_map(rays, map_T_camera)
+    limit = gate_limit(gate)
+    edges = gated_edges(s, Landmarks(places, covariance, np.append(noises, np.ones(len(ours))), accepts), limit)
+    edges = _clear(edges, len(rows))
+    number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
+    cost = edges.cost
+    if tracks and (rays.track >= 0).any():
+        before = np.array([tracks.get(t, -1) for t in rays.track.tolist()])
+        ids = np.append(known.id[rows], np.full(len(ours), -2))
+        cost = cost - np.where(before[edges.ray] == ids[edges.landmark], 2.0, 0.0)
+    unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
+    chosen = choose(edges, cost, np.zeros(len(rays), dtype=np.int64), unmatched)
+    return np.where(chosen >= 0, number[chosen], -1) if len(number) else chosen
+
+
+def match_by_label(rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, gate: float) -> tuple[Ints, Ints]:
+    """The same where every label is one object: the row (n,) of each ray's landmark or -1, and that of the one it misses.
+
+    Of several boxes with one label the one with the highest score counts.
+    """
+    rows, position, spread, noises = predicted(rays, map_T_camera, known, doubt, everywhere=True)
+    hit, missed = (np.full(len(rays), -1, dtype=np.int64) for _ in range(2))
+    if not len(rows):
+        return hit, missed
+    s = in_map(rays, map_T_camera)
+    accepts = known.label[rows][:, None] == np.arange(int(max(rays.label.max(), known.label.max())) + 1)
+    edges = gated_edges(s, Landmarks(position, spread, noises, accepts), _BY_LABEL * gate_limit(gate))
+    hit[edges.ray] = rows[edges.landmark]
+    for i in np.flatnonzero(hit < 0).tolist():
+        same = rows[known.label[rows] == rays.label[i]]
+        missed[i] = same[0] if len(same) else -1
+    return hit, missed
+
+
+def best_of_label(rays: FrameRays) -> Ints:
+    """Indices of the rays (m,) that have the highest score of their label."""
+    order = np.lexsort((np.arange(len(rays)), -rays.score, rays.label))
+    _, first = np.unique(rays.label[order], return_index=True)
+    return np.sort(order[first])
+
+
+def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
+    """The rays as lines in map."""
+    direction = rays.direction @ map_T_camera[:3, :3].T
+    origin = np.broadcast_to(map_T_camera[:3, 3], direction.shape)
+    return sightings(origin, direction, rays.sigma, rays.range, rays.range_sigma, rays.label)
+
+
+def predicted(
+    rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, everywhere: bool = False
+) -> tuple[Ints, Floats, Floats, Floats]:
+    """Rows (n,) of the landmarks that could be in the frame, where (n, 3), with what covariance (n, 3, 3) as seen from its
+    camera, and the noise (n,) of their rays.
+
+    The camera's own doubt is what the odometry gathered since the landmark was last seen, or that of its place in the map,
+    whichever is less.
+    """
+    to = known.position - map_T_camera[:3, 3]
+    distance = np.linalg.norm(to, axis=1)
+    wanted = np.isin(known.label, rays.label)
+    if not everywhere:
+        off = (to / np.maximum(distance, 1e-6)[:, None]) @ (rays.direction @ map_T_camera[:3, :3].T).T
+        wanted &= off.max(axis=1, initial=-1.0) > _VIEW
+    rows = np.flatnonzero(wanted)
+    to = to[rows]
+    since = carried(to, doubt.drift - known.drift[rows], map_T_camera, doubt.camera_from_drift)
+    own = covariances(known, rows)
+    if np.isfinite(doubt.pose).all():
+        placed = carried(to, doubt.pose, map_T_camera, np.eye(6))
+        less = np.trace(placed, axis1=1, axis2=2) < np.trace(since, axis1=1, axis2=2)
+        since = np.where(less[:, None, None], placed, since)
+    return rows, known.position[rows], own + since, noise(known, rows)
+
+
+def _clear(edges: Edges, landmarks: int) -> Edges:
+    """Without the matches of rays that could as well be of another landmark, where both are expected somewhere there."""
+    loose = (edges.vague > 2 * np.log(_LOOSE)) & (edges.landmark < landmarks)
+    order = np.lexsort((edges.cost, edges.ray))
+    ray, cost = edges.ray[order], edges.cost[order]
+    doubtful = np.zeros(int(edges.ray.max(initial=-1)) + 1, dtype=bool)
+    second = np.flatnonzero((np.diff(ray) == 0) & (np.diff(cost) < _CLEAR)) + 1
+    first = np.flatnonzero(np.diff(ray, prepend=-1))
+    rivals = second[np.isin(second - 1, first)]
+    both = loose[order[rivals]] & loose[order[rivals - 1]]
+    doubtful[ray[rivals[both]]] = True
+    keep = ~(doubtful[edges.ray] & loose)
+    return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])

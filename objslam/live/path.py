@@ -1,0 +1,82 @@
+"""The last stretch of the robot's path, as a stream: poses between the stamps, and the drift gathered by then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.config import Odometry
+from objslam.geometry import interpolate, inverse, is_planar
+from objslam.keyframes import step_drift
+from objslam.types import Floats
+
+_CHUNK = 512  # poses that may wait until they are worked in
+
+
+class PathBuffer:
+    """Poses of base as they come, the newest `seconds` of them; drift is summed up in the frame of the first pose."""
+
+    def __init__(self, settings: Odometry, seconds: float) -> None:
+        self._settings, self._seconds = settings, seconds
+        self._stamps: Floats = np.zeros(0)
+        self._poses: Floats = np.zeros((0, 4, 4))
+        self._drift: Floats = np.zeros((0, 6, 6))
+        self._new: list[tuple[float, Floats]] = []
+        self._from_start = np.eye(4)
+        self._planar = True
+        self.newest = -np.inf
+
+    def append(self, stamp: float, pose: Floats) -> None:
+        """One more pose (4, 4), newer than all before."""
+        if not len(self._stamps) and not self._new:
+            self._from_start = inverse(pose)
+        self._new.append((stamp, pose))
+        self.newest = stamp
+        if len(self._new) >= _CHUNK:
+            self._work_in()
+
+    @property
+    def oldest(self) -> float:
+        """The stamp of the oldest pose, inf without any."""
+        if len(self._stamps):
+            return float(self._stamps[0])
+        return self._new[0][0] if self._new else np.inf
+
+    def at(self, stamp: float, max_gap: float) -> tuple[Floats, Floats] | None:
+        """The pose (4, 4) at a stamp and the drift (6, 6) gathered by then; None outside the path or in a longer gap."""
+        self._work_in()
+        stamps = self._stamps
+        if not len(stamps) or not stamps[0] <= stamp <= stamps[-1]:
+            return None
+        after = int(np.clip(np.searchsorted(stamps, stamp), 1, max(len(stamps) - 1, 1)))
+        pair = slice(after - 1, after + 1)
+        poses, valid = interpolate(stamps[pair], self._poses[pair], np.array([stamp]), max_gap)
+        if not valid[0]:
+            return None
+        before, then = stamps[pair][0], stamps[pair][-1]
+        share = (stamp - before) / (then - before) if then > before else 0.0
+        drift = self._drift[pair]
+        return poses[0], np.asarray((1 - share) * drift[0] + share * drift[-1])
+
+    def from_start(self, pose: Floats) -> Floats:
+        """A pose (4, 4) in the frame of the first one."""
+        return np.asarray(self._from_start @ pose)
+
+    def _work_in(self) -> None:
+        if not self._new:
+            return
+        stamps = np.array([stamp for stamp, _ in self._new])
+        poses = np.array([pose for _, pose in self._new])
+        self._new.clear()
+        if len(self._stamps):
+            joined = self._from_start @ np.concatenate([self._poses[-1:], poses])
+            total = self._drift[-1]
+        else:
+            joined, total = self._from_start @ poses, np.zeros((6, 6))
+        self._planar = self._planar and is_planar(np.concatenate([np.eye(4)[None], joined]))
+        drift = total + np.cumsum(step_drift(joined, self._settings, self._planar), axis=0)
+        if not len(self._stamps):
+            drift = np.concatenate([total[None], drift])
+        kept = max(0, int(np.searchsorted(self._stamps, self.newest - self._seconds)) - 1)
+        self._stamps = np.concatenate([self._stamps[kept:], stamps])
+        self._poses = np.concatenate([self._poses[kept:], poses])
+        self._drift = np.concatenate([self._drift[kept:], drift])

@@ -1,0 +1,245 @@
+"""What a map needs now and then: duplicates merged, ghosts dropped, a second look at every ray, bounded growth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.association.extent import grouped_median
+from objslam.errors import SolveError
+from objslam.graph import factors
+from objslam.live.known import covariances, noise
+from objslam.live.meeting import meet, misses, sightings
+from objslam.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from objslam.live.mapper import Mapper
+
+_EVERY = 10  # keyframes
+_FIRST, _GROWTH = 20, 1.5  # keyframes; the graph is solved as a whole when there are so many, and each time so many times more
+_ITERATIONS = 8
+_MISS = 4.0  # standard deviations by which a ray may miss its landmark
+_WIDEST = 5.0  # times the noise that was promised
+_RAYLEIGH_MEDIAN = 1.1774
+_SAME = 11.3  # squared Mahalanobis distance below which 99 % of equal points lie (chi-squared, 3 degrees of freedom)
+_FARTHEST = 1.0  # m; objects further apart are two, however little is known of them
+_TOGETHER = 0.03  # share of frames with both that a wrong box may account for
+_GHOST, _GHOST_FRAMES = 0.1, 40  # seen in a smaller share of so many frames that should show it, it is none
+_KEPT_FREE = 500  # the newest keyframes are never left out
+_SHARE = 0.25  # of the keyframes that are left out at a time
+_FEWEST = 10  # rays that a landmark keeps
+_HALF = 0.5  # of a landmark's rays; when fewer fit, it is looked for anew
+_MANY, _SECOND = 5, 0.25  # rays, and share of them, that disagree with a label's one object if there is a second
+_DISTANT = 60.0  # s; how long something seen from afar is waited for
+_SLACK = 0.02  # m
+
+
+def after_keyframe(m: Mapper) -> None:
+    """Every few keyframes, whatever is due."""
+    if m.keyframes_so_far % _EVERY:
+        return
+    m.graph.update(relinearise=True)
+    m.known.position[:] = m.graph.points(m.known.id)
+    _forget(m)
+    if not m.by_label:
+        _merge(m)
+        _drop_ghosts(m)
+    if len(m.keyframes) > m.settings.live.max_keyframes:
+        thin(m)
+    if m.keyframes_so_far >= max(_FIRST, _GROWTH * m.polished) and len(m.known):
+        m.polished = m.keyframes_so_far
+        polish(m)
+
+
+def polish(m: Mapper) -> None:
+    """The whole graph solved by Levenberg-Marquardt, then every ray asked again whether it fits its landmark."""
+    try:
+        m.graph.solve(_ITERATIONS)
+    except SolveError:
+        m.counters.accept("solves given up")
+    if _reconsider(m):
+        m.graph.rebuild()
+    m.known.position[:] = m.graph.points(m.known.id)
+
+
+def _reconsider(m: Mapper) -> bool:
+    """Reject rays that miss their landmark by far more than its others, take back those that do not; whether any changed."""
+    rays, known = m.rays, m.known
+    m.graph.refresh()
+    known.position[:] = m.graph.points(known.id)
+    held = np.flatnonzero(rays.owner >= 0)
+    if not len(held):
+        return False
+    row = m.rows_of(rays.owner[held])
+    s = _sight(m, held)
+    off = misses(s, known.position[row])
+    support = _support(off, row, rays.used[held], len(known))
+    if m.by_label:
+        number, fits = np.bincount(row, minlength=len(known)), np.bincount(row[support], minlength=len(known))
+        if m.settings.association.method == "auto" and ((number - fits >= _MANY) & (number - fits > _SECOND * number)).any():
+            m.by_label = False
+            m.candidates = [c for c in m.candidates if not c.by_label]
+        for j in np.flatnonzero((fits < _HALF * number) & (number >= _MANY)).tolist():
+            mine = np.flatnonzero(row == j)
+            met = meet(s.take(mine), m.rng, _SLACK)
+            if met is not None and met.agree.sum() > fits[j]:
+                known.position[j] = met.position
+                m.graph.place(int(known.id[j]), met.position)
+                support[mine] = met.agree
+    out, back = held[rays.used[held] & ~support], held[~rays.used[held] & support]
+    rays.used[held] = support
+    m.graph.drop_rays(rays.number[out])
+    if len(back):
+        m.graph.add_rays(m.bearings(back))
+    return bool(len(out) or len(back))
+
+
+def _support(off: Floats, row: Ints, used: Bools, count: int) -> Bools:
+    """Which rays (R,) miss their landmark (R,) by no more than its others let expect; off: (R,) standard deviations."""
+    before = used & np.isfinite(off)
+    usual = np.nan_to_num(grouped_median(off[before], row[before], count)) / _RAYLEIGH_MEDIAN
+    return np.asarray(off <= _MISS * np.clip(usual, 1.0, _WIDEST)[row])
+
+
+def _sight(m: Mapper, at: Ints):  # type: ignore[no-untyped-def]
+    rays = m.rays
+    ids, index = np.unique(rays.keyframe[at], return_inverse=True)
+    poses = m.graph.poses(ids)[index]
+    ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], rays.direction[at])
+    return sightings(poses[:, :3, 3], ahead, rays.sigma[at], rays.range[at], rays.range_sigma[at])
+
+
+def _forget(m: Mapper) -> None:
+    """Candidates out of sight for too long."""
+    now, live = float(m.keyframes.stamp.max()), m.settings.live
+    m.candidates = [
+        c for c in m.candidates if c.by_label or now - c.last < (_DISTANT if len(c) >= live.min_rays else live.forget)
+    ]
+
+
+def _merge(m: Mapper) -> None:
+    """Landmarks of one label that are no further apart than the graph allows, and were not seen in one frame, are one."""
+    known = m.known
+    if len(known) < 2:
+        return
+    a, b = np.triu_indices(len(known), 1)
+    apart = known.position[a] - known.position[b]
+    near = (known.label[a] == known.label[b]) & (np.linalg.norm(apart, axis=1) < _FARTHEST)
+    a, b, apart = a[near], b[near], apart[near]
+    gone: set[int] = set()
+    for i, j, way in zip(a.tolist(), b.tolist(), apart, strict=True):
+        ids = int(known.id[i]), int(known.id[j])
+        fewer = min(int(known.seen[i]), int(known.seen[j]))
+        if gone & {i, j} or m.together.get(ids, 0) > _TOGETHER * fewer:
+            continue
+        if m.apart.get(ids) == fewer // 5:  # nothing new since they were found to be two
+            continue
+        spread = m.graph.difference_covariance(*ids)
+        rows = np.array([i, j])
+        spread = spread + (covariances(known, rows) * (noise(known, rows) ** 2 - 1)[:, None, None]).sum(axis=0)
+        spread += 2e-4 * np.eye(3)
+        if not np.isfinite(spread).all() or way @ np.linalg.solve(spread, way) > _SAME:
+            m.apart[ids] = fewer // 5
+            continue
+        keep, drop = (i, j) if known.seen[i] >= known.seen[j] else (j, i)
+        gone.add(drop)
+        _join(m, keep, drop)
+    if gone:
+        m.counters.accept("merged objects", len(gone))
+        _without(m, np.array(sorted(gone)))
+
+
+def _join(m: Mapper, keep: int, drop: int) -> None:
+    known, rays = m.known, m.rays
+    mine = np.flatnonzero(rays.owner == known.id[drop])
+    m.graph.drop_rays(rays.number[mine])
+    rays.owner[mine] = known.id[keep]
+    known.information[keep] += known.information[drop]
+    for name in ("squared", "seen", "expected", "rejected"):
+        getattr(known, name)[keep] += getattr(known, name)[drop]
+    known.first[keep] = min(known.first[keep], known.first[drop])
+    if known.last[drop] > known.last[keep]:
+        known.last[keep], known.drift[keep] = known.last[drop], known.drift[drop]
+    known.far[keep] = max(known.far[keep], known.far[drop])
+    m.graph.add_rays(m.bearings(mine[rays.used[mine]]))
+
+
+def _drop_ghosts(m: Mapper) -> None:
+    """Landmarks that are hardly ever seen where they should be."""
+    known = m.known
+    ghost = np.flatnonzero((known.expected >= _GHOST_FRAMES) & (known.seen < _GHOST * known.expected))
+    if len(ghost):
+        m.counters.accept("ghosts dropped", len(ghost))
+        mine = np.isin(m.rays.owner, known.id[ghost])
+        m.graph.drop_rays(m.rays.number[mine])
+        m.rays.owner[mine], m.rays.used[mine] = -1, False
+        _without(m, ghost)
+
+
+def _without(m: Mapper, rows: Ints) -> None:
+    """Landmarks whose rays have gone elsewhere, away."""
+    ids = set(m.known.id[rows].tolist())
+    m.graph.drop_landmarks(m.known.id[rows])
+    kept = np.ones(len(m.known), dtype=bool)
+    kept[rows] = False
+    m.known.keep(kept)
+    m.together = {pair: n for pair, n in m.together.items() if not ids & set(pair)}
+    m.apart = {pair: n for pair, n in m.apart.items() if not ids & set(pair)}
+    m.graph.rebuild()
+    m.known.position[:] = m.graph.points(m.known.id)
+
+
+def thin(m: Mapper) -> None:
+    """Leave out a share of the older keyframes, where they are densest, never two in a row, and sum up the odometry."""
+    k = m.keyframes
+    order = np.argsort(k.stamp, kind="stable")
+    place = k.start_T_base[order][:, :3, 3]
+    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    span = np.full(len(order), np.inf)
+    span[1:-1] = step[:-1] + step[1:]
+    span[-_KEPT_FREE:] = np.inf
+    rays_of = np.bincount(m.rays.owner[m.rays.used], minlength=int(m.known.id.max(initial=0)) + 1)
+    out = np.zeros(len(order), dtype=bool)
+    wanted = int(_SHARE * m.settings.live.max_keyframes)
+    by_keyframe = np.argsort(m.rays.keyframe, kind="stable")
+    sorted_keyframe = m.rays.keyframe[by_keyframe]
+    for i in np.argsort(span, kind="stable").tolist():
+        if not wanted or not np.isfinite(span[i]):
+            break
+        if out[i - 1] or out[i + 1]:
+            continue
+        number = k.id[order[i]]
+        mine = by_keyframe[np.searchsorted(sorted_keyframe, number) : np.searchsorted(sorted_keyframe, number, "right")]
+        owners = m.rays.owner[mine][m.rays.used[mine]]
+        if (rays_of[owners] <= _FEWEST).any():
+            continue
+        np.subtract.at(rays_of, owners, 1)
+        out[i] = True
+        wanted -= 1
+    leaving = k.id[order[out]]
+    mine = np.isin(m.rays.keyframe, leaving)
+    m.graph.drop_rays(m.rays.number[mine])
+    m.graph.drop_keyframes(leaving)
+    m.rays.keep(~mine)
+    k.keep(~np.isin(k.id, leaving))
+    for candidate in m.candidates:
+        candidate.rays = [ray for ray in candidate.rays if ray[1] not in set(leaving.tolist())]
+    m.candidates = [candidate for candidate in m.candidates if candidate.rays]
+    _chain(m)
+    m.counters.accept("keyframes left out", len(leaving))
+    m.graph.rebuild()
+    m.known.position[:] = m.graph.points(m.known.id)
+
+
+def _chain(m: Mapper) -> None:
+    """The odometry between the keyframes that are left, in the order of time."""
+    k = m.keyframes
+    order = np.argsort(k.stamp, kind="stable")
+    arrays = m.keyframe_arrays(order)
+    if arrays.odom_T_base is None:
+        return
+    motion, covariance = factors.motions(arrays, m.settings)
+    ids = k.id[order].tolist()
+    for before, after, step, spread in zip(ids[:-1], ids[1:], motion, covariance, strict=True):
+        m.graph.add_motion(before, after, step, spread)
