@@ -14,11 +14,14 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from objslam.object_map import MapObject as MapObject
+from objslam.object_map import ObjectMap as ObjectMap
+from objslam.object_map import Status as Status
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-Status = Literal["ok", "unresolved"]
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
 
@@ -263,47 +266,6 @@ class Association:
     def count(self) -> int:
         """Number of objects, N."""
         return len(self.label)
-
-
-@dataclass(frozen=True)
-class MapObject:
-    """One object of the map, as objects.json holds it.
-
-    position: (3,) m. covariance: (3, 3) m^2, None where unresolved. extent: width and height in m. A ray (origin,
-    direction) stands for an unresolved object: its best guess lies on it. labels: the share of each label among its boxes,
-    None where one label is taken for one object. existence: the probability that there is such an object, likewise.
-    """
-
-    id: int
-    label: str
-    position: Floats
-    covariance: Floats | None
-    status: Status
-    rays: int
-    frames: int
-    parallax_deg: float
-    rms_deg: float
-    first_seen: float
-    last_seen: float
-    extent: tuple[float, float] | None = None
-    ray: tuple[Floats, Floats] | None = None
-    labels: dict[str, float] | None = None
-    existence: float | None = None
-
-
-@dataclass(frozen=True)
-class ObjectMap:
-    """The objects of one map, in `frame`."""
-
-    objects: tuple[MapObject, ...]
-    frame: str = "map"
-
-    def __len__(self) -> int:
-        return len(self.objects)
-
-    def resolved(self) -> tuple[MapObject, ...]:
-        """The objects that have a position to rely on."""
-        return tuple(o for o in self.objects if o.status == "ok")
 
 
 @dataclass(frozen=True)
