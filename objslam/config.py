@@ -272,6 +272,10 @@ class Output(Section):
     """What a run writes."""
 
     recording: bool = True
+    images: Annotated[int, Field(ge=0)] = 1000
+    """of each camera go into the recording, at the most, evenly spread; 0: none."""
+    image_width: Annotated[int, Field(ge=16)] = 480
+    """px; in the recording wider images are made smaller, by a whole number."""
     picture: bool = True
 
 

@@ -72,6 +72,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         path=path,
         path_after=path_after,
         trace=solution.trace,
+        images=tuple(c.rgb for c in log.cameras),
         surface=surface,
         surface_before=before,
     )

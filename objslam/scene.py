@@ -46,14 +46,27 @@ def captions(objects: ObjectMap) -> list[str]:
 def label_colours(objects: ObjectMap) -> dict[str, tuple[float, float, float]]:
     """A colour (r, g, b in [0, 1]) for each label, all dark enough for text on white (contrast 4.5 and more)."""
     names = sorted({o.label for o in objects.objects})
-    colours = {}
-    for i, name in enumerate(names):
-        linear = np.array(colorsys.hsv_to_rgb(i / len(names), 0.85, 1.0)) ** 2.2
-        # neighbours on the wheel alternate in luminance, so that many labels stay apart
-        linear *= (0.09, 0.17)[i % 2] / float(linear @ [0.2126, 0.7152, 0.0722])
-        r, g, b = np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
-        colours[name] = (float(r), float(g), float(b))
+    return {name: _colour(i / len(names), i) for i, name in enumerate(names)}
+
+
+def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
+    """A colour for each object: that of its label for the first of them, the others from there towards the next label's."""
+    names = sorted({o.label for o in objects.objects})
+    shared, met = Counter(o.label for o in objects.objects), Counter[str]()
+    colours = []
+    for o in objects.objects:
+        i, k = names.index(o.label), met[o.label]
+        met[o.label] += 1
+        colours.append(_colour((i + 0.8 * k / shared[o.label]) / len(names), i + k))
     return colours
+
+
+def _colour(hue: float, number: int) -> tuple[float, float, float]:
+    linear = np.array(colorsys.hsv_to_rgb(hue, 0.85, 1.0)) ** 2.2
+    # neighbours on the wheel alternate in luminance, so that many colours stay apart
+    linear *= (0.09, 0.17)[number % 2] / float(linear @ [0.2126, 0.7152, 0.0722])
+    r, g, b = np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
+    return float(r), float(g), float(b)
 
 
 def ellipsoid(o: MapObject, sigmas: float = 2.0) -> tuple[Floats, Floats] | None:

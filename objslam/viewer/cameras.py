@@ -1,0 +1,196 @@
+"""Cameras: frusta that move with the robot, their images and boxes, and the map's objects as the camera should see them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.geometry import inverse, quaternion
+from objslam.rays import project
+from objslam.scene import captions, ray_kinds
+from objslam.types import Camera, Floats, Ints
+from objslam.viewer.image_labels import label_rows
+from objslam.viewer.images import choose, jpegs
+from objslam.viewer.objects import colours
+from objslam.viewer.rays import RAY_COLOURS
+from objslam.viewer.times import moments, stamp_column
+
+if TYPE_CHECKING:
+    from objslam.results import RunResult
+
+_BLOCK = 500_000  # objects in frames looked at together
+_NEAR, _BEYOND = 0.2, 1.2  # m; and of the farthest ray of an object: from further away it is not expected to be seen
+_LIGHTER = 0.35  # an object's colour is dark enough for a white page, an image asks for a lighter one
+_FRUSTUM = 0.05  # of the map's size
+
+
+def camera_path(camera: Camera) -> str:
+    """The entity of a camera."""
+    import rerun as rr
+
+    return str(rr.new_entity_path(["map", "camera", camera.name])).lstrip("/")
+
+
+def log_cameras(recording: Any, result: RunResult, size: float) -> None:
+    """`map/camera/NAME` moves; below it `image`, `boxes` in the colours of their objects (grey unexplained, red rejected),
+    and `map`, the objects where they should be in the image. size: m, of the map.
+
+    Images are scaled down as the settings say, and all pixels with them.
+    """
+    map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
+    for index, camera in enumerate(result.cameras):
+        mine = np.flatnonzero(result.keyframes.camera == index)
+        if len(mine) == 0:
+            continue
+        images = result.images[index] if index < len(result.images) else None
+        # by a whole number: quick, and no pixel is a mixture of neighbours by odd shares
+        scale = 1 / np.ceil(camera.width / result.settings.output.image_width) if images is not None else 1.0
+        path = camera_path(camera)
+        log_pinhole(recording, path, camera, scale, size)
+        stamps, poses = result.keyframes.stamps[mine], map_T_camera[mine]
+        _send_poses(recording, path, stamps, poses)
+        if images is not None:
+            shown, which = choose(images, stamps, result.settings.output.images)
+            shape = (round(camera.width * scale), round(camera.height * scale))
+            _send_images(recording, path, stamps, shown, jpegs(images, which, *shape))
+        _send_boxes(recording, path, result, mine, scale)
+        _send_objects(recording, path, result, camera, stamps, poses, scale)
+
+
+def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
+    """The frustum of a camera, with pixels scaled; static."""
+    import rerun as rr
+
+    matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
+    pinhole = rr.Pinhole(
+        image_from_camera=matrix,
+        resolution=[camera.width * scale, camera.height * scale],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_FRUSTUM * size,
+        color=RAY_COLOURS["used"],
+        line_width=-1.5,  # below 0: points on the screen, not metres
+    )
+    recording.log(path, pinhole, static=True)
+
+
+def _send_poses(recording: Any, path: str, stamps: Floats, poses: Floats) -> None:
+    import rerun as rr
+
+    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternion(poses))
+    recording.send_columns(path, [stamp_column(stamps)], columns)
+
+
+def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> None:
+    """The images of the stamps (n,) shown; the others get none, for boxes on the image of another moment would mislead."""
+    import rerun as rr
+
+    blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
+    for place, blob in zip(shown.tolist(), images, strict=True):
+        if blob is not None:
+            blobs.append(blob)
+            counts[place] = 1
+    if blobs:
+        columns = rr.EncodedImage.columns(blob=blobs).partition(counts)
+        recording.send_columns(f"{path}/image", [stamp_column(stamps)], columns)
+        recording.log(f"{path}/image", rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
+
+
+def _send_boxes(recording: Any, path: str, result: RunResult, mine: Ints, scale: float) -> None:
+    import rerun as rr
+
+    number = np.full(len(result.keyframes), -1)
+    number[mine] = np.arange(len(mine))
+    rays = np.flatnonzero(number[result.rays.keyframe] >= 0)
+    stamps, counts, order = moments(result.keyframes.stamps[mine], number[result.rays.keyframe[rays]])
+    rays = rays[order]
+    box = scale * result.rays.box[rays]
+    columns = rr.Boxes2D.columns(
+        centers=(box[:, :2] + box[:, 2:]) / 2,
+        half_sizes=(box[:, 2:] - box[:, :2]) / 2,
+        colors=box_colours(result)[rays],
+    ).partition(counts)
+    recording.send_columns(f"{path}/boxes", [stamp_column(stamps)], columns)
+    recording.log(f"{path}/boxes", rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(1.5)), static=True)
+
+
+def box_colours(result: RunResult) -> NDArray[np.uint8]:
+    """(R, 3): the colour of each box's object, grey where none explains it, red where the robust loss rejected it."""
+    palette = np.array([lighter(c) for c in colours(result.map)], dtype=np.uint8).reshape(-1, 3)
+    kinds = ray_kinds(result)
+    colour = np.zeros((len(result.rays), 3), dtype=np.uint8)
+    colour[kinds["used"]] = palette[result.association.object[kinds["used"]]]
+    for kind in ("rejected", "unexplained"):
+        colour[kinds[kind]] = RAY_COLOURS[kind]
+    return colour
+
+
+def lighter(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    """A colour to be seen on an image."""
+    r, g, b = (round(c + _LIGHTER * (255 - c)) for c in colour)
+    return r, g, b
+
+
+def _send_objects(
+    recording: Any, path: str, result: RunResult, camera: Camera, stamps: Floats, poses: Floats, scale: float
+) -> None:
+    """The resolved objects in the image at each stamp: `.../map`, and their names below them, `.../map/labels`."""
+    import rerun as rr
+
+    resolved = [i for i, o in enumerate(result.map.objects) if o.status == "ok"]
+    if not resolved:
+        return
+    positions = np.stack([result.map.objects[i].position for i in resolved])
+    frame, seen, pixels = in_view(camera, poses, positions, _farthest(result, resolved))
+    pixels *= scale
+    names = np.array(captions(result.map), dtype=object)[resolved]
+    palette = np.array([lighter(c) for c in colours(result.map)], dtype=np.uint8)[resolved]
+    at = [stamp_column(stamps)]
+    dots = rr.Points2D.columns(positions=pixels, colors=palette[seen])
+    recording.send_columns(f"{path}/map", at, dots.partition(np.bincount(frame, minlength=len(stamps))))
+    recording.log(f"{path}/map", rr.Points2D.from_fields(radii=rr.Radius.ui_points(4)), static=True)
+    widths = np.array([len(name) for name in names])
+    hung, shown = label_rows(frame, pixels, widths[seen], (scale * camera.width, scale * camera.height))
+    frame, seen, hung = frame[shown], seen[shown], hung[shown]
+    labels = rr.Points2D.columns(positions=hung, colors=palette[seen], labels=names[seen].tolist())
+    recording.send_columns(f"{path}/map/labels", at, labels.partition(np.bincount(frame, minlength=len(stamps))))
+    points = rr.Points2D.from_fields(radii=rr.Radius.ui_points(0), show_labels=True)
+    recording.log(f"{path}/map/labels", points, static=True)
+
+
+def in_view(camera: Camera, map_T_camera: Floats, points: Floats, farthest: Floats) -> tuple[Ints, Ints, Floats]:
+    """Which points (N, 3) are in the image of which pose (K, 4, 4): pose (S,), point (S,), raw pixels (S, 2), in that order.
+
+    farthest: (N,) m, from which a point counts as seen.
+    """
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]])
+    centre = camera.matrix[:2, 2]
+    # a lens model is one only near its image: points far outside would be bent back into it
+    widest = 1.3 * float(np.linalg.norm((corners - centre) / camera.focal, axis=1).max())
+    fisheye = camera.distortion_model == "equidistant"
+    found: list[tuple[Ints, Ints, Floats]] = []
+    step = max(1, _BLOCK // max(len(points), 1))
+    for begin in range(0, len(map_T_camera), step):
+        to = inverse(map_T_camera[begin : begin + step])
+        local = np.einsum("kij,nj->kni", to[:, :3, :3], points) + to[:, None, :3, 3]
+        across, ahead = np.linalg.norm(local[..., :2], axis=2), local[..., 2]
+        off = np.arctan2(across, ahead) if fisheye else across / np.maximum(ahead, _NEAR)
+        near = (ahead > _NEAR) & (off <= widest) & (np.linalg.norm(local, axis=2) <= farthest)
+        pose, point = np.nonzero(near)
+        pixels = project(camera, local[pose, point])
+        inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        found.append((pose[inside] + begin, point[inside], pixels[inside]))
+    pose, point, pixels = (np.concatenate(c) for c in zip(*found, strict=True))
+    return pose, point, pixels
+
+
+def _farthest(result: RunResult, objects: list[int]) -> Floats:
+    """(n,) m, how far away each of the objects was at the most where a ray of it was used, and a little more."""
+    used = np.flatnonzero(ray_kinds(result)["used"])
+    index = result.association.object[used]
+    every = np.stack([o.position for o in result.map.objects])
+    reach = np.zeros(len(every))
+    np.maximum.at(reach, index, np.linalg.norm(every[index] - result.origins[used], axis=1))
+    return _BEYOND * reach[objects]

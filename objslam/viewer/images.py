@@ -1,0 +1,53 @@
+"""Camera images for a recording: few, small and as JPEG, read and packed ahead in threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from objslam.detection.frames import ahead, decode_image
+from objslam.errors import LogError
+from objslam.sources.textfile import read_bytes
+from objslam.types import Floats, Images, Ints
+
+MAX_LAG = 0.05  # s between a keyframe and the image that is shown for it
+_QUALITY = 70
+_AHEAD = 8
+
+
+def choose(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
+    """Which of the stamps (N,), s, get an image, at most so many, evenly spread, and the index of each one's image."""
+    if most == 0 or len(stamps) == 0 or len(images.paths) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    after = np.clip(np.searchsorted(images.stamps, stamps), 1, max(len(images.stamps) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(images.stamps) - 1)
+    near = np.where(np.abs(images.stamps[before] - stamps) <= np.abs(images.stamps[after] - stamps), before, after)
+    there = np.flatnonzero(np.abs(images.stamps[near] - stamps) <= MAX_LAG)
+    if len(there) > most:
+        there = there[np.linspace(0, len(there) - 1, most).round().astype(np.int64)]
+    return there, near[there]
+
+
+def jpegs(images: Images, which: Ints, width: int, height: int) -> Iterator[bytes | None]:
+    """The chosen images as JPEG of this size, px, one after the other; None for one that cannot be read."""
+    return ahead(lambda i: _jpeg(images, int(i), (width, height)), which.tolist(), _AHEAD)
+
+
+def _jpeg(images: Images, index: int, size: tuple[int, int]) -> bytes | None:
+    try:
+        pixels = decode_image(read_bytes(images.paths[index]))
+    except LogError:
+        return None
+    return None if pixels is None else pack(pixels, size)
+
+
+def pack(pixels: np.ndarray, size: tuple[int, int]) -> bytes:
+    """Pixels (H, W, 3) uint8 BGR, or (H, W), as JPEG of a size (width, height)."""
+    import cv2
+
+    if (pixels.shape[1], pixels.shape[0]) != size:
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return data.tobytes()
