@@ -30,7 +30,8 @@ _KEPT_FREE = 500  # the newest keyframes are never left out
 _SHARE = 0.25  # of the keyframes that are left out at a time
 _FEWEST = 10  # rays that a landmark keeps
 _HALF = 0.5  # of a landmark's rays; when fewer fit, it is looked for anew
-_MANY, _SECOND = 5, 0.25  # rays, and share of them, that disagree with a label's one object if there is a second
+_MANY, _SECOND = 5, 0.25  # rays, and share of them, that disagree with a label's one object if there is a second,
+_VISITS = 6  # and so often it is one's turn after the other's: a drifted path, or a bad place, disagrees at one stretch
 _DISTANT = 60.0  # s; how long something seen from afar is waited for
 _SLACK = 0.02  # m
 
@@ -77,7 +78,7 @@ def _reconsider(m: Mapper) -> bool:
     support = _support(off, row, rays.used[held], len(known))
     if m.by_label:
         number, fits = np.bincount(row, minlength=len(known)), np.bincount(row[support], minlength=len(known))
-        if m.settings.association.method == "auto" and ((number - fits >= _MANY) & (number - fits > _SECOND * number)).any():
+        if m.settings.association.method == "auto" and _two_of_a_label(row, support, number, fits):
             m.by_label = False
             m.candidates = [c for c in m.candidates if not c.by_label]
         for j in np.flatnonzero((fits < _HALF * number) & (number >= _MANY)).tolist():
@@ -93,6 +94,14 @@ def _reconsider(m: Mapper) -> bool:
     if len(back):
         m.graph.add_rays(m.bearings(back))
     return bool(len(out) or len(back))
+
+
+def _two_of_a_label(row: Ints, support: Bools, number: Ints, fits: Ints) -> bool:
+    """Whether the rays (R,) in the order of time show that some label has two objects."""
+    for j in np.flatnonzero((number - fits >= _MANY) & (number - fits > _SECOND * number)).tolist():
+        if (np.diff(support[row == j].astype(np.int64)) != 0).sum() >= _VISITS:
+            return True
+    return False
 
 
 def _support(off: Floats, row: Ints, used: Bools, count: int) -> Bools:
