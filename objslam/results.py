@@ -23,6 +23,7 @@ from objslam.errors import LogError, OutputError
 from objslam.folders import no_empty_folders
 from objslam.ledger import Ledger
 from objslam.matching import lay_truth
+from objslam.motions_file import Motions, dump_motions, motions_of, read_motions
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.ply_file import write_cloud, write_mesh
 from objslam.sources.detections_file import write_detections
@@ -49,9 +50,11 @@ TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth_objects.json", "groundtruth_traje
 DETECTIONS = "detections.jsonl"
 SURFACE, SURFACE_BEFORE, CLOUD = "reconstruction.ply", "reconstruction_before.ply", "reconstruction_cloud.ply"
 EVALUATION, REPORT = "evaluation.json", "report.html"
+MOTIONS = "motions.parquet"
+EXPORTS = ("objects.csv", "objects.geojson", "objects.ply", "graph.g2o", "map.mcap")
 _OWN = (
     *(SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
-    *(SURFACE, SURFACE_BEFORE, CLOUD, EVALUATION, REPORT),
+    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT, *EXPORTS),
 )
 """Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
 _STAGING = ".objslam-staging"
@@ -159,6 +162,13 @@ def load_trajectory(out: Path) -> Trajectory:
     return trajectory
 
 
+def load_motions(out: Path) -> Motions | None:
+    """The odometry between the poses of the result in the folder `out`, None where it had none; OutputError as above."""
+    _existing(out, OBJECTS)
+    file = out / MOTIONS
+    return read_motions(file) if file.is_file() else None
+
+
 def load_truth(path: Path) -> Truth | None:
     """The ground truth in `path`, None when a folder holds none; LogError when there is no such path, or it is malformed.
 
@@ -202,6 +212,9 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
         CONFIG: lambda file: _write(file, _encode(dump_settings(result.settings))),
         SUMMARY: lambda file: _write(file, _encode(dump_json(result.summary))),
     }
+    motions = motions_of(result)
+    if motions is not None:
+        writers[MOTIONS] = lambda file: _write(file, dump_motions(motions))
     if truth is not None and truth.objects:
         true = truth.objects
         writers[TRUTH_OBJECTS] = lambda file: _write(file, _encode(dump_truth_objects(true)))
