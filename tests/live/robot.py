@@ -1,6 +1,6 @@
 """A robot on DDS for tests, in a process of its own: message types written out by hand and cyclonedds' own serialiser.
 
-python robot.py '{"domain": 60, ...}' drives for a while, then prints what it sent as JSON. `Sent` is that, as a test sees it.
+python robot.py '{"domain": 60, ...}' drives for a while, then prints the stamps of what it sent as JSON.
 """
 
 import json
@@ -35,7 +35,10 @@ def pose_at(time_s: float) -> np.ndarray:
 
 @dataclass
 class Drive:
-    """What a robot does. hz: odometry and detections a second. bad: detections whose label is no text."""
+    """What a robot does. hz: odometry and detections a second. bad: detections whose label is no text.
+
+    heard: the writers that must have a reader before it drives off.
+    """
 
     domain: int
     seconds: float
@@ -45,7 +48,7 @@ class Drive:
     bad: int = 0
     first: int = 0
     topic: str = "odom"
-    wait: float = 1.5
+    heard: tuple[str, ...] = ("odom", "tf", "info", "found")
 
 
 @dataclass
@@ -178,7 +181,7 @@ class Robot:
     def odometry(self, stamp, pose):
         zero, none = self.make("Vector3", 0.0, 0.0, 0.0), [0.0] * 36
         place = self.make("Pose", self.make("Point", *pose[:3, 3].tolist()), self.turn(pose))
-        body = self.make("PoseWithCovariance", place, [0.01] + none[1:])
+        body = self.make("PoseWithCovariance", place, [0.01, *none[1:]])
         twist = self.make("TwistWithCovariance", self.make("Twist", zero, zero), none)
         return self.make("Odometry", self.header(stamp, "odom"), "base_link", body, twist)
 
@@ -202,7 +205,9 @@ class Robot:
     def run(self) -> dict:
         drive = self.drive
         self.tf_static.write(self.transform(0.0, "base_link", "front_optical_frame", BASE_T_CAMERA))
-        time.sleep(drive.wait)
+        end = time.monotonic() + 20
+        while not all(getattr(self, name).get_matched_subscriptions() for name in drive.heard) and time.monotonic() < end:
+            time.sleep(0.02)
         now = time.time()
         self.tf.write(self.transform(now, "map", "odom", MAP_T_ODOM))
         self.info.write(self.camera_info(now))
@@ -228,9 +233,10 @@ class Robot:
             data = bytes(bad.serialize()).replace(b"cup\0", b"\xff\xfe\xff\0")
             bad.serialize = lambda *args, data=data, **kwargs: data
             self.found.write(bad)
-        time.sleep(0.5)
+        for writer in (self.odom, self.found):
+            writer.wait_for_acks(2 * 10**9)
         return stamps
 
 
 if __name__ == "__main__":
-    print(json.dumps(Robot(Drive(**json.loads(sys.argv[1]))).run()))
+    sys.stdout.write(json.dumps(Robot(Drive(**json.loads(sys.argv[1]))).run()))

@@ -64,7 +64,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
     name, encoding = connection.type, connection.encoding
     if encoding not in ("ros1", "cdr"):
         raise Undecodable(f"encoded as {encoding[:40]!r}, which is not read")
-    stores = typestores(name, encoding, connection.definition, connection.language)
+    stores = list(typestores(name, encoding, connection.definition, connection.language))
 
     def decode(data: bytes) -> Any:
         from rosbags.serde import SerdeError
@@ -85,7 +85,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 
 @lru_cache(maxsize=256)
-def typestores(name: str, encoding: str, definition: str, language: str) -> list[Typestore]:
+def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
     """What can decode a type, one for each layout; the files of a recording share them, as making them takes a while.
 
     Undecodable where there is no definition, or none that can be used.
@@ -97,7 +97,7 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> list
         known = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
         if name not in known.fielddefs:
             raise Undecodable("the bag does not bring the type's definition")
-        return [known]
+        return (known,)
     stores = []
     for text in texts:
         if len(text) > _MAX_DEFINITION:
@@ -112,7 +112,7 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> list
             reason = str(error).strip().splitlines()[0][:80] if str(error).strip() else type(error).__name__
             raise Undecodable(f"its definition cannot be used ({reason})") from error
         stores.append(store)
-    return stores
+    return tuple(stores)
 
 
 def _check(types: Typesdict) -> None:

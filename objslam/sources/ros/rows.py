@@ -47,7 +47,7 @@ class PoseRows:
 def one_pose(place: Any, turn: Any) -> Floats | None:
     """The pose (4, 4) of a position (or translation) and an orientation message, None where they are no pose."""
     xyz, xyzw = np.array([[place.x, place.y, place.z]], dtype=np.float64), np.array([[turn.x, turn.y, turn.z, turn.w]])
-    good = bool((np.abs(xyz) < _FAR).all()) and _SHORT < float(np.linalg.norm(xyzw)) < _LONG
+    good = bool((np.abs(xyz) < _FAR).all() and (np.abs(xyzw) < _LONG).all()) and float(np.linalg.norm(xyzw)) > _SHORT
     return pose_from_quaternion(xyz, xyzw)[0] if good else None
 
 

@@ -1,0 +1,133 @@
+"""A running ROS 2 robot, heard as a ROS node: where ROS 2 is installed and its setup is sourced."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from objslam.errors import ObjslamError
+from objslam.ledger import Ledger
+from objslam.live.ros_messages import RosMessages
+from objslam.live.topic_choice import TopicChoice
+from objslam.sources.ros.survey import CAMERA_INFO, COMPRESSED, IMAGE, TF
+
+_WAIT = 0.05  # s: how soon a stop is seen
+_LOOK = 0.2  # s between looks at what is published
+_HEAD_START = 1.0  # s for all publishers to be found before one of several is chosen
+_DEPTH = 1000
+_LATCHED = (*TF, CAMERA_INFO)  # types whose past messages matter as well
+
+
+@dataclass
+class _Subscription:
+    """A subscription and the QoS that it asks for: reliable, transient-local."""
+
+    entity: Any
+    kind: tuple[bool, bool]
+
+
+@dataclass
+class RclpyAdapter:
+    """Subscribes to topics by their types, as their publishers come and go, and hands the messages on.
+
+    ROS does not say which publisher a message is from, so a topic has one subscription: reliable where all its publishers
+    are, else best-effort, which hears both. ObjslamError where rclpy cannot be imported.
+    """
+
+    messages: RosMessages
+    choice: TopicChoice
+    _open: dict[str, _Subscription] = field(default_factory=dict)
+    _unknown: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        try:
+            import rclpy  # noqa: F401
+        except ImportError as error:
+            hint = "source the setup of ROS 2 in a Python that fits it; `objslam live dds` needs no ROS"
+            raise ObjslamError(f"rclpy cannot be imported ({error})", hint=hint) from error
+
+    @property
+    def ledger(self) -> Ledger:
+        """What was dropped before it could be pushed, and warnings."""
+        return self.messages.ledger
+
+    def run(self, stop: threading.Event) -> None:
+        """Hand messages on until stop is set."""
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        context = rclpy.Context()
+        rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            node = rclpy.create_node("objslam", context=context)
+            executor = SingleThreadedExecutor(context=context)
+            executor.add_node(node)
+            begin, looked = time.monotonic(), 0.0
+            while not stop.is_set():
+                executor.spin_once(timeout_sec=_WAIT)
+                now = time.monotonic()
+                if now - looked >= _LOOK:
+                    looked = now
+                    self._look_around(node, settled=now - begin >= _HEAD_START)
+                    self.messages.tick()
+            executor.shutdown()
+            node.destroy_node()
+        finally:
+            rclpy.shutdown(context=context)
+
+    def _look_around(self, node: Any, settled: bool) -> None:
+        """Subscribe to what is published and wanted, anew where the publishers' QoS asks for it."""
+        offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
+        for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
+            type_ = offered[topic]
+            profiles = [publisher.qos_profile for publisher in node.get_publishers_info_by_topic(topic)]
+            if not profiles or type_ in self._unknown:
+                continue
+            kind = _kind(profiles, type_)
+            old = self._open.get(topic)
+            if old is not None and old.kind == kind:
+                continue
+            message = self._message(type_)
+            if message is None:
+                continue
+            if old is not None:
+                node.destroy_subscription(old.entity)
+            entity = node.create_subscription(message, topic, partial(self._take, type_, topic), _profile(kind, type_))
+            self._open[topic] = _Subscription(entity, kind)
+
+    def _message(self, type_: str) -> Any:
+        from rosidl_runtime_py.utilities import get_message
+
+        try:
+            return get_message(type_)
+        except (ImportError, AttributeError, ValueError) as error:
+            self._unknown.add(type_)
+            self.ledger.warn(f"{type_} is not installed with this ROS: left out ({error})")
+            return None
+
+    def _take(self, type_: str, topic: str, message: Any) -> None:
+        self.messages.receive(type_, topic, message, time.time())
+
+
+def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
+    latched = all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles)
+    return reliable, latched and type_ in _LATCHED
+
+
+def _profile(kind: tuple[bool, bool], type_: str) -> Any:
+    from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    reliable, latched = kind
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1 if type_ in (IMAGE, COMPRESSED) else _DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

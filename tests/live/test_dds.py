@@ -1,0 +1,243 @@
+"""A robot in another process, heard over DDS on the loopback interface."""
+
+import itertools
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robot import BASE_T_CAMERA, LOOPBACK, MAP_T_ODOM, Drive, Recorder, messages, pose_at, sent, start
+
+pytest.importorskip("cyclonedds")
+sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
+from bag_writer import Maker, serialize
+
+from objslam.errors import ConfigError, ObjslamError
+from objslam.live.adapters.dds import DdsAdapter
+from objslam.live.dds_network import open_network
+from objslam.live.dds_types import dds_topic, dds_type, layouts_of, ros_topic, ros_type
+from objslam.live.ros_messages import RosMessages, RosOptions, parse_topics
+from objslam.live.topic_choice import TopicChoice
+
+_DOMAINS = itertools.count(20 + os.getpid() % 60)
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """A domain that nobody else is in."""
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    return next(_DOMAINS)
+
+
+@contextmanager
+def listening(domain, **choices):
+    """A recorder that hears a domain, and its adapter."""
+    sink = Recorder()
+    topics = parse_topics([f"{role}={name}" for role, name in choices.items()])
+    adapter = DdsAdapter(open_network(domain), RosMessages(sink, RosOptions(topics=topics)), TopicChoice(topics))
+    stop = threading.Event()
+    thread = threading.Thread(target=adapter.run, args=(stop,))
+    thread.start()
+    try:
+        yield sink, adapter
+    finally:
+        stop.set()
+        thread.join(10)
+    assert not thread.is_alive()
+
+
+def wait_for(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.02)
+    return condition()
+
+
+def stamps(rows):
+    return [round(row[0], 6) for row in rows]
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_all_of_a_robot_arrives(domain, reliable):
+    with listening(domain) as (sink, adapter):
+        robot = start(Drive(domain, seconds=2.0, reliable=reliable, bad=2))
+        said = sent(robot)
+        assert wait_for(lambda: len(sink.odometry) == len(said["odometry"]) and adapter.ledger.dropped)
+    assert stamps(sink.odometry) == [round(stamp, 6) for stamp in said["odometry"]]
+    assert stamps(sink.detections) == [round(stamp, 6) for stamp in said["detections"]]
+    np.testing.assert_allclose(
+        [row[1] for row in sink.odometry], [pose_at(k / 200) for k in range(len(sink.odometry))], atol=1e-9
+    )
+    assert sink.odometry[0][2][0, 0] == 0.01
+    (camera,) = sink.cameras
+    np.testing.assert_allclose(camera.base_T_camera, BASE_T_CAMERA, atol=1e-9)  # sent before anyone listened
+    assert (camera.name, camera.width, camera.height, camera.focal) == ("front", 640, 480, 500)
+    _, name, boxes, labels, scores, tracks, _ = sink.detections[0]
+    assert (name, labels, tracks) == ("front", [f"cup{i}" for i in range(5)], list(range(5)))
+    np.testing.assert_allclose(boxes, [[80 + 90 * i, 170, 120 + 90 * i, 230] for i in range(5)])
+    np.testing.assert_allclose(scores, 0.9)
+    ((stamp, pose, _),) = sink.localization
+    at = stamps(sink.odometry).index(round(stamp, 6))
+    np.testing.assert_allclose(pose, MAP_T_ODOM @ sink.odometry[at][1], atol=1e-9)
+    assert adapter.ledger.dropped == {"message that cannot be decoded": 2}
+
+
+def test_a_robot_that_is_killed_and_starts_again_is_heard_again(domain):
+    with listening(domain) as (sink, _):
+        robot = start(Drive(domain, seconds=60.0))
+        assert wait_for(lambda: len(sink.detections) > 5)
+        robot.kill()
+        robot.communicate()
+        before = len(sink.odometry)
+        said = sent(start(Drive(domain, seconds=1.0, first=before)))
+        assert wait_for(lambda: len(sink.odometry) >= before + len(said["odometry"]))
+    assert stamps(sink.odometry)[before:] == [round(stamp, 6) for stamp in said["odometry"]]
+    assert stamps(sink.detections)[-len(said["detections"]) :] == [round(stamp, 6) for stamp in said["detections"]]
+
+
+def test_reliable_and_best_effort_publishers_of_one_topic_are_each_heard_once(domain):
+    with listening(domain, odometry="/odom", detections="none") as (sink, _):
+        drives = [Drive(domain, seconds=1.0, reliable=reliable, heard=("odom",)) for reliable in (True, False)]
+        robots = [start(drive) for drive in drives]
+        said = [sent(robot)["odometry"] for robot in robots]
+        assert wait_for(lambda: len(sink.odometry) >= sum(map(len, said)))
+        time.sleep(0.2)
+    assert sorted(stamps(sink.odometry)) == sorted(round(stamp, 6) for stamp in said[0] + said[1])
+
+
+def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+
+    network = open_network(domain)
+    found = BuiltinDataReader(network.participant, BuiltinTopicDcpsPublication)
+    with listening(domain) as (sink, adapter):
+        robot = start(Drive(domain, seconds=3.0, reliable=False))
+        assert wait_for(lambda: len(sink.odometry) > 20)
+        (writer,) = [sample.key.bytes for sample in found.take(100) if sample.topic_name == "rt/odom"]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+            for number, payload in ((100_000, b"\0\1\0\0garbage!"), (100_001, b"\0\1\0\0" + b"\xff" * 64)):
+                for index in range(8):
+                    port = 7400 + 250 * domain + 11 + 2 * index
+                    wire.sendto(rtps_data(writer, number, payload), ("127.0.0.1", port))
+        reason = "malformed payload (DDS)"
+        assert wait_for(lambda: adapter.ledger.dropped.get(reason, 0) >= 2)
+        count = len(sink.detections)
+        assert wait_for(lambda: len(sink.detections) > count)
+        sent(robot)
+    assert adapter.ledger.examples[reason][0] == "/odom"
+
+
+def rtps_data(writer: bytes, number: int, payload: bytes) -> bytes:
+    """A packet with one DATA submessage, little-endian, after the RTPS specification, 9.4.5.3."""
+    body = struct.pack("<HH", 0, 16) + bytes(4) + writer[12:] + struct.pack("<iI", 0, number) + payload
+    return b"RTPS\x02\x01\x01\x10" + writer[:12] + struct.pack("<BBH", 0x15, 0x05, len(body)) + body
+
+
+def test_an_older_layout_of_vision_msgs_is_read(domain):
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    newer, older = layouts_of("vision_msgs/msg/Detection2DArray")
+    assert newer.__idl__.get_type_id() == messages()["Detection2DArray"].__idl__.get_type_id()
+    maker = Maker("2")
+    with listening(domain, odometry="/odom", detections="/old") as (sink, adapter):
+        robot = start(Drive(domain, seconds=1.0, heard=("odom", "tf", "info")))
+        participant = DomainParticipant(domain)
+        writer = DataWriter(participant, Topic(participant, "rt/old", older))
+        assert wait_for(lambda: len(sink.odometry) > 10 and writer.get_matched_subscriptions())
+        box = [(1, 2, 30, 40, "mug", 0.5, "4")]
+        message = maker.detections(round(time.time() * 1e9), box, "front_optical_frame")
+        writer.write(older(serialize(maker, message)))
+        assert wait_for(lambda: sink.detections), adapter.ledger.lines()
+        sent(robot)
+    ((_, _, boxes, labels, scores, tracks, _),) = sink.detections
+    np.testing.assert_allclose(boxes, [box[0][:4]])
+    assert (labels, scores.tolist(), tracks) == (["mug"], [0.5], [4])
+
+
+def test_the_types_are_those_that_others_use():
+    from cyclonedds.idl import IdlStruct
+
+    written = messages()
+    for name, type_ in (
+        ("Odometry", "nav_msgs/msg/Odometry"),
+        ("TFMessage", "tf2_msgs/msg/TFMessage"),
+        ("CameraInfo", "sensor_msgs/msg/CameraInfo"),
+        ("Detection2DArray", "vision_msgs/msg/Detection2DArray"),
+    ):
+        ids = [layout.__idl__.get_type_id() for layout in layouts_of(type_)]
+        assert issubclass(layouts_of(type_)[0], IdlStruct)
+        assert written[name].__idl__.get_type_id() in ids
+    assert layouts_of("unknown_msgs/msg/Thing") == ()
+
+
+def test_names_go_there_and_back():
+    assert dds_topic("/a/odom") == "rt/a/odom"
+    assert ros_topic("rt/a/odom") == "/a/odom"
+    assert ros_topic("rq/service") is None
+    assert dds_type("nav_msgs/msg/Odometry") == "nav_msgs::msg::dds_::Odometry_"
+    assert ros_type("nav_msgs::msg::dds_::Odometry_") == "nav_msgs/msg/Odometry"
+    assert ros_type("Plain") is None
+
+
+def test_nothing_listens_beyond_the_loopback_interface(domain):
+    before = set(_datagram_sockets())
+    open_network(domain)
+    opened = set(_datagram_sockets()) - before
+    assert len(opened) >= 2
+    for number in opened:
+        with socket.socket(fileno=os.dup(number)) as own:
+            host = own.getsockname()[0]
+            device = own.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
+            assert host == "127.0.0.1" or device.rstrip(b"\0") == b"lo", (host, device)
+
+
+def _datagram_sockets():
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            if str(entry.readlink()).startswith("socket:"):
+                with socket.socket(fileno=os.dup(int(entry.name))) as own:
+                    if own.type == socket.SOCK_DGRAM and own.family == socket.AF_INET:
+                        yield int(entry.name)
+        except OSError:
+            continue
+
+
+def test_settings_of_the_user_are_kept(domain, monkeypatch):
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    network = open_network()
+    assert (network.domain, network.where) == (domain, "CYCLONEDDS_URI")
+    assert open_network() is network
+    with pytest.raises(ConfigError, match="open on CYCLONEDDS_URI already"):
+        open_network(domain, "auto")
+
+
+@pytest.mark.parametrize("given", [-1, 233])
+def test_a_domain_that_cannot_be_is_wrong_use(given):
+    with pytest.raises(ConfigError, match="no DDS domain"):
+        open_network(given)
+
+
+@pytest.mark.parametrize("interface", ['lo"/><x', "a b", ""])
+def test_an_interface_that_cannot_be_is_wrong_use(domain, interface):
+    with pytest.raises(ConfigError, match="no network interface"):
+        open_network(domain, interface)
+
+
+def test_an_interface_that_is_not_there(domain):
+    with pytest.raises(ObjslamError, match="cannot be joined on the interface nosuch0"):
+        open_network(domain, "nosuch0")
+
+
+def test_without_cyclonedds_one_line_says_so(domain, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    with pytest.raises(ObjslamError, match=r"not installed \(pip install"):
+        open_network(domain)
