@@ -27,7 +27,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Bars, ticks below them (place, text), the rays in the highest bar, and those beyond the axis, which the last bar takes."""
+    """Bars, ticks below them (place, text), the rays in the highest bar, and those beyond the axis (in the last bar)."""
 
     bars: tuple[Bar, ...]
     ticks: tuple[tuple[float, str], ...]

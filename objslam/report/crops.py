@@ -12,17 +12,16 @@ import numpy as np
 from objslam.detection.frames import decode_image
 from objslam.errors import ObjslamError
 from objslam.ledger import Ledger
-from objslam.report.rays_table import RaysTable
+from objslam.rays_file import RaysTable
 from objslam.scene import REJECTED_BELOW
 from objslam.sources import SourceOptions, read
 from objslam.sources.box_depths import MAX_LAG, nearest
 from objslam.sources.textfile import read_bytes
 from objslam.types import Floats, Images, Ints
 
-_SIDE = 144  # px, the height of a picture in the page
-_WIDEST = 2.2  # times that
-_AROUND = 0.25  # of the box's size is shown beside it
-_LEAST = 24  # px around small boxes
+_SIDE = 160  # px, of a picture in the page
+_AROUND = 0.2  # of the box's longer side is shown on either side of it
+_LEAST = 40  # px of the image at least
 _FRAME = (60, 190, 255)  # BGR
 
 
@@ -38,8 +37,13 @@ class Crop:
     camera: str
 
 
-def images_of(log: Path | None) -> tuple[dict[str, Images], str | None]:
-    """The images of a log by camera, and if there are none, why in words. Only images inside the log are listed."""
+def images_of(log: Path | None, count: int | None) -> tuple[dict[str, Images], str | None]:
+    """The images of a log by camera, and if there are none, why in words. Only images inside the log are listed.
+
+    count: how many there were when it was mapped, None if nobody knows.
+    """
+    if count == 0:
+        return {}, "The log has no images."
     if log is None:
         return {}, "The result does not say which log it is from."
     if not log.exists():
@@ -55,7 +59,7 @@ def images_of(log: Path | None) -> tuple[dict[str, Images], str | None]:
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
     """Of an object's rays (M,), indices in the order of time, the best in each of `count` parts of them (at most count,)."""
     kept = mine[rays.weight[mine] >= REJECTED_BELOW]
-    parts = np.array_split(kept, min(count, len(kept))) if len(kept) else []
+    parts = np.array_split(kept, min(count, len(kept))) if count and len(kept) else []
     size = np.sqrt(np.prod(rays.box[:, 2:] - rays.box[:, :2], axis=1))
     return np.array([part[np.lexsort((size[part], rays.score[part]))[-1]] for part in parts], dtype=np.int64)
 
@@ -92,23 +96,20 @@ def _file(rays: RaysTable, ray: int, images: dict[str, Images]) -> Path | None:
 
 
 def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
-    """A box with what is around it, framed, as JPEG with its width and height; None for a box outside the image."""
+    """A square around a box, with the box in it, as JPEG with its width and height; None for a box outside the image."""
     import cv2
 
     height, width = image.shape[:2]
-    size = box[2:] - box[:2]
-    margin = np.maximum(_AROUND * size, (_LEAST - size) / 2)
-    # no wider than the page has room for, no narrower than half as wide as high
-    margin[0] = max(margin[0], (0.5 * (size[1] + 2 * margin[1]) - size[0]) / 2)
-    margin[1] = max(margin[1], ((size[0] + 2 * margin[0]) / _WIDEST - size[1]) / 2)
-    low = np.clip(np.floor(box[:2] - margin), 0, [width, height]).astype(int)
-    high = np.clip(np.ceil(box[2:] + margin), 0, [width, height]).astype(int)
+    middle, longer = (box[:2] + box[2:]) / 2, float((box[2:] - box[:2]).max())
+    half = max((0.5 + _AROUND) * longer, _LEAST / 2)
+    low = np.clip(np.floor(middle - half), 0, [width, height]).astype(int)
+    high = np.clip(np.ceil(middle + half), 0, [width, height]).astype(int)
     if (high - low < 2).any():
         return None
     part = image[low[1] : high[1], low[0] : high[0]]
-    scale = _SIDE / part.shape[0]
-    shape = (min(max(round(part.shape[1] * scale), 1), 4 * _SIDE), _SIDE)
+    scale = _SIDE / max(part.shape[:2])
+    shape = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
     part = cv2.resize(part, shape, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    corners = np.rint((box.reshape(2, 2) - low) * [shape[0] / (high[0] - low[0]), scale]).astype(int)
+    corners = np.rint((box.reshape(2, 2) - low) * scale).astype(int)
     cv2.rectangle(part, corners[0].tolist(), corners[1].tolist(), _FRAME, 1, cv2.LINE_AA)
     return cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes(), shape[0], shape[1]

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
-from objslam.errors import OutputError
+from objslam.errors import ConfigError, OutputError
 from objslam.evaluation import Evaluation, evaluate
 from objslam.matching import lay_truth
+from objslam.rays_file import RaysTable, read_rays
 from objslam.report.charts import Histogram, axis_end, histogram
 from objslam.report.crops import Crop, best_rays, cut_crops, images_of
-from objslam.report.rays_table import RaysTable, read_rays
 from objslam.results import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY, load_map, load_trajectory, load_truth, write_file
 from objslam.scene import REJECTED_BELOW, captions, label_colours
 from objslam.types import MapObject, ObjectMap
@@ -79,11 +80,11 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
 
     progress("reading the result", 0, 0)
     objects, rays, summary = load_map(out), read_rays(out), _json(out / SUMMARY)
-    settings = load_settings(out / CONFIG)
+    settings = _settings(out / CONFIG)
     errors, scores = _evaluation(out, objects)
     mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
     chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
-    images, no_images = images_of(log or _log_path(summary)) if crops else ({}, None)
+    images, no_images = images_of(log or _log_path(summary), summary.get("images")) if crops else ({}, None)
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     begin = float(rays.stamp.min()) if len(rays) else 0.0
@@ -170,7 +171,7 @@ def _card(
 
 
 def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """The errors of the matched objects by id, and what evaluation.json holds; from the truth, if there is one but no such file.
+    """The errors of the matched objects by id, and what evaluation.json holds (without it, the truth will do).
 
     Then, a map that lies in a frame of its own is first laid onto the truth.
     """
@@ -199,6 +200,13 @@ def _json(file: Path) -> dict[str, Any]:
     return data
 
 
+def _settings(file: Path) -> Settings:
+    try:
+        return load_settings(file)
+    except ConfigError as error:
+        raise OutputError(error.message.splitlines()[0], where=error.where) from error
+
+
 def _log_path(summary: dict[str, Any]) -> Path | None:
     path = summary.get("log_path")
     return Path(path) if isinstance(path, str) else None
@@ -209,10 +217,11 @@ def _dropped(summary: dict[str, Any]) -> list[tuple[str, int, str]]:
     return [(why, count, ", ".join(examples.get(why, []))) for why, count in summary.get("dropped", {}).items()]
 
 
-def _changed(settings: Settings) -> list[tuple[str, Any, Any]]:
+def _changed(settings: Settings) -> list[tuple[str, str, str]]:
     """Settings that are not at their default: name, value, default."""
     now, default = _flat(settings.model_dump(mode="json")), _flat(Settings().model_dump(mode="json"))
-    return [(key, value, default[key]) for key, value in now.items() if value != default.get(key)]
+    shown = partial(json.dumps, ensure_ascii=False)
+    return [(key, shown(value), shown(default.get(key))) for key, value in now.items() if value != default.get(key)]
 
 
 def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
