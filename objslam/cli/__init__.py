@@ -15,6 +15,7 @@ from objslam.cli.evaluate import evaluate_result
 from objslam.cli.info import info
 from objslam.cli.report import report_result
 from objslam.cli.run import run
+from objslam.cli.view import view
 from objslam.errors import ObjslamError
 
 app = typer.Typer(
@@ -27,6 +28,7 @@ app = typer.Typer(
 app.command()(run)
 app.command(name="eval")(evaluate_result)
 app.command(name="report")(report_result)
+app.command()(view)
 app.command()(demo)
 app.command()(convert)
 app.command()(info)

@@ -32,8 +32,8 @@ def blueprint(eye: Eye, cameras: list[tuple[str, str]], *, solver: bool = True, 
     )
 
 
-def map_view(eye: Eye, name: str = "map") -> Any:
-    """The 3D view of the map from this eye."""
+def map_view(eye: Eye, name: str = "map", hidden: tuple[str, ...] = HIDDEN) -> Any:
+    """The 3D view of the map from this eye; hidden: entities not shown at first."""
     import rerun.blueprint as rrb
 
     controls = rrb.EyeControls3D(position=eye.position, look_target=eye.target, eye_up=[0, 0, 1])
@@ -42,7 +42,7 @@ def map_view(eye: Eye, name: str = "map") -> Any:
         name=name,
         background=[250, 250, 250],
         eye_controls=controls,
-        overrides={path: rrb.EntityBehavior(visible=False) for path in HIDDEN},
+        overrides={path: rrb.EntityBehavior(visible=False) for path in hidden},
     )
 
 

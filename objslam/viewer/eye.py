@@ -43,10 +43,7 @@ def first_eye(objects: ObjectMap, path: Floats) -> Eye:
     inside, low, high = frame_objects(positions, path)
     points = np.concatenate([positions[inside], path[((path >= low) & (path <= high)).all(axis=1)], [low, high]])
     centre = (low + high) / 2
-    back = _FROM / np.linalg.norm(_FROM)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(back, right), -back])
+    axes = _axes(_FROM)
     tangent = _MARGIN * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
     for _ in range(4):  # the middle of what is seen is not that of the box: perspective makes the near half larger
         x, y, ahead = ((points - centre) @ axes.T).T
@@ -54,7 +51,20 @@ def first_eye(objects: ObjectMap, path: Floats) -> Eye:
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
         shift = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance
         centre = centre + shift @ axes[:2]
-    return Eye(centre + distance * back, centre, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
+    return look_at(centre, _FROM, distance)
+
+
+def look_at(target: Floats, back: Floats, distance: float) -> Eye:
+    """An eye that looks at a target (3,) from a direction (3,) and a distance, m."""
+    axes = _axes(back)
+    return Eye(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
+
+
+def _axes(back: Floats) -> Floats:
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), -back])
 
 
 def label_places(eye: Eye, anchors: Floats, texts: list[str], avoid: Floats) -> tuple[Floats, Floats]:

@@ -6,14 +6,15 @@ import os
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from objslam.errors import OutputError
+from objslam.results import RECORDING
 from objslam.viewer.times import STAMP
 
 if TYPE_CHECKING:
@@ -36,6 +37,14 @@ def program() -> Path:
             "rerun's viewer is not installed", where=str(found), hint="pip install --force-reinstall rerun-sdk"
         )
     return found
+
+
+def find_recording(out: Path) -> Path:
+    """The recording of a result folder, or the file itself; OutputError where there is none."""
+    file = out if out.is_file() else out / RECORDING
+    if not file.is_file():
+        raise OutputError("no recording here", where=str(out), hint="run with output.recording=true, and name its result")
+    return file
 
 
 def free_port() -> int:
@@ -66,7 +75,7 @@ def show(files: list[Path]) -> None:
         raise _failure(viewer.returncode, said, "use --web, or --screenshot FILE.png")
 
 
-def serve(files: list[Path], say: Any, *, browser: bool = True) -> None:
+def serve(files: list[Path], say: Callable[[str], None]) -> None:
     """Serve recordings to a browser on this machine until interrupted; say(text) gets the address."""
     web, data = free_port(), free_port()
     viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))

@@ -34,7 +34,7 @@ class Recording:
 
     def paths(self) -> set[str]:
         """The entities that are not the blueprint's."""
-        roots = ("/map", "/log", "/plots", "/summary")
+        roots = ("/map", "/log", "/plots", "/summary", "/field")
         return {path for path, _ in self.columns if path.startswith(roots)}
 
 
