@@ -12,7 +12,9 @@ from objslam.cli.console import say
 from objslam.cli.convert import convert
 from objslam.cli.demo import demo
 from objslam.cli.evaluate import evaluate_result
+from objslam.cli.export import export
 from objslam.cli.info import info
+from objslam.cli.live import live
 from objslam.cli.report import report_result
 from objslam.cli.run import run
 from objslam.cli.view import view
@@ -26,12 +28,14 @@ app = typer.Typer(
     help="A robot's log becomes a map of objects in 3D: poses and detector boxes in, positions with covariances out.",
 )
 app.command()(run)
+app.command()(live)
 app.command(name="eval")(evaluate_result)
 app.command(name="report")(report_result)
 app.command()(view)
 app.command()(demo)
 app.command()(convert)
 app.command()(info)
+app.command()(export)
 config_app = typer.Typer(no_args_is_help=True, help="Look at the settings.")
 config_app.command("dump")(config_dump)
 app.add_typer(config_app, name="config")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 _SURE = 5
-"""So many poses in a row that are all older than what came before, each newer than the last, are a clock that was set back."""
+"""So many poses in a row, all older than what came before, each newer than the last, are a clock that was set back."""
 _BACK = 0.5  # s; what is less far back is late, not from another clock
 _KEPT = 8  # clocks set back that stamps may still belong to
 _MISSED = 0.005  # s; what a step of the path may have taken that the clock's jump hides

@@ -12,14 +12,30 @@ from objslam.ledger import Ledger
 _WINDOW = 2000  # updates that the percentiles are of
 
 
+class _Guarded(Ledger):
+    """A ledger that several threads may write."""
+
+    def __init__(self, lock: threading.RLock) -> None:
+        super().__init__()
+        self._lock = lock
+
+    def drop(self, reason: str, count: int = 1, where: str | None = None) -> None:
+        with self._lock:
+            super().drop(reason, count, where)
+
+    def warn(self, message: str) -> None:
+        with self._lock:
+            super().warn(message)
+
+
 class Counters:
     """Counts from any thread; `ledger` holds the drops with the first few places, as everywhere."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._accepted: Counter[str] = Counter()
         self._seconds: deque[float] = deque(maxlen=_WINDOW)
-        self.ledger = Ledger()
+        self.ledger: Ledger = _Guarded(self._lock)
 
     def accept(self, kind: str, count: int = 1) -> None:
         """One more message, or event, of a kind."""
@@ -28,8 +44,7 @@ class Counters:
 
     def drop(self, reason: str, where: str | None = None, count: int = 1) -> None:
         """One more message dropped for a reason."""
-        with self._lock:
-            self.ledger.drop(reason, count, where)
+        self.ledger.drop(reason, count, where)
 
     def updated(self, seconds: float) -> None:
         """A frame is in the map so many seconds after it was pushed."""

@@ -35,7 +35,7 @@ _AHEAD = 60.0  # s; and at all
 class Intake:
     """A `Sink` that hands on what is sound, in session time: stamps of the path increase, odometry is continuous.
 
-    deliver(message, arrival) is called with one message at a time, from the thread that pushed, and says whether it was taken.
+    deliver(message, arrival) is called with one message at a time, by the thread that pushed; it says whether it was taken.
     """
 
     def __init__(
@@ -123,6 +123,11 @@ class Intake:
             self._counters.accept("boxes", len(frame))
             self._remember(camera, at)
             return True
+
+    @property
+    def newest(self) -> float:
+        """The newest stamp of the path, s; -inf without any."""
+        return self._clock.newest
 
     def recall(self, message: Message) -> None:
         """Take note of a message that a journal holds, so that what is pushed next goes on from it."""
@@ -221,8 +226,9 @@ class Intake:
         names = np.array([isinstance(n, str) and bool(n.strip()) and n.isprintable() for n in labels], dtype=bool)
         with np.errstate(invalid="ignore"):
             area = (corners[:, 2] > corners[:, 0]) & (corners[:, 3] > corners[:, 1])
+        finite = np.asarray(np.isfinite(corners).all(axis=1))
         checks: tuple[tuple[Bools, str], ...] = (
-            (np.isfinite(corners).all(axis=1), "box with a corner that is not finite"),
+            (finite, "box with a corner that is not finite"),
             (area, "box without area (x2 <= x1 or y2 <= y1)"),
             ((score >= 0) & (score <= 1), "box with a score outside 0 to 1"),
             (names, "box with a label that is empty or not printable"),
@@ -235,7 +241,7 @@ class Intake:
             depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan)
         kept = np.flatnonzero(good)
         return FrameMessage(
-            stamp, camera, corners[kept], tuple(labels[i] for i in kept), score[kept], depth[kept], track[kept]
+            stamp, camera, corners[kept], tuple(labels[i] for i in kept.tolist()), score[kept], depth[kept], track[kept]
         )
 
     def _remember(self, camera: str, at: float) -> None:

@@ -32,7 +32,10 @@ _SYNC_EVERY = 1.0  # s
 
 
 class Journal:
-    """A journal that is written to, by one process at a time; OutputError where the disk refuses."""
+    """A journal that is written to, by one process at a time; OutputError where the disk refuses.
+
+    torn: bytes of a record that was cut off, which opening it again took away.
+    """
 
     def __init__(self, file: Path, resume: bool = False) -> None:
         """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use."""
@@ -48,6 +51,7 @@ class Journal:
             os.close(self._stream)
             raise OutputError("another session writes this journal", where=str(file)) from error
         end = _sound_end(file) if resume else 0
+        self.torn = file.stat().st_size - end if resume else 0
         os.ftruncate(self._stream, end)
         os.lseek(self._stream, 0, os.SEEK_END)
         self._end = end

@@ -54,7 +54,7 @@ class Mapper:
         seconds = settings.live.max_late + _KEPT
         self.odometry = PathBuffer(settings.odometry, seconds)
         self.localization = PathBuffer(settings.odometry, seconds)
-        self.polished = 0
+        self.polished = self.frames = 0
         self.tracks: dict[int, int] = {}
         self._label_number: dict[str, int] = {}
         self._mounts: dict[str, tuple[list[float], list[Floats]]] = {}
@@ -99,7 +99,7 @@ class Mapper:
             self._count += 1
             bisect.insort(self.waiting, (message.stamp, self._count, message, arrival))
             while len(self.waiting) > self.settings.live.max_frames_waiting:
-                self._drop(self.waiting.pop(0)[2], "frames that waited for the path in vain")
+                self.leave_out(self.waiting.pop(0)[2], "frames that waited for the path in vain")
 
     def ready(self) -> tuple[FrameMessage, float] | None:
         """The next frame whose place on the path is known, and when it arrived."""
@@ -115,9 +115,10 @@ class Mapper:
         found = self._lead().at(frame.stamp, max_gap)
         camera = self._camera_number[frame.camera]
         if found is None:
-            self._drop(frame, "frames off the path, or in a gap of it")
+            self.leave_out(frame, "frames off the path, or in a gap of it")
             return False
         map_T_base, drift = found
+        self.frames += 1
         start_T_base = self._lead().from_start(map_T_base)
         base_T_camera = self._mount(frame)
         number = self._frame_number.get(camera, 0)
@@ -134,7 +135,7 @@ class Mapper:
             return False
         before = self._before(frame.stamp)
         if before is None and len(self.keyframes):
-            self._drop(frame, "frames older than the map")
+            self.leave_out(frame, "frames older than the map")
             return False
         k = self._next_keyframe
         row = {
@@ -167,12 +168,16 @@ class Mapper:
         self._unlocalized.append(k)
         self._localize()
         self._associate(rays, k, camera, guess, doubt, frame.stamp)
-        upkeep.after_keyframe(self)
         return True
 
-    def take_in(self, frame: FrameMessage, reason: str) -> None:
-        """Count a frame that is not to be looked at."""
-        self._drop(frame, reason)
+    def look_after(self) -> None:
+        """What is due now and then, after a frame that became a keyframe."""
+        upkeep.after_keyframe(self)
+
+    def leave_out(self, frame: FrameMessage, reason: str) -> None:
+        """Count a frame that is not to be looked at, and its boxes."""
+        self.counters.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
+        self.counters.drop(reason.replace("frames", "boxes", 1), count=len(frame))
 
     def _associate(self, rays: FrameRays, k: int, camera: int, guess: Floats, doubt: Doubt, stamp: float) -> None:
         known, count = self.known, len(rays)
@@ -222,9 +227,7 @@ class Mapper:
         self.graph.update()
         self._seen(rays, matched, rows, k, camera, doubt, stamp)
 
-    def _seen(
-        self, rays: FrameRays, matched: Ints, rows: Ints, k: int, camera: int, doubt: Doubt, stamp: float
-    ) -> None:
+    def _seen(self, rays: FrameRays, matched: Ints, rows: Ints, k: int, camera: int, doubt: Doubt, stamp: float) -> None:
         """What the landmarks of a frame learn from it."""
         known = self.known
         pose = self.graph.pose(k)
@@ -347,9 +350,7 @@ class Mapper:
         """The rows of landmarks by their ids, which must be there."""
         return np.searchsorted(self.known.id, ids)
 
-    def _predict(
-        self, before: int | None, row: dict[str, object]
-    ) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
+    def _predict(self, before: int | None, row: dict[str, object]) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
         """The first guess (4, 4) of a keyframe's camera, the covariance (6, 6) of that, and its motion by odometry."""
         if before is None or self._localized_only():
             noise = self.settings.localization
@@ -452,9 +453,7 @@ class Mapper:
         live = self.settings.live
         step = inverse(last) @ start_T_camera
         turned = np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0))
-        return bool(
-            np.linalg.norm(step[:3, 3]) >= live.keyframe_distance or turned >= np.radians(live.keyframe_angle_deg)
-        )
+        return bool(np.linalg.norm(step[:3, 3]) >= live.keyframe_distance or turned >= np.radians(live.keyframe_angle_deg))
 
     def _mount(self, frame: FrameMessage) -> Floats:
         stamps, poses = self._mounts.get(frame.camera, ([], []))
@@ -491,10 +490,6 @@ class Mapper:
             box=boxes.boxes,
             track=boxes.track_ids,
         )
-
-    def _drop(self, frame: FrameMessage, reason: str) -> None:
-        self.counters.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
-        self.counters.drop(reason.replace("frames", "boxes", 1), count=len(frame))
 
 
 def take(rays: FrameRays, which: Ints) -> FrameRays:

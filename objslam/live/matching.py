@@ -24,8 +24,8 @@ _BY_LABEL = 4.0  # times the gate, where only one object has the label
 
 @dataclass(frozen=True)
 class FrameRays:
-    """The usable boxes of one frame: direction (n, 3) in the camera, sigma (n,) rad, range, range_sigma (n,) m, label, score,
-    box (n, 4) px, track (n,)."""
+    """The usable boxes of one frame: direction (n, 3) in the camera, sigma (n,) rad, range and range_sigma (n,) m, label and
+    score (n,), box (n, 4) px, track (n,)."""
 
     direction: Floats
     sigma: Floats
@@ -42,8 +42,8 @@ class FrameRays:
 
 @dataclass(frozen=True)
 class Doubt:
-    """How little the camera's pose is known: drift (6, 6) gathered by now, in a frame from which camera_from_drift (6, 6) goes
-    to the camera's; pose (6, 6), the covariance of the pose itself, in the camera's frame."""
+    """How little the camera's pose is known: drift (6, 6) gathered by now, which camera_from_drift (6, 6) takes to the
+    camera's frame; pose (6, 6), the covariance of the pose itself, in that frame."""
 
     drift: Floats
     camera_from_drift: Floats

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.extent import grouped_median
+from objslam.association.sightings import Sightings
 from objslam.errors import SolveError
 from objslam.graph import factors
 from objslam.live.known import covariances, noise
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
 _EVERY = 10  # keyframes
-_FIRST, _GROWTH = 20, 1.5  # keyframes; the graph is solved as a whole when there are so many, and each time so many times more
+_FIRST, _GROWTH = (
+    20,
+    1.5,
+)  # keyframes; the graph is solved as a whole when there are so many, and each time so many times more
 _ITERATIONS = 8
 _MISS = 4.0  # standard deviations by which a ray may miss its landmark
 _WIDEST = 5.0  # times the noise that was promised
@@ -111,7 +115,7 @@ def _support(off: Floats, row: Ints, used: Bools, count: int) -> Bools:
     return np.asarray(off <= _MISS * np.clip(usual, 1.0, _WIDEST)[row])
 
 
-def _sight(m: Mapper, at: Ints):  # type: ignore[no-untyped-def]
+def _sight(m: Mapper, at: Ints) -> Sightings:
     rays = m.rays
     ids, index = np.unique(rays.keyframe[at], return_inverse=True)
     poses = m.graph.poses(ids)[index]
@@ -227,13 +231,14 @@ def thin(m: Mapper) -> None:
         out[i] = True
         wanted -= 1
     leaving = k.id[order[out]]
-    mine = np.isin(m.rays.keyframe, leaving)
-    m.graph.drop_rays(m.rays.number[mine])
+    lost: Bools = np.isin(m.rays.keyframe, leaving)
+    m.graph.drop_rays(m.rays.number[lost])
     m.graph.drop_keyframes(leaving)
-    m.rays.keep(~mine)
+    m.rays.keep(~lost)
     k.keep(~np.isin(k.id, leaving))
+    gone = set(leaving.tolist())
     for candidate in m.candidates:
-        candidate.rays = [ray for ray in candidate.rays if ray[1] not in set(leaving.tolist())]
+        candidate.rays = [ray for ray in candidate.rays if ray[1] not in gone]
     m.candidates = [candidate for candidate in m.candidates if candidate.rays]
     _chain(m)
     m.counters.accept("keyframes left out", len(leaving))

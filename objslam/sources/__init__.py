@@ -74,6 +74,18 @@ def _read_ros(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
     return ros.read_bag(path, ledger, options.of_bag())
 
 
+def _is_journal(path: Path) -> bool:
+    from objslam.live.journal import is_journal
+
+    return is_journal(path)
+
+
+def _read_journal(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+    from objslam.live.journal import read_journal
+
+    return read_journal(path, ledger)
+
+
 SOURCES: tuple[Source, ...] = (
     Source("log", "camera.yaml or cameras/ with odometry.txt or localization.txt", folder.is_log_folder, _read_log),
     Source(
@@ -97,6 +109,7 @@ SOURCES: tuple[Source, ...] = (
         _read_tum,
         frozenset({"label", "with_range"}),
     ),
+    Source("journal", "journal.objslam, what a live session accepted", _is_journal, _read_journal),
     Source(
         "ros",
         "a ROS bag (.bag, .mcap, .db3, also .zstd), or a folder with one",

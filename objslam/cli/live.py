@@ -1,0 +1,243 @@
+"""objslam live: the map while the robot drives."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import console, report, say
+from objslam.cli.options import (
+    Anonymous,
+    BaseFrame,
+    CameraInfo,
+    Config,
+    DetectorModel,
+    Format,
+    Label,
+    Out,
+    Rectified,
+    Robot,
+    Set,
+    Topics,
+    WithoutRange,
+    settings_of,
+    source_options,
+)
+
+if TYPE_CHECKING:
+    from objslam.live.adapters import Feed
+    from objslam.live.interface import Snapshot
+    from objslam.live.session import Session
+    from objslam.sources import SourceOptions
+    from objslam.types import Truth
+
+_POLL = 0.1  # s; how soon the end of a source is seen
+_LINES = 10.0  # s between status lines where there is no terminal
+
+Speed = Annotated[
+    float, typer.Option("--speed", min=0.0, help="Replay so many times as fast as it was driven; 0: as fast as it can be.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with the journal of a session that was killed.")]
+Interval = Annotated[float, typer.Option("--interval", min=0.1, help="s between two writings of objects.json.")]
+WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Keep what comes on the disk.")]
+
+
+def live(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="stdin, another adapter's name, or a recording, which is replayed.")
+    ],
+    out: Out = Path("out"),
+    config: Config = None,
+    set_: Set = None,
+    speed: Speed = 1.0,
+    resume: Resume = False,
+    interval: Interval = 1.0,
+    journal: WithJournal = True,
+    format_: Format = None,
+    robot: Robot = None,
+    without_range: WithoutRange = False,
+    anonymous: Anonymous = False,
+    label: Label = None,
+    topic: Topics = None,
+    camera_info: CameraInfo = None,
+    base_frame: BaseFrame = None,
+    rectified: Rectified = None,
+    detector: DetectorModel = None,
+) -> None:
+    """Map objects while the robot drives: objects.json follows, and at the end (Ctrl-C) there is a whole result folder."""
+    from objslam.live.adapters import ADAPTERS, LiveOptions
+    from objslam.live.journal import NAME
+    from objslam.live.session import Session
+    from objslam.results import output_folder
+
+    settings = settings_of("joint", config, set_)
+    options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
+    with output_folder(out), ExitStack() as stack:
+        if journal:
+            _look_for_journal(out / NAME, resume)
+        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name)
+        stack.callback(session.abort)
+        truth = None
+        if source in ADAPTERS:
+            feed = ADAPTERS[source](session, LiveOptions(settings, detector))
+        else:
+            feed, truth = _replay(Path(source), options, session, speed or None, resume)
+        for close in feed.close:
+            stack.callback(close)
+        session.start()
+        _drive(session, feed, out, interval)
+        _finish(session, feed, out, truth)
+
+
+def _look_for_journal(file: Path, resume: bool) -> None:
+    from objslam.errors import OutputError
+    from objslam.results import SUMMARY
+
+    if resume and not file.is_file():
+        raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
+    if not resume and file.is_file() and not (file.parent / SUMMARY).is_file():
+        raise OutputError(
+            "the journal of a session that did not end",
+            where=str(file),
+            hint="--resume goes on with it, -o names another folder, `objslam run` maps it",
+        )
+
+
+def _replay(
+    path: Path, options: SourceOptions, session: Session, speed: float | None, resume: bool
+) -> tuple[Feed, Truth | None]:
+    from objslam.ledger import Ledger
+    from objslam.live.adapters import Feed
+    from objslam.live.adapters.replay import ReplayAdapter
+    from objslam.sources import read
+
+    ledger = Ledger()
+    log = read(path, ledger, options)
+    adapter = ReplayAdapter(session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger)
+    return Feed(adapter), log.truth
+
+
+def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
+    """Run the adapter until it ends or Ctrl-C, with a status line and objects.json."""
+    from objslam.objects_file import dump_objects
+    from objslam.results import OBJECTS, write_file
+
+    stop, failure = threading.Event(), list[BaseException]()
+
+    def bring() -> None:
+        try:
+            feed.adapter.run(stop)
+        except Exception as error:  # noqa: BLE001 - told below, in the thread that can tell it
+            failure.append(error)
+
+    bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
+    with _ends_by_signal(stop), _status() as show:
+        bringing.start()
+        due = time.monotonic() + interval
+        while bringing.is_alive() and not stop.is_set() and not session.failed:
+            bringing.join(_POLL)
+            if time.monotonic() >= due:
+                due = time.monotonic() + interval
+                snapshot = session.snapshot()
+                write_file(out / OBJECTS, dump_objects(snapshot.map).encode())
+                for view in feed.views:
+                    view(snapshot)
+                show(snapshot)
+        stop.set()
+        bringing.join()
+    if failure:
+        say(f"warning: the source ended: {failure[0]}", stderr=True)
+
+
+def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> None:
+    from objslam.cli.run import objects_table
+    from objslam.results import write_result
+
+    result = session.stop()
+    last = session.snapshot()
+    for view in feed.views:
+        view(last)
+    write_result(result, out, truth)
+    ledger = session.counters.ledger
+    for reason, count in feed.adapter.ledger.dropped.items():
+        ledger.drop(reason, count)
+    for warning in feed.adapter.ledger.warnings:
+        ledger.warn(warning)
+    report(ledger)
+    console().print(objects_table(result.map))
+    counts = result.summary["counts"]
+    say(
+        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays in "
+        f"{counts['keyframes']} keyframes; update p50 {1e3 * last.update[0]:.1f} ms, p99 {1e3 * last.update[1]:.1f} ms, "
+        f"{last.rebuilds} rebuilds"
+    )
+    say(f"wrote {out}")
+
+
+@contextmanager
+def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C and SIGTERM set stop; a second Ctrl-C ends at once."""
+
+    def end(number: int, frame: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _status() -> Iterator[Callable[[Snapshot], None]]:
+    """A line that is kept up to date on stderr; where that is no terminal, one line every ten seconds."""
+    from rich.live import Live as Line
+
+    screen = console(stderr=True)
+    counts = _Rates()
+    if screen.is_terminal:
+        with Line(console=screen, refresh_per_second=4, transient=True) as line:
+            yield lambda snapshot: line.update(counts.line(snapshot))
+        return
+    told = time.monotonic()
+
+    def tell(snapshot: Snapshot) -> None:
+        nonlocal told
+        if time.monotonic() - told >= _LINES:
+            told = time.monotonic()
+            say(counts.line(snapshot), stderr=True)
+
+    yield tell
+
+
+class _Rates:
+    """The status line, with rates since the last one."""
+
+    def __init__(self) -> None:
+        self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
+
+    def line(self, snapshot: Snapshot) -> str:
+        now, then, before = time.monotonic(), *self._before
+        self._before = (now, snapshot.counters)
+        rates = {
+            kind: (snapshot.counters.get(kind, 0) - before.get(kind, 0)) / max(now - then, 1e-3)
+            for kind in ("odometry", "localization", "frames")
+            if kind in snapshot.counters
+        }
+        shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
+        resolved = len(snapshot.map.resolved())
+        return (
+            f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
+            f"{snapshot.keyframes} keyframes | {resolved} objects, {len(snapshot.map) - resolved} unresolved | "
+            f"update p50 {1e3 * snapshot.update[0]:.1f} p99 {1e3 * snapshot.update[1]:.1f} ms"
+        )

@@ -1,0 +1,112 @@
+"""A log, played again as it was driven: at its own speed, faster, or as fast as the session can take it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from objslam.ledger import Ledger
+from objslam.live.interface import Sink
+from objslam.types import Detections, Log, Trajectory
+
+_BEHIND = 1.0  # s; a replay that fell behind by more is told
+
+
+@dataclass
+class ReplayAdapter:
+    """Pushes what a log holds in the order of its stamps, poses before the frames that they may be needed for.
+
+    speed: 2 is twice as fast as it was driven; None as fast as possible, then `wait` is called after each frame and returns
+    once that is in the map. after: what has a smaller stamp is left out, when a session that took it before goes on.
+    """
+
+    sink: Sink
+    log: Log
+    speed: float | None = 1.0
+    wait: Callable[[], object] | None = None
+    after: Callable[[], float] = lambda: -np.inf
+    name: str = "replay"
+    ledger: Ledger = field(default_factory=Ledger)
+
+    def run(self, stop: threading.Event) -> None:
+        """Push all of it, or until stop is set."""
+        for camera_log in self.log.cameras:
+            self.sink.push_camera(camera_log.camera)
+        begin, first = time.perf_counter(), None
+        late, after = 0.0, self.after()
+        for stamp, frame, push in events(self.log):
+            if stop.is_set():
+                return
+            if stamp < after:
+                continue
+            first = stamp if first is None else first
+            if self.speed is not None:
+                ahead = (stamp - first) / self.speed - (time.perf_counter() - begin)
+                late = max(late, -ahead)
+                if ahead > 0 and stop.wait(ahead):
+                    return
+            push(self.sink)
+            if self.speed is None and frame and self.wait is not None:
+                self.wait()
+        if late > _BEHIND:
+            self.ledger.warn(f"the replay fell behind by up to {late:.1f} s")
+
+
+Push = Callable[[Sink], bool]
+
+
+def events(log: Log) -> Iterator[tuple[float, bool, Push]]:
+    """The log as pushes in the order of their stamps: stamp, whether it is a frame, and the push."""
+    kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []
+    for path, which in ((log.localization, "push_localization"), (log.odometry, "push_odometry")):
+        if path is not None:
+            kinds.append((path.stamps, 0, _poses(path, which)))
+    for camera_log in log.cameras:
+        name, mount = camera_log.camera.name, camera_log.mount
+        if mount is not None:
+            kinds.append((mount.stamps, 1, _mounts(mount, name)))
+        if camera_log.detections is not None:
+            kinds.append((camera_log.detections.frame_stamps, 2, _frames(camera_log.detections, name)))
+    stamps = np.concatenate([k[0] for k in kinds])
+    rank = np.concatenate([np.full(len(k[0]), k[1]) for k in kinds])
+    kind = np.concatenate([np.full(len(k[0]), i) for i, k in enumerate(kinds)])
+    index = np.concatenate([np.arange(len(k[0])) for k in kinds])
+    for at in np.lexsort((rank, stamps)).tolist():
+        yield float(stamps[at]), bool(rank[at] == 2), kinds[kind[at]][2](int(index[at]))
+
+
+def _poses(path: Trajectory, which: str) -> Callable[[int], Push]:
+    def push(i: int) -> Push:
+        return lambda sink: getattr(sink, which)(float(path.stamps[i]), path.poses[i])
+
+    return push
+
+
+def _mounts(mount: Trajectory, camera: str) -> Callable[[int], Push]:
+    def push(i: int) -> Push:
+        return lambda sink: sink.push_mount(float(mount.stamps[i]), camera, mount.poses[i])
+
+    return push
+
+
+def _frames(detections: Detections, camera: str) -> Callable[[int], Push]:
+    bounds = np.searchsorted(detections.frame, np.arange(len(detections.frame_stamps) + 1))
+
+    def push(i: int) -> Push:
+        boxes = slice(bounds[i], bounds[i + 1])
+        labels = tuple(detections.label_names[j] for j in detections.label[boxes].tolist())
+        return lambda sink: sink.push_detections(
+            float(detections.frame_stamps[i]),
+            camera,
+            detections.boxes[boxes],
+            labels,
+            detections.scores[boxes],
+            detections.depths[boxes],
+            detections.track_ids[boxes].tolist(),
+        )
+
+    return push

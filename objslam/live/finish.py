@@ -1,0 +1,122 @@
+"""The end of a session: everything it kept, solved once more as offline does, becomes a result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from objslam.description import describe, summarise
+from objslam.errors import SolveError
+from objslam.live.mapper import Mapper
+from objslam.results import RunResult
+from objslam.rounds import Solution, merge_unseen_together, seen_something
+from objslam.types import Association, Floats, Ints, Keyframes, Rays, Trajectory
+
+
+def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
+    """The result of a session: the batch solve of the joint mode, from the poses and with the association of the session.
+
+    SolveError where nothing was seen.
+    """
+    from objslam.graph import batch
+
+    begin = time.perf_counter()
+    settings = mapper.settings.model_copy(update={"mode": "joint"})
+    ledger = mapper.counters.ledger
+    keyframes, rays, association, poses = collected(mapper)
+    if not len(rays):
+        raise SolveError("nothing was seen that could be mapped", where=name, hint="; ".join(ledger.lines()) or None)
+    estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+    for _ in range(settings.joint.max_rounds if not mapper.by_label else 0):
+        merged = merge_unseen_together(rays, association, estimate)
+        if merged.count == association.count:
+            break
+        association = merged
+        start = estimate.map_T_base @ keyframes.base_T_camera
+        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=start)
+    solution = Solution(keyframes, rays, association, estimate, ())
+    cameras = tuple(mapper.cameras)
+    objects, residual = describe(solution, cameras, settings)
+    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
+    accepted = mapper.counters.accepted()
+    counts = {
+        "detection_frames": accepted.get("frames", 0),
+        "frames_on_path": mapper.frames,
+        "detections": accepted.get("boxes", 0),
+    }
+    seconds = {"finish": round(time.perf_counter() - begin, 4)}
+    summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
+    stamps, first = np.unique(keyframes.stamps, return_index=True)
+    return RunResult(
+        map=objects,
+        keyframes=keyframes,
+        map_T_base=estimate.map_T_base,
+        rays=rays,
+        association=association,
+        origins=origins,
+        directions=directions,
+        residual=residual,
+        weight=estimate.weight,
+        summary={**summary, "live": {**accepted, "rebuilds": mapper.graph.rebuilds}},
+        settings=settings,
+        cameras=cameras,
+        path=Trajectory(stamps, keyframes.map_T_base[first]),
+        path_after=Trajectory(stamps, estimate.map_T_base[first]),
+    )
+
+
+def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats]:
+    """Keyframes in the order of time, rays in theirs, who is whose, and the camera poses (K, 4, 4), as offline has them.
+
+    With a localisation, keyframes that it does not cover are left out, as offline does. Candidates with enough rays are
+    objects too, which the solve may leave unresolved.
+    """
+    mapper.graph.refresh()
+    k, r = mapper.keyframes, mapper.rays
+    order = np.argsort(k.stamp, kind="stable")
+    if k.localized.any():
+        order = order[k.localized[order]]
+    number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
+    number[k.id[order]] = np.arange(len(order))
+    owner, label = _owners(mapper)
+    at = number[r.keyframe]
+    rows = np.flatnonzero(at >= 0)
+    rows = rows[np.argsort(at[rows], kind="stable")]
+    rays = Rays(
+        keyframe=at[rows],
+        direction=r.direction[rows],
+        sigma=r.sigma[rows],
+        range=r.range[rows],
+        range_sigma=r.range_sigma[rows],
+        label=r.label[rows],
+        score=r.score[rows],
+        box=r.box[rows],
+        track_id=r.track[rows],
+        label_names=tuple(mapper.labels),
+    )
+    poses = mapper.graph.poses(k.id[order])
+    frames = mapper.keyframe_arrays(order)
+    frames = replace(frames, map_T_base=frames.map_T_base.copy())
+    kept = np.unique(rays.keyframe)
+    keyframes, rays = seen_something(frames, rays)
+    held, object_ = np.unique(owner[rows], return_inverse=True)
+    none = len(held) > 0 and held[0] < 0
+    association = Association(object_ - int(none), label[held[int(none) :]])
+    return keyframes, rays, association, poses[kept]
+
+
+def _owners(mapper: Mapper) -> tuple[Ints, Ints]:
+    """The object (R,) of each ray, -1 none, candidates numbered after the landmarks, and the label of each object."""
+    known, rays = mapper.known, mapper.rays
+    owner = rays.owner.copy()
+    first = int(known.id.max(initial=-1)) + 1
+    enough = [c for c in mapper.candidates if len(c) >= mapper.settings.live.min_rays]
+    label = np.zeros(first + len(enough), dtype=np.int64)
+    label[known.id] = known.label
+    for i, candidate in enumerate(enough, first):
+        owner[np.searchsorted(rays.number, candidate.numbers())] = i
+        label[i] = candidate.label
+    return owner, label

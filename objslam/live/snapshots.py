@@ -1,0 +1,135 @@
+"""The map as of now, in milliseconds: only the objects that were seen since the last time are described anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.association.extent import extents
+from objslam.geometry import inverse, widest_angle
+from objslam.live.candidates import Candidate
+from objslam.live.mapper import Mapper
+from objslam.live.meeting import misses, sightings
+from objslam.types import Association, Floats, Ints, Keyframes, MapObject, ObjectMap, Rays, Trajectory
+
+_MOST = 200  # rays of an object that it is described by
+_FEW = 60  # and for its parallax
+
+
+class Describer:
+    """Remembers what it said of each object."""
+
+    def __init__(self) -> None:
+        self._said: dict[int, tuple[tuple[int, float], MapObject]] = {}
+
+    def map(self, m: Mapper) -> ObjectMap:
+        """Objects with covariance and status, by their ids; candidates with enough boxes come after them, unresolved."""
+        known = m.known
+        m.graph.refresh()
+        points = m.graph.points(known.id)
+        objects, said = [], {}
+        for row, j in enumerate(known.id.tolist()):
+            state = (int(known.seen[row]), float(known.last[row]))
+            before = self._said.get(j)
+            if before is not None and before[0] == state:
+                described = replace(before[1], position=points[row])
+            else:
+                described = self._describe(m, row, j, points[row])
+            said[j] = (state, described)
+            objects.append(described)
+        self._said = said
+        first = int(known.id.max(initial=-1)) + 1
+        waiting = [c for c in m.candidates if len(c) >= m.settings.live.min_rays]
+        objects += [_waiting(m, c, first + i) for i, c in enumerate(waiting)]
+        return ObjectMap(tuple(objects))
+
+    def _describe(self, m: Mapper, row: int, j: int, position: Floats) -> MapObject:
+        known, rays = m.known, m.rays
+        mine = np.flatnonzero((rays.owner == j) & rays.used)
+        count = len(mine)
+        some = mine[np.linspace(0, count - 1, min(count, _MOST)).astype(np.int64)] if count else mine
+        few = mine[np.linspace(0, count - 1, min(count, _FEW)).astype(np.int64)] if count else mine
+        covariance = m.graph.point_covariance(j) * max(1.0, float(known.squared[row]) / (2 * max(int(known.seen[row]), 1)))
+        origin, direction, index = _in_map(m, some)
+        s = sightings(origin, direction, rays.sigma[some], rays.range[some], rays.range_sigma[some])
+        off = misses(s, position) * s.sigma if count else np.zeros(1)
+        parallax = float(np.degrees(widest_angle(_in_map(m, few)[1])))
+        ranged = bool(np.isfinite(rays.range[some]).any())
+        limit = m.settings.triangulation
+        fixed = np.isfinite(covariance).all() and (ranged or parallax >= limit.min_parallax_deg)
+        size = _size(m, some, index, position) if count else None
+        return MapObject(
+            id=j,
+            label=m.labels[int(known.label[row])],
+            position=position,
+            covariance=covariance if fixed else None,
+            status="ok" if fixed else "unresolved",
+            rays=count,
+            frames=len(np.unique(rays.keyframe[mine])),
+            parallax_deg=round(parallax, 3),
+            rms_deg=round(float(np.degrees(np.sqrt(np.mean(np.minimum(off, np.pi) ** 2)))), 4),
+            first_seen=float(known.first[row]),
+            last_seen=float(known.last[row]),
+            extent=size,
+            ray=None if fixed or not count else (origin[-1], direction[-1]),
+        )
+
+
+def path(m: Mapper) -> Trajectory:
+    """map_T_base of all keyframes, as the graph has them now."""
+    k = m.keyframes
+    m.graph.refresh()
+    stamps, first = np.unique(k.stamp, return_index=True)
+    poses = m.graph.poses(k.id[first]) @ inverse(k.base_T_camera[first])
+    return Trajectory(stamps, poses)
+
+
+def _waiting(m: Mapper, candidate: Candidate, number: int) -> MapObject:
+    s = candidate.sight(m.graph)
+    position = candidate.position if not candidate.by_label else s.origin[-1] + 1.0 * s.direction[-1]
+    off = np.minimum(misses(s, position) * s.sigma, np.pi)
+    return MapObject(
+        id=number,
+        label=m.labels[candidate.label],
+        position=position,
+        covariance=None,
+        status="unresolved",
+        rays=len(s),
+        frames=len(s),
+        parallax_deg=round(float(np.degrees(widest_angle(s.direction))), 3),
+        rms_deg=round(float(np.degrees(np.sqrt(np.mean(off**2)))), 4),
+        first_seen=candidate.first,
+        last_seen=candidate.last,
+        ray=(s.origin[-1], s.direction[-1]),
+    )
+
+
+def _in_map(m: Mapper, at: Ints) -> tuple[Floats, Floats, Ints]:
+    """Origins and directions (n, 3) of rays, and the row (n,) of the keyframe of each."""
+    poses = m.graph.poses(m.rays.keyframe[at])
+    row = np.searchsorted(m.keyframes.id, m.rays.keyframe[at])
+    return poses[:, :3, 3], np.einsum("rij,rj->ri", poses[:, :3, :3], m.rays.direction[at]), row
+
+
+def _size(m: Mapper, at: Ints, row: Ints, position: Floats) -> tuple[float, float] | None:
+    rays, frames = m.rays, np.unique(row)
+    poses = m.graph.poses(m.keyframes.id[frames])
+    k = m.keyframes
+    nothing = np.zeros(len(frames), dtype=np.int64)
+    keyframes = Keyframes(k.stamp[frames], k.camera[frames], nothing, k.base_T_camera[frames], k.map_T_base[frames])
+    some = Rays(
+        keyframe=np.searchsorted(frames, row),
+        direction=rays.direction[at],
+        sigma=rays.sigma[at],
+        range=rays.range[at],
+        range_sigma=rays.range_sigma[at],
+        label=rays.label[at],
+        score=rays.score[at],
+        box=rays.box[at],
+        track_id=rays.track[at],
+        label_names=tuple(m.labels),
+    )
+    one = Association(np.zeros(len(at), dtype=np.int64), np.zeros(1, dtype=np.int64))
+    width, height = extents(some, one, position[None], poses, keyframes, tuple(m.cameras))[0].tolist()
+    return (width, height) if np.isfinite([width, height]).all() else None
