@@ -240,7 +240,7 @@ def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("info",), ("config",), ("config", "dump")]
+    "command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("info",), ("export",), ("config",), ("config", "dump")]
 )
 def test_help(objslam, command):
     help_ = objslam(*command, "--help")

@@ -63,6 +63,18 @@ VISION_MSGS_3D = _join(
     vision_msgs__BoundingBox3D="geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
     geometry_msgs__Vector3="float64 x\nfloat64 y\nfloat64 z\n",
 )
+VISION_MSGS_3D = _join(
+    _ARRAY.format("vision_msgs/Detection3D[]"),
+    **_HEADER,
+    **_POSE,
+    vision_msgs__Detection3D="std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nstring id\n",
+    vision_msgs__ObjectHypothesisWithPose="vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    vision_msgs__ObjectHypothesis="string class_id\nfloat64 score\n",
+    vision_msgs__BoundingBox3D="geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    geometry_msgs__Vector3="float64 x\nfloat64 y\nfloat64 z\n",
+)
+"""Detection3DArray of vision_msgs 4.x, for maps that are written."""
 APRILTAG_MSGS = _join(
     _ARRAY.format("apriltag_msgs/AprilTagDetection[]"),
     **_HEADER,
