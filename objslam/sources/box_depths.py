@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from objslam.errors import LogError
 from objslam.ledger import Ledger
+from objslam.sources.packed_image import decode_image
 from objslam.sources.textfile import read_bytes
 from objslam.types import Camera, Detections, Floats, Images
 
@@ -64,12 +65,9 @@ def nearest(stamps: Floats, query: Floats) -> NDArray[np.int64]:
 
 def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
     """A depth image (H, W) in its own units; None, counted, where it cannot be decoded or has not the camera's size."""
-    import cv2
-
     try:
-        data = np.frombuffer(read_bytes(path), dtype=np.uint8)
-        image: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except (LogError, cv2.error):
+        image = decode_image(read_bytes(path))
+    except LogError:
         image = None
     if image is None:
         ledger.drop("depth image that cannot be decoded", where=str(path))

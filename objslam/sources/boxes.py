@@ -10,6 +10,9 @@ from objslam.ledger import Ledger
 from objslam.sources.textfile import count_drops, in_order
 from objslam.types import Bools, Detections, label_table
 
+MAX_BOXES = 10_000
+"""A frame with more boxes is refused: no detector finds so many, and association would take forever."""
+
 
 @dataclass
 class BoxCollector:

@@ -28,6 +28,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 """How many distortion coefficients each model takes."""
 
 CAMERAS = "cameras"
+_MAX_SIDE = 1 << 16  # px
 _Mapping = dict[str, yaml.Node]
 
 
@@ -176,8 +177,8 @@ def _number(path: Path, node: yaml.Node, what: str) -> float:
 def _size(path: Path, top: _Mapping, key: str) -> int:
     node = _get(path, top, key)
     number = _number(path, node, key)
-    if number < 1 or number != int(number):
-        raise _error(path, node, f"{key} must be a whole number of pixels above zero, got {number:g}")
+    if not 1 <= number <= _MAX_SIDE or number != int(number):
+        raise _error(path, node, f"{key} must be a whole number of pixels, 1 to {_MAX_SIDE}, got {number:g}")
     return int(number)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from objslam.errors import LogError
 from objslam.ledger import Ledger
-from objslam.sources.boxes import BoxCollector
+from objslam.sources.boxes import MAX_BOXES, BoxCollector
 from objslam.sources.textfile import read_lines
 from objslam.types import Detections
 
@@ -84,6 +84,8 @@ def read_stamp(message: dict[str, Any]) -> float:
 def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
     """Add a frame with its boxes; whether it says that they are whole. Malformed where it is no frame."""
     stamp = read_stamp(frame)
+    if len(_list(frame, "boxes")) > MAX_BOXES:
+        raise Malformed(f"more than {MAX_BOXES} boxes")
     boxes = [read_numbers(box, "a box") for box in _list(frame, "boxes")]
     labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
     depths = [_depth(depth) for depth in _list(frame, "depths")] if "depths" in frame else [math.nan] * len(boxes)

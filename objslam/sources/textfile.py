@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import stat
 import zlib
 from collections.abc import Iterable, Iterator
@@ -18,6 +19,7 @@ from objslam.ledger import Ledger
 from objslam.types import Bools, Floats, Ints
 
 _PLACES = 3  # as many places as a ledger keeps
+_MAX_UNPACKED = 1 << 30  # bytes; a day of poses at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -51,10 +53,16 @@ def read_bytes(path: Path) -> bytes:
             what = "is a folder" if stat.S_ISDIR(mode) else "is not a regular file"
             raise LogError(f"{what}, a file was expected", where=str(path))
         data = path.read_bytes()
+    if path.suffix != ".gz":
+        return data
     try:
-        return gzip.decompress(data) if path.suffix == ".gz" else data
+        with gzip.open(io.BytesIO(data)) as packed:
+            unpacked = packed.read(_MAX_UNPACKED + 1)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise LogError(f"not gzip, or cut off: {error}", where=str(path)) from error
+    if len(unpacked) > _MAX_UNPACKED:
+        raise LogError(f"unpacks to more than {_MAX_UNPACKED >> 20} MiB", where=str(path))
+    return unpacked
 
 
 def read_lines(path: Path, ledger: Ledger) -> list[tuple[int, str]]:

@@ -127,6 +127,7 @@ def test_a_missing_key_is_named(tmp_path, key):
         (1, "image_width: 0", "image_width must be a whole number"),
         (1, "image_width: -640", "image_width must be a whole number"),
         (1, "image_width: 640.5", "image_width must be a whole number"),
+        (1, "image_width: 1e12", "image_width must be a whole number of pixels, 1 to 65536"),
         (1, "image_width: wide", "image_width must be a finite number, got 'wide'"),
         (1, "image_width: .nan", "image_width must be a finite number"),
         (1, "image_width: [640]", "image_width must be one value"),

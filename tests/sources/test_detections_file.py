@@ -138,6 +138,10 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         (_GOOD | {"track_ids": [1, 2]}, "boxes, labels, scores, depths and track_ids differ in length"),
         (_GOOD | {"track_ids": [1.5]}, "track_ids must hold integers and null only"),
         (_GOOD | {"track_ids": [2**63]}, "track_ids must hold integers and null only"),
+        (
+            {"stamp": 2, "boxes": [[1, 2, 3, 4]] * 10_001, "labels": ["c"] * 10_001, "scores": [1] * 10_001},
+            "more than 10000 boxes",
+        ),
         (_GOOD | {"whole": 1}, "whole is neither true nor false"),
     ],
 )

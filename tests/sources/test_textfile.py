@@ -94,6 +94,17 @@ def test_packed_files_and_damaged_ones(tmp_path):
         assert caught.value.where == str(file)
 
 
+def test_a_packed_file_that_unpacks_without_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("objslam.sources.textfile._MAX_UNPACKED", 1 << 20)
+    file = tmp_path / "a.txt.gz"
+    file.write_bytes(gzip.compress(bytes(1 << 20)))
+    assert len(read_bytes(file)) == 1 << 20
+    file.write_bytes(gzip.compress(bytes((1 << 20) + 1)))
+    with pytest.raises(LogError, match="unpacks to more than 1 MiB") as caught:
+        read_bytes(file)
+    assert caught.value.where == str(file)
+
+
 def test_what_is_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")

@@ -10,10 +10,8 @@ import numpy as np
 
 from objslam.geometry import pose_from_quaternion
 from objslam.rays import project
+from objslam.sources.boxes import MAX_BOXES as MAX_BOXES
 from objslam.types import Camera, Floats
-
-MAX_BOXES = 10_000
-"""A message with more detections is refused."""
 
 _UNKNOWN = [math.nan] * 4
 

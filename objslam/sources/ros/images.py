@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from objslam.errors import LogError
 from objslam.ledger import Ledger
+from objslam.sources.packed_image import decode_image
 from objslam.sources.ros.decode import Undecodable, make_decoder, read_head
 from objslam.sources.ros.recording import Recording, read_messages
 from objslam.sources.ros.records import Connection, FileReport
@@ -96,14 +97,11 @@ def _write(path: Path, content: bytes) -> None:
 
 def colour_image(message: Any) -> NDArray[Any]:
     """A sensor_msgs/Image or CompressedImage as pixels (H, W, 3), uint8, BGR; Undecodable where it is none, or depth."""
-    import cv2
-
     if hasattr(message, "format"):
-        packed = np.frombuffer(message.data, dtype=np.uint8)
-        image = cv2.imdecode(packed, cv2.IMREAD_COLOR) if len(packed) else None
+        image = decode_image(bytes(message.data), colour=True)
         if image is None or "compresseddepth" in message.format.lower().replace(" ", ""):
             raise Undecodable(f"not a colour image of the format {message.format[:40]!r}")
-        return np.asarray(image)
+        return image
     image, conversion = _pixels(message)
     if image.dtype == np.float32:
         raise Undecodable("it is of floats, which no colour image is")
@@ -154,8 +152,6 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 
 def _compressed(message: Any, depth: bool) -> tuple[bytes, str]:
     """A sensor_msgs/CompressedImage as the content of a file, and the ending of its name."""
-    import cv2
-
     data = message.data.tobytes()
     packing = message.format.lower().replace(" ", "")
     if "compresseddepth" in packing:
@@ -163,7 +159,7 @@ def _compressed(message: Any, depth: bool) -> tuple[bytes, str]:
     ending = next((ending for magic, ending in _ENDINGS.items() if data.startswith(magic)), None)
     if ending is not None and not depth:
         return data, ending
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    image = decode_image(data)
     if image is None:
         raise Undecodable(f"not an image of the format {message.format[:40]!r}")
     return _encode(_depth_units(image) if depth else image), ".png"
@@ -171,11 +167,9 @@ def _compressed(message: Any, depth: bool) -> tuple[bytes, str]:
 
 def _compressed_depth(data: bytes, packing: str) -> bytes:
     """compressed_depth_image_transport: a PNG behind a header, of floats as quantised inverse depth (a / depth + b)."""
-    import cv2
-
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise Undecodable("its compressed depth is not PNG")
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8, offset=_DEPTH_HEADER), cv2.IMREAD_UNCHANGED)
+    image = decode_image(data[_DEPTH_HEADER:])
     if image is None or image.dtype != np.uint16:
         raise Undecodable("its compressed depth is not PNG of 16 bits")
     if packing.startswith("32fc1"):
