@@ -18,6 +18,7 @@ import pytest
 import typer
 import yaml
 
+from objslam import ObjectMap
 from objslam.cli import app
 from objslam.config import Settings, load_settings
 
@@ -30,6 +31,13 @@ def blocks(language: str) -> list[str]:
     """The fenced blocks of a language, without their indentation."""
     found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", README, re.MULTILINE | re.DOTALL)
     return [textwrap.dedent(text) for _, text in found]
+
+
+def marked() -> list[tuple[str, str]]:
+    """(language, text) of every block that is marked to run, in the order of the page."""
+    found = re.findall(r"^( *)```(bash|python)\n(.*?)^\1```$", README, re.MULTILINE | re.DOTALL)
+    texts = [(language, textwrap.dedent(text)) for _, language, text in found]
+    return [(language, text) for language, text in texts if text.startswith(MARK)]
 
 
 def commands() -> list[list[str]]:
@@ -52,11 +60,11 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    marked = [block for block in blocks("bash") if block.startswith(MARK)]
-    assert marked
-    for block in marked:
+    runs = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}
+    assert {language for language, _ in marked()} == set(runs)
+    for language, block in marked():
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", block],
+            [*runs[language], block],
             cwd=folder,
             env={**os.environ, "PATH": path},
             capture_output=True,
@@ -83,6 +91,12 @@ def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
     assert f"Its sigma is {sigma:.2f} m" in README
     assert load_settings(played / "my_settings.yaml").fixed.loss == "huber"
     assert (played / "my_copy" / "groundtruth" / "objects.json").is_file()
+    assert (played / "out" / "objects.csv").is_file()
+    assert (played / "out" / "map.mcap").is_file()
+    assert json.loads((played / "map.geojson").read_text())["type"] == "FeatureCollection"
+    mapped = ObjectMap.load(played / "out"), ObjectMap.load(played / "demo_out" / "fixed")
+    both = ObjectMap.load(played / "both.json")
+    assert max(map(len, mapped)) <= len(both) < sum(map(len, mapped))  # the same room twice
 
 
 def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
