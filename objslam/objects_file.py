@@ -42,13 +42,24 @@ def read_objects(file: Path) -> ObjectMap:
     OutputError, with the file and the object, when it cannot be read or is not what `dump_objects` writes.
     """
     try:
-        data = _load(file)
-        if data.get("format") != FORMAT:
-            raise _Wrong(f"format is {data.get('format')!r}, not {FORMAT!r}")
-        frame = _text(data.get("frame", "map"), "frame")
-        return ObjectMap(_each(data, _map_object), frame)
+        return _objects(_load(file))
     except _Wrong as wrong:
         raise OutputError(str(wrong), where=str(file)) from wrong
+
+
+def parse_objects(data: dict[str, Any]) -> ObjectMap:
+    """The map in what `dump_objects` wrote, as `json.loads` gives it; OutputError where it is something else."""
+    try:
+        return _objects(data)
+    except _Wrong as wrong:
+        raise OutputError(str(wrong)) from wrong
+
+
+def _objects(data: dict[str, Any]) -> ObjectMap:
+    if data.get("format") != FORMAT:
+        raise _Wrong(f"format is {data.get('format')!r}, not {FORMAT!r}")
+    frame = _text(data.get("frame", "map"), "frame")
+    return ObjectMap(_each(data, _map_object), frame)
 
 
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -55,6 +56,16 @@ def free_port() -> int:
         return port
 
 
+def address(port: int) -> str:
+    """Where a viewer of this machine takes data."""
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def web_address(web: int, port: int) -> str:
+    """What to open in a browser: the page, and where it gets its data."""
+    return f"http://{LOOPBACK}:{web}?url={address(port).replace('+', '%2B')}"
+
+
 def start(*arguments: str, quiet: bool = True) -> subprocess.Popen[bytes]:
     """Start the viewer, bound to the loopback interface (by itself it listens to the whole network)."""
     environment = {**os.environ, "RUST_LOG": "error"} if quiet else dict(os.environ)
@@ -80,14 +91,14 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
     web, data = free_port(), free_port()
     viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))
     try:
-        _listening(viewer, web)
-        say(f"http://{LOOPBACK}:{web}?url=rerun%2Bhttp://{LOOPBACK}:{data}/proxy (Ctrl+C ends it)")
+        wait_for(viewer, web)
+        say(f"{web_address(web, data)} (Ctrl+C ends it)")
         _, said = _until_closed(viewer)
         raise _failure(viewer.returncode, said, None)
     except KeyboardInterrupt:
         pass
     finally:
-        _stop(viewer)
+        stop(viewer)
 
 
 def screenshot(
@@ -115,7 +126,7 @@ def screenshot(
     except FileNotFoundError as error:
         raise OutputError("the viewer wrote no picture", where=str(picture)) from error
     finally:
-        _stop(viewer)
+        stop(viewer)
         temporary.unlink(missing_ok=True)
 
 
@@ -130,7 +141,7 @@ def _talking(viewer: subprocess.Popen[bytes], port: int) -> Iterator[ViewerClien
             _, said = viewer.communicate()
             raise _failure(viewer.returncode, said, None)
         try:
-            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            client = ViewerClient.connect(address(port))
             state = client.get_state()
             if state.recordings and not state.loading and state.views:
                 yield client
@@ -176,7 +187,8 @@ def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputEr
     return OutputError(f"the viewer ended with code {code}" + (f": {reason[:200]}" if reason else ""), hint=hint)
 
 
-def _listening(viewer: subprocess.Popen[bytes], port: int) -> None:
+def wait_for(viewer: subprocess.Popen[bytes], port: int) -> None:
+    """Until a viewer listens on a port; OutputError where it ends instead."""
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         if viewer.poll() is not None:
@@ -187,18 +199,25 @@ def _listening(viewer: subprocess.Popen[bytes], port: int) -> None:
             return
         except OSError:
             time.sleep(0.1)
+    stop(viewer)
     raise OutputError("the viewer does not answer")
+
+
+def let_go(viewer: subprocess.Popen[bytes]) -> None:
+    """Let a viewer say what it likes from now on: nobody listens, and it must not wait for somebody who does."""
+    if viewer.stderr is not None:
+        threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True).start()
 
 
 def _until_closed(viewer: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
     try:
         return viewer.communicate()
     except KeyboardInterrupt:
-        _stop(viewer)
+        stop(viewer)
         raise
 
 
-def _stop(viewer: subprocess.Popen[bytes]) -> None:
+def stop(viewer: subprocess.Popen[bytes]) -> None:
     """End a viewer that we started."""
     if viewer.poll() is None:
         viewer.terminate()
@@ -207,5 +226,3 @@ def _stop(viewer: subprocess.Popen[bytes]) -> None:
         except subprocess.TimeoutExpired:
             viewer.kill()
             viewer.wait()
-    if viewer.stderr is not None:
-        viewer.stderr.close()

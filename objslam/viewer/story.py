@@ -9,13 +9,14 @@ import numpy as np
 
 from objslam.scene import captions, ray_kinds
 from objslam.trace import Round
-from objslam.types import Floats, Ints, MapObject
+from objslam.types import Floats, Ints, MapObject, ObjectMap
 
 if TYPE_CHECKING:
     from objslam.results import RunResult
 
 Level = Literal["INFO", "WARN"]
 _MOST = 40  # lines about objects in one round
+_MERGED = 0.5  # m; an object that goes has become its neighbour of the same label
 _WHY = {
     "fixed": "association at the poses as they are",
     "labels": "every label taken for one object",
@@ -144,6 +145,29 @@ def _changes(before: Round | None, now: Round, names: list[str], label_names: tu
         lost, total = int(went[i, -1]), int(went[i].sum())
         texts.append(f"dropped: {old_names[i]}, {lost} of its {total} rays are explained by nothing now")
     return texts
+
+
+def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
+    """What happened to a live map: objects born, placed, lost and dropped, by their ids."""
+    old, new = ({o.id: o for o in m.objects} for m in (before, now))
+    lines: list[tuple[Level, str]] = []
+    for j, o in new.items():
+        name, was = f"{o.label} #{j}", old.get(j)
+        if was is None:
+            lines.append(("INFO", f"born: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+        if o.status == "ok" and (was is None or was.status != "ok"):
+            sigma = "" if o.covariance is None else f", sigma {100 * np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.0f} cm"
+            lines.append(("INFO", f"placed: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg{sigma}"))
+        if o.status != "ok" and was is not None and was.status == "ok":
+            lines.append(("WARN", f"no longer sure: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+        if was is not None and was.label != o.label:
+            lines.append(("INFO", f"renamed: {was.label} #{j} is a {o.label}"))
+    gone = [o for j, o in old.items() if j not in new]
+    for o in gone:
+        near = [n for n in new.values() if n.label == o.label and np.linalg.norm(n.position - o.position) < _MERGED]
+        into = f"merged into {near[0].label} #{near[0].id}" if near else "nothing explains it any more"
+        lines.append(("INFO", f"dropped: {o.label} #{o.id}, {o.rays} rays, {into}"))
+    return lines
 
 
 def _flow(old: Ints, new: Ints, olds: int, news: int) -> Ints:

@@ -1,0 +1,248 @@
+"""A session looked at while it goes on: what arrives, and that nobody waits for a viewer."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rrd import Recording, rgb
+from synthetic_result import clusters, synthetic_result
+
+from objslam.errors import ConfigError, OutputError
+from objslam.live.interface import Snapshot
+from objslam.results import RunResult
+from objslam.types import ObjectMap, Trajectory
+from objslam.viewer import program
+from objslam.viewer.live import LiveView
+from objslam.viewer.wire import Frame, encode, read
+
+
+def snapshots(result: RunResult, count: int) -> list[Snapshot]:
+    """A drive as a session shows it: keyframes and objects come one after the other, the fourth is dropped in the end."""
+    found = []
+    for k in range(1, count + 1):
+        n = len(result.keyframes) * k // count
+        objects = tuple(o for i, o in enumerate(result.map.objects[: 4 * k]) if i != 3 or k < count)
+        path = Trajectory(result.keyframes.stamps[:n], result.map_T_base[:n])
+        dropped = {"boxes cut off": k}
+        found.append(
+            Snapshot(float(path.stamps[-1]), ObjectMap(objects), path, n, 0, 0.01 * k, (0.002, 0.02), {"frames": n}, dropped)
+        )
+    return found
+
+
+def frame(result: RunResult, keyframe: int) -> Frame:
+    mine = result.rays.keyframe == keyframe
+    index = result.association.object[mine]
+    ids = np.array([o.id for o in result.map.objects])
+    return Frame(
+        stamp=float(result.keyframes.stamps[keyframe]),
+        camera=result.cameras[0],
+        map_T_camera=(result.map_T_base @ result.keyframes.base_T_camera)[keyframe],
+        boxes=result.rays.box[mine],
+        objects=np.where(index >= 0, ids[index], -1),
+        rejected=(index >= 0) & (result.weight[mine] < 0.5),
+        image=np.full((480, 640, 3), (10, 20, 200), dtype=np.uint8),
+    )
+
+
+@pytest.fixture(scope="module")
+def result() -> RunResult:
+    return synthetic_result(*clusters(), keyframes=40, unresolved=(2,))[0]
+
+
+def test_a_message_comes_through_whole(result: RunResult) -> None:
+    snapshot = snapshots(result, 4)[-1]
+    stream = io.BytesIO(encode(snapshot, [frame(result, 7)], 5) + encode(Snapshot(np.nan, ObjectMap(()), Trajectory(
+        np.zeros(0), np.zeros((0, 4, 4)))), ()))  # fmt: skip
+    first, second = read(stream), read(stream)
+    assert read(stream) is None
+    assert first is not None
+    assert second is not None
+    shown, (got,) = first
+    assert [o.label for o in shown.map.objects] == [o.label for o in snapshot.map.objects]
+    np.testing.assert_allclose(shown.path, result.map_T_base[:, :3, 3], atol=1e-4)
+    np.testing.assert_array_equal(shown.base, result.map_T_base[-1])
+    assert shown.numbers["unseen"] == 5
+    assert shown.dropped == {"boxes cut off": 4}
+    sent = frame(result, 7)
+    for name in ("map_T_camera", "boxes", "objects", "rejected"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(sent, name))
+    assert isinstance(got.image, bytes)
+    np.testing.assert_allclose(cv2.imdecode(np.frombuffer(got.image, np.uint8), 1)[5, 5], (10, 20, 200), atol=4)
+    assert np.isnan(second[0].stamp)
+    assert second[0].base is None
+    cut = encode(snapshot, [frame(result, 7)])[:-10]
+    assert read(io.BytesIO(cut)) is None
+    assert read(io.BytesIO(cut[:300])) is None
+
+
+def test_a_session_becomes_a_recording(result: RunResult, tmp_path: Path) -> None:
+    every = snapshots(result, 4)
+    with LiveView(file=tmp_path / "live.rrd") as view:
+        for k, snapshot in enumerate(every):
+            view.show(snapshot, [frame(result, 10 * k + 9)])
+            while view.shown <= k:
+                time.sleep(0.01)
+    assert (view.shown, view.dropped) == (4, 0)
+    r = Recording(tmp_path / "live.rrd")
+    subprocess.run([program.program(), "rrd", "verify", tmp_path / "live.rrd"], check=True, capture_output=True, timeout=60)
+    resolved = [[o for o in s.map.objects if o.status == "ok"] for s in every]
+    points = r.get("/map/objects", "Points3D:positions")
+    assert [len(row) for row in points] == [len(some) for some in resolved]
+    np.testing.assert_allclose(points[-1], [o.position for o in resolved[-1]], rtol=1e-5)
+    strips = r.get("/map/path/after", "LineStrips3D:strips")
+    assert [len(row[0]) for row in strips] == [10, 20, 30, 40]
+    assert [row[0] for row in r.get("/plots/live/lag/now", "Scalars:scalars")] == pytest.approx([10, 20, 30, 40])
+    assert [row[0] for row in r.get("/plots/live/lag/p99", "Scalars:scalars")] == pytest.approx([20] * 4)
+    assert [row[0] for row in r.get("/plots/live/dropped/messages", "Scalars:scalars")] == [1, 2, 3, 4]
+    text = [row[0] for row in r.get("/log", "TextLog:text")]
+    assert sum(t.startswith("born: ") for t in text) == 15
+    assert sum(t.startswith("placed: ") for t in text) == 14
+    gone = result.map.objects[3]
+    assert [t for t in text if t.startswith("dropped: ")] == [
+        f"dropped: {gone.label} #{gone.id}, {gone.rays} rays, nothing explains it any more"
+    ]
+    assert "dropped: boxes cut off | 4" in r.get("/summary", "TextDocument:text")[-1][0]
+    # the last frame's boxes, in the colours that they have offline
+    colours = [rgb(c) for c in r.get("/map/camera/front/boxes", "Boxes2D:colors")[-1]]
+    sent = frame(result, 39)
+    known = np.isin(sent.objects, [o.id for o in every[-1].map.objects])
+    for (red, green, blue), rejected, held in zip(colours, sent.rejected, known, strict=True):
+        grey = red == green == blue
+        assert (red > 2 * green and red > 2 * blue) if rejected else grey != held
+    assert [len(row) for row in r.get("/map/camera/front/image", "EncodedImage:blob")] == [1] * 4
+    rays = np.array(r.get("/map/rays/now", "LineStrips3D:strips")[-1])
+    np.testing.assert_allclose(rays[:, 0], np.broadcast_to(sent.map_T_camera[:3, 3], (15, 3)), rtol=1e-5)
+
+
+@pytest.fixture
+def viewer() -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """A viewer's server, without the viewer: nothing is drawn."""
+    port = program.free_port()
+    process = program.start("--serve-grpc", "--port", str(port))
+    try:
+        program.wait_for(process, port)
+        program.let_go(process)
+        yield process, port
+    finally:
+        process.kill()
+        process.wait()
+
+
+def heavy(result: RunResult) -> tuple[Snapshot, list[Frame]]:
+    """A snapshot with more images than a socket has room for."""
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    picture = cv2.imencode(".jpg", noise)[1].tobytes()
+    return snapshots(result, 4)[-1], [dataclasses.replace(frame(result, k), image=picture) for k in range(40)]
+
+
+@pytest.mark.parametrize("how", ["frozen", "killed"])
+def test_a_viewer_that_hangs_or_dies_keeps_nobody_waiting(
+    result: RunResult, viewer: tuple[subprocess.Popen[bytes], int], how: str
+) -> None:
+    process, port = viewer
+    snapshot, frames = heavy(result)
+    view = LiveView(address=program.address(port))
+    view.show(snapshot)
+    end = time.monotonic() + 20
+    while not view.shown and time.monotonic() < end:
+        time.sleep(0.02)
+    assert view.shown == 1
+    if how == "frozen":
+        process.send_signal(signal.SIGSTOP)
+    else:
+        process.kill()
+        process.wait()
+    longest, began = 0.0, time.monotonic()
+    number = 0
+    while time.monotonic() - began < 1.0:
+        start = time.perf_counter()
+        view.show(snapshot, frames)
+        longest = max(longest, time.perf_counter() - start)
+        number += 1
+        time.sleep(0.02)
+    start = time.monotonic()
+    view.close(timeout=1.0)
+    assert time.monotonic() - start < 8.0
+    assert view.shown + view.dropped == number + 1
+    assert view.dropped > number / 2
+    assert longest < 0.5  # it is some microseconds; a loaded machine may do something else meanwhile
+    if how == "frozen":
+        process.send_signal(signal.SIGCONT)
+
+
+def test_a_viewer_that_comes_back_is_found(result: RunResult, viewer: tuple[subprocess.Popen[bytes], int]) -> None:
+    process, port = viewer
+    snapshot = snapshots(result, 4)[-1]
+    with LiveView(address=program.address(port)) as view:
+        view.show(snapshot)
+        wait_until(lambda: view.shown == 1)
+        process.kill()
+        process.wait()
+        view.show(snapshot)
+        wait_until(lambda: view.dropped == 1)
+        again = program.start("--serve-grpc", "--port", str(port))
+        try:
+            program.wait_for(again, port)
+            program.let_go(again)
+            wait_until(lambda: view.show(snapshot) and view.shown >= 2, 0.3)
+        finally:
+            again.kill()
+            again.wait()
+
+
+def wait_until(condition: object, step: float = 0.02) -> None:
+    assert callable(condition)
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(step)
+
+
+def test_a_process_ends_however_its_viewer_is(viewer: tuple[subprocess.Popen[bytes], int]) -> None:
+    """Without a close, and with a viewer that takes nothing more."""
+    process, port = viewer
+    script = (
+        "import os, signal, sys, time\n"
+        "import numpy as np\n"
+        "from objslam.live.interface import Snapshot\n"
+        "from objslam.types import Camera, ObjectMap, Trajectory\n"
+        "from objslam.viewer.live import LiveView\n"
+        "from objslam.viewer.wire import Frame\n"
+        "snapshot = Snapshot(1.0, ObjectMap(()), Trajectory(np.zeros(1), np.eye(4)[None]))\n"
+        "none = np.zeros(0, dtype=np.int64)\n"
+        "camera = Camera('front', 640, 480, np.eye(3))\n"
+        "frame = Frame(1.0, camera, np.eye(4), np.zeros((0, 4)), none, none.astype(bool), os.urandom(5_000_000))\n"
+        "view = LiveView(address=sys.argv[1])\n"
+        "view.show(snapshot)\n"
+        "while not view.shown: time.sleep(0.02)\n"
+        "os.kill(int(sys.argv[2]), signal.SIGSTOP)\n"
+        "for _ in range(10): view.show(snapshot, [frame, frame])\n"
+        "time.sleep(0.5)\n"
+        "print(view._process.pid, view.shown, flush=True)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, program.address(port), str(process.pid)], timeout=40, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    logger, shown = done.stdout.split()
+    assert shown == "1"  # it hung
+    wait_until(lambda: not Path(f"/proc/{logger}").exists())
+    process.send_signal(signal.SIGCONT)
+
+
+def test_what_cannot_be_shown_to_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no address"):
+        LiveView(address="127.0.0.1:9876")
+    with pytest.raises(OutputError, match="No such file"):
+        LiveView(file=tmp_path / "none" / "a.rrd")
