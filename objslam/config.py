@@ -229,7 +229,7 @@ class Reconstruction(Section):
     device: Device = "auto"
     voxel: Positive = 0.02
     """m; the size of a voxel."""
-    truncation: Positive = 0.08
+    truncation: Positive = 0.06
     """m; how far from a surface depths are averaged: more than they err, less than things are thick. At least 2 voxels."""
     max_depth: Positive = 4.0
     """m; depths beyond it are not used."""
@@ -239,8 +239,8 @@ class Reconstruction(Section):
     """every so many-th depth image is used."""
     max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
     """of more than that, evenly many are left out."""
-    max_blocks: Annotated[int, Field(ge=2048)] = 40_000
-    """the grid grows to so many blocks of 8^3 voxels; each takes 10 kB, and as much again while the surface is taken out."""
+    max_blocks: Annotated[int, Field(ge=2048)] = 80_000
+    """the grid grows to so many blocks of 6^3 voxels, at 4.3 kB each."""
 
 
 class Live(Section):

@@ -1,6 +1,6 @@
 """The room around the objects: depth images fused at the solved poses into one coloured surface (Open3D's VoxelBlockGrid).
 
-Truncated signed distances (Curless & Levoy, SIGGRAPH 1996) in blocks of 8^3 voxels that exist only near surfaces (Dong et
+Truncated signed distances (Curless & Levoy, SIGGRAPH 1996) in blocks of 6^3 voxels that exist only near surfaces (Dong et
 al., ASH, T-PAMI 2022).
 """
 
@@ -24,8 +24,8 @@ from objslam.sources.box_depths import MAX_LAG, nearest, read_depth
 from objslam.sources.textfile import read_bytes
 from objslam.types import Bools, Camera, CameraLog, Floats, Log, Surface, Trajectory
 
-_BLOCK = 8  # voxels along a block's edge: of 8 and 16, 8 takes a third less memory and time for walls
-_FIRST_BLOCKS = 8192  # what the grid begins with; it doubles as it fills
+_BLOCK = 6  # voxels along a block's edge: a tenth less time and a quarter less memory than with 8, 16 takes twice the time
+_FIRST_BLOCKS = 32_768  # what the grid begins with, enough for a room; it doubles as it fills
 _SPARE = 1024  # blocks kept free: Open3D grows by itself unless all that a call touches would fit, be it there already
 _AHEAD = 4  # images that may be decoded ahead
 _TOUCH = 4  # Open3D looks at every so many-th pixel for the blocks that a frame touches
@@ -119,7 +119,7 @@ def _fuse(
 
         def load(shot: Shot) -> tuple[Shot, NDArray[np.float32] | None, NDArray[np.float32] | None, Ledger]:
             noted = Ledger()  # threads must not share one
-            return shot, *_load(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
+            return shot, *load_shot(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
 
         for done, (shot, depth, colour, noted) in enumerate(ahead(load, shots, _AHEAD)):
             ledger.add(noted)
@@ -170,7 +170,7 @@ class Lens:
         return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST))
 
 
-def _load(
+def load_shot(
     shot: Shot, camera: Camera, lens: Lens, max_depth: float, ledger: Ledger
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
     """Depth (H, W), m, 0 where none is in reach, and RGB (H, W, 3) in [0, 1], both straightened; None where unusable."""
@@ -195,7 +195,7 @@ def _load(
 
 
 class Grid:
-    """A voxel block grid that grows up to reconstruction.max_blocks blocks of 8^3 voxels, 20 bytes each (8 without colour).
+    """A voxel block grid that grows up to reconstruction.max_blocks blocks of 6^3 voxels, 20 bytes each (8 without colour).
 
     left_out: how many times a frame touched a block that had no room.
     """

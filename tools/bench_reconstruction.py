@@ -1,0 +1,174 @@
+"""What the reconstruction costs and how true it is, on the demo's rendered drive.
+
+    objslam demo -o demo_out
+    python tools/bench_reconstruction.py demo_out [--seed 0] [--repeats 3] [--picture docs/reconstruction.png]
+
+Fuses the drive's depth images at the true poses, at those that `fixed` and `joint` solve, and at the odometry's, and prints the
+distance of the surface from the true room. A map from odometry alone has a frame of its own: it is laid onto the room by its
+path first. Then milliseconds a frame, the best and the median of all repeats, and the peak memory of a full grid.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+from mesh_view import Picture, View
+
+from objslam import offline
+from objslam.config import Settings, load_settings
+from objslam.geometry import align, interpolate, make_pose
+from objslam.ledger import Ledger
+from objslam.reconstruction import Grid, Lens, choose_shots, load_shot, reconstruct
+from objslam.simulation.rendered import RenderSettings, drive_room
+from objslam.sources import read
+from objslam.sources.detections_file import read_detections
+from objslam.types import Floats, Log, Surface, Trajectory
+
+BAR_DISTANCE, BAR_TIME = 0.015, 10.0  # m, ms
+
+
+def true_room(seed: int) -> o3d.t.geometry.RaycastingScene:
+    """The room of the demo's drive."""
+    scene = o3d.t.geometry.RaycastingScene()
+    for part in drive_room(RenderSettings(), seed).parts:
+        vertices, triangles = part.vertices.astype(np.float32), part.triangles.astype(np.uint32)
+        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
+    return scene
+
+
+def moved(surface: Surface, pose: Floats) -> Surface:
+    """The surface under a rigid motion (4, 4)."""
+    turn = pose[:3, :3].astype(np.float32)
+    return replace(
+        surface, vertices=surface.vertices @ turn.T + pose[:3, 3].astype(np.float32), normals=surface.normals @ turn.T
+    )
+
+
+def laid(path: Trajectory, truth: Trajectory) -> Floats:
+    """How a path's frame lies in the true one (4, 4), in the plane."""
+    true, known = interpolate(truth.stamps, truth.poses, path.stamps, 1.0)
+    return align(path.poses[known, :3, 3], true[known, :3, 3], "se2")[0]
+
+
+def surfaces(log: Log, demo: Path) -> dict[str, Surface]:
+    """The surface at each kind of poses, laid onto the room where its frame is its own."""
+    assert log.truth is not None
+    truth = log.truth.trajectory
+    assert truth is not None
+    found = {"true poses": reconstruct(log, truth, Settings(), Ledger())}
+    for mode, poses in (("fixed", "localization"), ("joint", "odometry")):
+        boxes = read_detections(demo / mode / "detections.jsonl", Ledger())
+        with_boxes = replace(log, cameras=(replace(log.cameras[0], detections=boxes),))
+        own = poses == "odometry"
+        change = (f"reconstruction.before={str(own).lower()}",)
+        result = offline.run(with_boxes, load_settings(demo / mode / "config.yaml", change), Ledger())
+        assert result.surface is not None
+        found[f"{mode}, from {poses}"] = moved(result.surface, laid(result.path_after, truth)) if own else result.surface
+        if result.surface_before is not None:
+            found["odometry as it is"] = moved(result.surface_before, laid(result.path, truth))
+    return {name: surface for name, surface in found.items() if surface is not None}
+
+
+def time_frames(log: Log, repeats: int) -> tuple[Floats, Floats]:
+    """Milliseconds of reading and of fusing each frame, (repeats, frames) each, one after the other."""
+    assert log.truth is not None
+    assert log.truth.trajectory is not None
+    settings, camera = Settings(), log.cameras[0].camera
+    shots = choose_shots(log, log.truth.trajectory, settings, Ledger())
+    reading, fusing = np.zeros((2, repeats, len(shots)))
+    for repeat in range(repeats):
+        grid = Grid(settings, coloured=True)
+        for i, shot in enumerate(shots):
+            begin = time.perf_counter()
+            depth, colour = load_shot(shot, camera, Lens.of(camera), settings.reconstruction.max_depth, Ledger())
+            middle = time.perf_counter()
+            assert depth is not None
+            grid.add(depth, colour, camera.matrix, shot.map_T_camera)
+            reading[repeat, i], fusing[repeat, i] = middle - begin, time.perf_counter() - middle
+    return 1e3 * reading, 1e3 * fusing
+
+
+def fill() -> None:
+    """Fill a grid up to its bound, take the surface out, and print MB: before, the grid full, the peak."""
+    settings = Settings()
+    depth, colour = np.full((480, 640), 3.0, np.float32), np.full((480, 640, 3), 0.5, np.float32)
+    matrix = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    o3d.core.Tensor(depth)
+    before = peak()
+    grid, place = Grid(settings, coloured=True), 0
+    while not grid.left_out:
+        for _ in range(settings.reconstruction.min_views):
+            grid.add(depth, colour, matrix, make_pose(np.eye(3), np.array([0.0, 0.0, 10.0 * place])))
+        place += 1
+    full = peak()
+    grid.surface(settings.reconstruction.min_views)
+    print(before, full, peak(), grid.blocks)
+
+
+def peak() -> float:
+    """The most memory so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def picture(before: Surface, after: Surface, file: Path) -> None:
+    """Both rooms from the same place, side by side."""
+    view = View(np.array([2.1, -3.9, 3.4]), np.array([-0.2, 0.3, 0.6]), 62.0, 620, 480)
+    images = []
+    for surface, title in ((before, "odometry as it is"), (after, "joint: path and objects solved together")):
+        image = np.ascontiguousarray(Picture(surface, view).done())
+        cv2.putText(image, title, (14, 28), cv2.FONT_HERSHEY_DUPLEX, 0.62, (40, 44, 52), 1, cv2.LINE_AA)
+        images.append(image)
+    whole = np.hstack([images[0], np.full((view.height, 12, 3), 255, np.uint8), images[1]])
+    cv2.imwrite(str(file), whole[..., ::-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("demo", type=Path, nargs="?", default=Path("demo_out"), help="what `objslam demo` made")
+    parser.add_argument("--seed", type=int, default=0, help="of the demo")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--picture", type=Path, help="PNG of the room at the odometry's and at the solved poses")
+    parser.add_argument("--fill", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.fill:
+        fill()
+        return
+    log, scene = read(args.demo / "log", Ledger()), true_room(args.seed)
+    found = surfaces(log, args.demo)
+    print(f"{'poses':<24}{'mean mm':>10}{'median mm':>11}{'95 % mm':>9}{'vertices':>10}")
+    for name, surface in found.items():
+        off = 1e3 * scene.compute_distance(o3d.core.Tensor(surface.vertices)).numpy()
+        row = f"{off.mean():10.1f}{np.median(off):11.1f}{np.quantile(off, 0.95):9.1f}{len(surface.vertices):10d}"
+        within = (
+            ""
+            if name.startswith(("true", "odometry"))
+            else f"  {'within' if off.mean() <= 1e3 * BAR_DISTANCE else 'NOT within'} 15 mm"
+        )
+        print(f"{name:<24}{row}{within}")
+    if args.picture:
+        picture(found["odometry as it is"], found["joint, from odometry"], args.picture)
+    reading, fusing = time_frames(log, args.repeats)
+    best = fusing.min(axis=0)
+    print(
+        f"fusing a 640x480 frame at 2 cm: best of {args.repeats} {best.mean():.1f} ms on average, all {np.median(fusing):.1f} ms in the median"
+    )
+    print(f"reading it (PNG and JPEG, in threads of their own in a run): {reading.min(axis=0).mean():.1f} ms")
+    print(f"{'within' if best.mean() <= BAR_TIME else 'NOT within'} {BAR_TIME:g} ms")
+    told = subprocess.run([sys.executable, __file__, "--fill"], capture_output=True, text=True, check=True).stdout
+    before, full, most, blocks = (float(x) for x in told.split())
+    print(
+        f"a full grid ({blocks:.0f} blocks): {full - before:.0f} MB while it grew, {most - before:.0f} MB at most, beyond {before:.0f} MB without it"
+    )
+
+
+if __name__ == "__main__":
+    main()
