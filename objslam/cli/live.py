@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
     from objslam.types import Truth
 
+_HAND_OVER = 5e-4  # s; a message does not wait Python's 5 ms, several times over, for the thread that makes the map
 _POLL = 0.1  # s; how soon the end of a source is seen
 _LINES = 10.0  # s between status lines where there is no terminal
 
@@ -46,12 +49,31 @@ Speed = Annotated[
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with the journal of a session that was killed.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="s between two writings of objects.json.")]
+Domain = Annotated[int | None, typer.Option("--domain", help="DDS domain. [default: ROS_DOMAIN_ID, else 0]")]
+Interface = Annotated[
+    str | None,
+    typer.Option(
+        "--interface",
+        help="DDS: auto, or a network interface's name or address. [default: as CYCLONEDDS_URI says, else loopback]",
+    ),
+]
+Publish = Annotated[
+    bool, typer.Option("--publish", help="Send objects, markers and the path over DDS, for RViz and Nav2, every --interval.")
+]
+View = Annotated[
+    str | None,
+    typer.Option("--view", help="Look at it: window, web (a browser on this machine), FILE.rrd, or a viewer's address."),
+]
 WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Keep what comes on the disk.")]
 
 
 def live(
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="stdin, another adapter's name, or a recording, which is replayed.")
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="dds (a ROS 2 robot), rclpy (the same, as a ROS node), stdin (JSON lines), or a recording: replayed.",
+        ),
     ],
     out: Out = Path("out"),
     config: Config = None,
@@ -70,6 +92,10 @@ def live(
     base_frame: BaseFrame = None,
     rectified: Rectified = None,
     detector: DetectorModel = None,
+    domain: Domain = None,
+    interface: Interface = None,
+    publish: Publish = False,
+    view: View = None,
 ) -> None:
     """Map objects while the robot drives: objects.json follows, and at the end (Ctrl-C) there is a whole result folder."""
     from objslam.live.adapters import ADAPTERS, LiveOptions
@@ -86,11 +112,20 @@ def live(
         stack.callback(session.abort)
         truth = None
         if source in ADAPTERS:
-            feed = ADAPTERS[source](session, LiveOptions(settings, detector))
+            feed = ADAPTERS[source](session, LiveOptions(settings, detector, options, domain, interface))
         else:
             feed, truth = _replay(Path(source), options, session, speed or None, resume)
         for close in feed.close:
             stack.callback(close)
+        if publish:
+            from objslam.live.dds_network import open_network
+            from objslam.live.publish import DdsPublisher
+
+            feed = replace(feed, views=(*feed.views, DdsPublisher(open_network(domain, interface)).publish))
+        if view is not None:
+            from objslam.viewer.live import open_view
+
+            feed = replace(feed, views=(*feed.views, stack.enter_context(open_view(view, say)).show))
         session.start()
         _drive(session, feed, out, interval)
         _finish(session, feed, out, truth)
@@ -129,6 +164,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
     from objslam.objects_file import dump_objects
     from objslam.results import OBJECTS, write_file
 
+    sys.setswitchinterval(_HAND_OVER)
     stop, failure = threading.Event(), list[BaseException]()
 
     def bring() -> None:
@@ -138,11 +174,15 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
             failure.append(error)
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
+    told = 0
     with _ends_by_signal(stop), _status() as show:
         bringing.start()
         due = time.monotonic() + interval
         while bringing.is_alive() and not stop.is_set() and not session.failed:
             bringing.join(_POLL)
+            for warning in feed.adapter.ledger.warnings[told:]:
+                told += 1
+                say(f"warning: {warning}", stderr=True)
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 snapshot = session.snapshot()
@@ -160,22 +200,19 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
     from objslam.cli.run import objects_table
     from objslam.results import write_result
 
+    session.counters.ledger.add(feed.adapter.ledger)
     result = session.stop()
     last = session.snapshot()
     for view in feed.views:
         view(last)
     write_result(result, out, truth)
     ledger = session.counters.ledger
-    for reason, count in feed.adapter.ledger.dropped.items():
-        ledger.drop(reason, count)
-    for warning in feed.adapter.ledger.warnings:
-        ledger.warn(warning)
     report(ledger)
     console().print(objects_table(result.map))
     counts = result.summary["counts"]
     say(
-        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays in "
-        f"{counts['keyframes']} keyframes; update p50 {1e3 * last.update[0]:.1f} ms, p99 {1e3 * last.update[1]:.1f} ms, "
+        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"in {counts['keyframes']} keyframes; update p50 {1e3 * last.update[0]:.1f} ms, p99 {1e3 * last.update[1]:.1f} ms, "
         f"{last.rebuilds} rebuilds"
     )
     say(f"wrote {out}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ class DetectorWorker:
     each topic. What is dropped is counted.
     """
 
-    def __init__(self, detector: Detector, clock: Callable[[], float]) -> None:
+    def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
         self._detector, self._clock = detector, clock
         self._waiting: dict[str, tuple[Any, float]] = {}
         self._ready = threading.Condition()

@@ -83,8 +83,9 @@ class RosMessages:
         options: RosOptions | None = None,
         detector: DetectorWorker | None = None,
         clock: Callable[[], float] = time.monotonic,
+        ledger: Ledger | None = None,
     ) -> None:
-        self.ledger = Ledger()
+        self.ledger = ledger if ledger is not None else Ledger()
         self._sink, self._options, self._detector, self._clock = sink, options or RosOptions(), detector, clock
         self._lock = threading.RLock()
         self._tf = TfBuffer()
