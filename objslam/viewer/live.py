@@ -23,6 +23,17 @@ _WAITING = 4  # snapshots that wait at the most: of more, the oldest is dropped
 _ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")
 
 
+def open_view(where: str, say: Callable[[str], None]) -> LiveView:
+    """A live view in a window (`window`), a browser (`web`), a recording (a name that ends in .rrd), or at an address."""
+    if where == "window":
+        return LiveView.spawn()
+    if where == "web":
+        return LiveView.serve(say)
+    if where.endswith(".rrd"):
+        return LiveView(file=Path(where))
+    return LiveView(address=where)
+
+
 class LiveView:
     """Shows snapshots: `show` takes one and returns at once, from any thread; what a slow viewer has no time for is dropped
     and counted.
