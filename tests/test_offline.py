@@ -10,11 +10,11 @@ from small_log import THINGS, small_log
 from objslam import offline
 from objslam.config import load_settings
 from objslam.errors import SolveError
-from objslam.geometry import exp_se3, interpolate, inverse
+from objslam.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.ledger import Ledger
 from objslam.simulation import DepthNoise, make_camera
 from objslam.simulation.motion import START
-from objslam.types import CameraLog, Detections, Log, Trajectory, TruthObject
+from objslam.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 
 MODES = ["fixed", "joint"]
 
@@ -296,3 +296,42 @@ def test_hundreds_of_labels(mode):
     assert len(result.map.resolved()) >= 145
     assert np.median(errors) < 0.03
     assert len({o.label for o in result.map.resolved()}) == len(result.map.resolved())
+
+
+def corridor(length: float = 28.0, every: float = 4.0) -> Log:
+    """Straight ahead, with a camera that looks to the left at one thing after the other: never two at a time."""
+    camera = make_camera("left", position=(0.0, 0.0, 0.5), yaw=np.pi / 2)
+    x = np.arange(0.0, length, 0.2)
+    poses = lift_se2(np.column_stack([x, np.zeros_like(x), np.zeros_like(x)]))
+    things = np.array([[at, 3.0, 0.5] for at in np.arange(every / 2, length, every)])
+    frame, thing = np.nonzero(np.abs(x[:, None] - things[:, 0]) < every / 2 - 0.1)
+    u = camera.matrix[0, 2] + camera.matrix[0, 0] * (things[thing, 0] - x[frame]) / 3.0
+    v = np.full(len(u), camera.matrix[1, 2])
+    detections = Detections(
+        frame_stamps=10 + 0.4 * np.arange(len(x)),
+        frame=frame,
+        boxes=np.column_stack([u - 15, v - 15, u + 15, v + 15]),
+        label=thing,
+        scores=np.ones(len(u)),
+        depths=np.full(len(u), np.nan),
+        track_ids=np.full(len(u), -1),
+        label_names=tuple(f"door {i}" for i in range(len(things))),
+    )
+    path = Trajectory(detections.frame_stamps, poses)
+    truth = Truth(tuple(TruthObject(i, f"door {i}", place) for i, place in enumerate(things)))
+    return Log("corridor", (CameraLog(camera, detections),), path, None, truth)
+
+
+def test_far_from_where_the_map_begins_an_object_is_still_known():
+    """How far the map may have turned by then says nothing of how well the object is placed in it."""
+    log = corridor()
+    result = run(log, "joint", "odometry.yaw_per_m=0.03")
+    assert len(result.map.resolved()) == len(result.map) == len(log.truth.objects)
+    by_label = {o.label: o for o in result.map.objects}
+    for true in log.truth.objects:
+        o = by_label[true.label]
+        np.testing.assert_allclose(o.position, true.position, atol=0.01)
+    # the covariance is that in the map, all the way back to its beginning
+    sigma = [np.sqrt(np.linalg.eigvalsh(by_label[true.label].covariance)[-1]) for true in log.truth.objects]
+    assert sigma[-1] > 0.5 * 3.0 > 5 * sigma[0]
+    assert (np.diff(sigma) > 0).all()
