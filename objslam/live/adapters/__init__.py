@@ -51,7 +51,7 @@ class Feed:
     """An adapter, what else wants to see the snapshots, and what to close in the end."""
 
     adapter: Adapter
-    views: tuple[Callable[[Snapshot], None], ...] = ()
+    views: tuple[Callable[[Snapshot], object], ...] = ()
     close: tuple[Callable[[], None], ...] = ()
 
 
