@@ -69,7 +69,8 @@ def _curves(solver: bool) -> Any:
 def _live_curves() -> Any:
     import rerun.blueprint as rrb
 
-    views = [_curve([f"plots/live/{name}"], name) for name in ("lag", "objects", "dropped")]
+    names = {"lag": "lag, ms", "objects": "objects", "dropped": "dropped"}
+    views = [_curve([f"plots/live/{path}"], name) for path, name in names.items()]
     return rrb.Tabs(*views, rrb.TextDocumentView(origin="summary", name="counters"), active_tab=0)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.label_layout import place_labels
 from objslam.scene import frame_objects
-from objslam.types import Floats, ObjectMap
+from objslam.types import Bools, Floats, ObjectMap
 
 _FOV = np.radians(55.0)  # the viewer's own, from the lower to the upper edge
 _VIEW = np.array([900.0, 620.0])  # px of the map's view in a window of 1600 x 900
@@ -31,6 +31,11 @@ class Eye:
         x, y, depth = ((points - self.position) @ self.axes.T).T
         safe = np.maximum(depth, 1e-6)
         return np.column_stack([x, -y]) * self.focal / safe[:, None] + _VIEW / 2, depth
+
+    def has_in_view(self, points: Floats) -> Bools:
+        """Which points (N, 3) are seen."""
+        pixels, depth = self.see(points)
+        return ((pixels >= 0) & (pixels <= _VIEW)).all(axis=1) & (depth > 0)
 
     def offset(self, pixels: Floats, depth: Floats) -> Floats:
         """How far in map (N, 3), in the plane of the view at a depth (N,), so many pixels (N, 2) are."""

@@ -19,7 +19,6 @@ from objslam.viewer.story import map_changes
 from objslam.viewer.times import STAMP, is_date
 from objslam.viewer.wire import Frame, Shown
 
-_GROWN = 1.4  # times as far as before the eye must stand to see the whole: then it goes there
 _PATH = (40, 44, 52)
 _LOST = 2.0  # m; how far a ray is drawn that ends on no object
 
@@ -65,13 +64,13 @@ class LiveLog:
     def _look(self, shown: Shown, frames: list[Frame]) -> Eye:
         """The eye that sees the whole; the layout follows where the map has outgrown it, or there is a new camera."""
         eye = first_eye(shown.map, shown.path)
-        far, before = np.linalg.norm(eye.position - eye.target), self._eye
-        size = float(far)
+        size, before = float(np.linalg.norm(eye.position - eye.target)), self._eye
+        places = np.concatenate([np.array([o.position for o in shown.map.objects]).reshape(-1, 3), shown.path])
         new = [f.camera for f in frames if f.camera.name not in self._cameras]
         for camera in new:
             self._cameras[camera.name] = camera_path(camera)
             log_pinhole(self._recording, self._cameras[camera.name], camera, 1.0, size)
-        if before is None or new or far > _GROWN * np.linalg.norm(before.position - before.target):
+        if before is None or new or (eye.has_in_view(places) & ~before.has_in_view(places)).any():
             layout = blueprint(eye, [(path, name) for name, path in self._cameras.items()], live=True)
             self._recording.send_blueprint(layout)
             self._eye = before = eye
