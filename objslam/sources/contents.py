@@ -75,19 +75,24 @@ def _missing(log: Log) -> tuple[str, ...]:
         missing.append("there is neither odometry nor localisation")
     if not log.cameras:
         missing.append("there is no camera")
-    path = log.localization or log.odometry
     for camera_log in log.cameras:
         where = f"camera {camera_log.camera.name}"
         frames = _frames(camera_log)
         if camera_log.detections is None:
             images = "run a detector on its images (--detector)" if camera_log.rgb is not None else "and no images either"
             missing.append(f"{where}: no detections; {images}")
-        if path is not None and len(frames) and not ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
-            missing.append(
-                f"{where}: none of its frames ({frames[0]:.3f} to {frames[-1]:.3f} s) is on the path "
-                f"({path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s); do both use one clock?"
-            )
+        missing += off_path(where, frames, log.localization or log.odometry)
     return tuple(missing)
+
+
+def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
+    """What to say where none of a camera's frames (N,), s, lies on the path; nothing where one does."""
+    if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
+        return []
+    return [
+        f"{where}: none of its frames ({frames.min():.3f} to {frames.max():.3f} s) is on the path "
+        f"({path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s); do both use one clock?"
+    ]
 
 
 def _frames(camera_log: CameraLog) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.errors import LogError
 from objslam.ledger import Ledger
-from objslam.sources.contents import Timing, timing
+from objslam.sources.contents import Timing, off_path, timing
 from objslam.sources.ros.log import Assembly, BagOptions, assemble
 from objslam.sources.ros.survey import COMPRESSED, TF, Topic
 from objslam.sources.ros.tf_tree import TfTree
@@ -110,9 +110,14 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
 
 def _missing(assembly: Assembly) -> tuple[str, ...]:
     missing = [str(error) for error in (*assembly.problems, *assembly.left_out)]
+    found = assembly.paths
+    path = (found.localization or found.odometry) if found is not None else None
     for topics, camera, _ in assembly.cameras:
+        where, frames = f"camera {camera.name}", topics.detections or topics.image
         if topics.detections is None:
-            missing.append(f"camera {camera.name}: no detections; a detector must be run on its images")
+            missing.append(f"{where}: no detections; run a detector on its images (--detector)")
+        if frames is not None:
+            missing += off_path(where, frames.times() / 1e9, path)
     return tuple(missing)
 
 

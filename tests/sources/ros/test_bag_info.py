@@ -56,11 +56,22 @@ def test_a_drive_at_a_glance(makers, tmp_path, log, kind):
 def test_images_without_detections_need_a_detector(makers, tmp_path, log):
     maker = makers["4"]
     rows = [row for row in rows_of(log, maker) if "detections" not in row[0]]
-    image = maker.image(rows[-1][1], np.zeros((480, 640, 3), np.uint8), "bgr8", "front_optical_frame")
+    image = maker.image(rows[-1][1] - 10**9, np.zeros((480, 640, 3), np.uint8), "bgr8", "front_optical_frame")
     info = describe(write_bag(tmp_path / "x", "mcap-zstd", maker, [*rows, ("/front/image_raw", rows[-1][1], image)]))
-    assert info.missing == ("camera front: no detections; a detector must be run on its images",)
+    assert info.missing == ("camera front: no detections; run a detector on its images (--detector)",)
     (topic,) = [topic for topic in info.topics if topic.name == "/front/image_raw"]
     assert (topic.role, topic.detail) == ("image", "640x480 bgr8")
+
+
+def test_frames_of_another_clock(makers, tmp_path, log):
+    maker = makers["4"]
+    rows = [row for row in rows_of(log, maker) if "detections" not in row[0]]
+    stamp = 10**9
+    rows.append(
+        ("/front/detections", rows[-1][1], maker.detections(stamp, [(0, 0, 9, 9, "cup", 0.5)], "front_optical_frame"))
+    )
+    (line,) = describe(write_bag(tmp_path / "x", "mcap-none", maker, rows)).missing
+    assert line.startswith("camera front: none of its frames (1.000 to 1.000 s) is on the path")
 
 
 def test_all_that_is_missing_is_listed(makers, tmp_path):
