@@ -118,9 +118,9 @@ class RosMessages:
             elif type_ in (IMAGE, COMPRESSED) and self._detector is not None:
                 self._detector.offer(topic, message, _stamp(message.header, received))
 
-    def refuse(self, reason: str, where: str) -> None:
-        """Count a message that never became an object."""
-        self._drop(reason, where)
+    def refuse(self, reason: str, where: str, count: int = 1) -> None:
+        """Count messages that never became objects."""
+        self._drop(reason, where, count)
 
     def tick(self) -> None:
         """To be called some times a second: gives up on what has waited too long."""
@@ -136,9 +136,9 @@ class RosMessages:
         """The topic (or "tf") that plays a role by now."""
         return self._sources.get(role)
 
-    def _drop(self, reason: str, where: str = "") -> None:
+    def _drop(self, reason: str, where: str = "", count: int = 1) -> None:
         with self._lock:
-            self.ledger.drop(reason, where=where[:_LONGEST] or None)
+            self.ledger.drop(reason, count, where[:_LONGEST] or None)
 
     def _takes(self, role: str, source: str) -> bool:
         """Whether a source plays a role: the one that was chosen, else the first that came."""

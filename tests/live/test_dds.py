@@ -19,7 +19,7 @@ sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker, serialize
 
 from objslam.errors import ConfigError, ObjslamError
-from objslam.live.adapters.dds import DdsAdapter
+from objslam.live.adapters.dds import DdsAdapter, _Publication
 from objslam.live.dds_network import open_network
 from objslam.live.dds_types import dds_topic, dds_type, layouts_of, ros_topic, ros_type
 from objslam.live.ros_messages import RosMessages, RosOptions, parse_topics
@@ -160,6 +160,15 @@ def test_an_older_layout_of_vision_msgs_is_read(domain):
     ((_, _, boxes, labels, scores, tracks, _),) = sink.detections
     np.testing.assert_allclose(boxes, [box[0][:4]])
     assert (labels, scores.tolist(), tracks) == (["mug"], [0.5], [4])
+
+
+def test_a_type_that_nobody_knows_is_left_out_with_a_warning():
+    adapter = DdsAdapter(None, RosMessages(Recorder()), TopicChoice())
+    adapter._publications[1] = _Publication("/tags", "my_apriltag/msg/TagArray", (True, False), None)
+    assert adapter._open(0.0) == []
+    assert adapter.ledger.warnings == [
+        "/tags: its type my_apriltag/msg/TagArray is not known, and DDS does not bring definitions: left out"
+    ]
 
 
 def test_the_types_are_those_that_others_use():

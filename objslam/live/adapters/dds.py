@@ -22,6 +22,7 @@ _HEAD_START = 1.0  # s for all publishers to be found before one of several is c
 _LONELY = 5.0  # s without any publisher, or with one that does not match, before that is said
 _DEPTH = 1000  # messages that a reader keeps: 5 s of odometry at 200 Hz
 _TAKE = 200
+_MAX_READERS = 256
 _LATCHED = (*TF, CAMERA_INFO)  # types whose past messages matter as well
 _MIN_BUFFER = 2 << 20
 
@@ -119,7 +120,8 @@ class DdsAdapter:
         opened = []
         for publication in list(self._publications.values()):
             key = publication.topic, publication.kind
-            if publication.topic in wanted and key not in self._readers:
+            fits = publication.topic in wanted and publication.type == offered[publication.topic]
+            if fits and key not in self._readers and len(self._readers) < _MAX_READERS:
                 reader = self._make_reader(publication)
                 if reader is not None:
                     self._readers[key] = reader
@@ -136,8 +138,10 @@ class DdsAdapter:
 
         topic, type_, (reliable, latched) = publication.topic, publication.type, publication.kind
         layouts = layouts_of(type_)
-        same = (t for t in layouts if publication.type_id is not None and t.__idl__.get_type_id() == publication.type_id)  # type: ignore[attr-defined]
-        layout = next(same, layouts[0])
+        if not layouts:
+            self.ledger.warn(f"{topic}: its type {type_} is not known, and DDS does not bring definitions: left out")
+            return None
+        layout = next((layout for layout in layouts if _is_of(publication, layout)), layouts[0])
         images = type_ in (IMAGE, COMPRESSED)
         qos = Qos(
             Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
@@ -183,13 +187,11 @@ class DdsAdapter:
     def _count_losses(self) -> None:
         for reader in self._readers.values():
             lost = reader.entity.get_sample_lost_status().total_count
-            for _ in range(lost - reader.lost):
-                self.messages.refuse("message lost on the way (DDS)", reader.topic)
+            self.messages.refuse("message lost on the way (DDS)", reader.topic, lost - reader.lost)
             reader.lost = lost
         for topic, count in list(self.network.unread.items()):
             name = ros_topic(topic) or "a packet that is not DDS"
-            for _ in range(count - self._unread.get(topic, 0)):
-                self.messages.refuse("malformed payload (DDS)", name)
+            self.messages.refuse("malformed payload (DDS)", name, count - self._unread.get(topic, 0))
             self._unread[topic] = count
 
     def _say_what_is_missing(self, age: float) -> None:
@@ -207,6 +209,11 @@ class DdsAdapter:
                     self.ledger.warn(
                         f"{reader.topic}: there is a publisher, but its QoS or layout of {reader.type} does not match"
                     )
+
+
+def _is_of(publication: _Publication, layout: Any) -> bool:
+    """Whether a publisher says that its messages have this layout; older ones do not say."""
+    return publication.type_id is not None and layout.__idl__.get_type_id() == publication.type_id
 
 
 def _kind(qos: Any, type_: str) -> _Kind:
