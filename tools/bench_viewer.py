@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import signal
+import sys
 import tempfile
 import time
 from pathlib import Path
