@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from objslam.sources.ros.decode import Undecodable, typestores
 from objslam.sources.ros.records import type_name
 
@@ -110,9 +108,3 @@ def _idl_types() -> Any:
     from cyclonedds.idl import types
 
     return types
-
-
-def pack(type_: str, message: Any) -> Any:
-    """A message of rosbags as a sample that a DDS writer takes; its layout is the first that is known."""
-    store = typestores(type_, "cdr", "", "msg")[0]
-    return layouts_of(type_)[0](np.asarray(store.serialize_cdr(message, type_)).tobytes())
