@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +14,7 @@ import open3d as o3d
 from objslam.geometry import inverse, make_pose
 from objslam.types import Floats, Surface
 
-BACKGROUND = (246, 246, 247)
+BACKGROUND = (255, 255, 255)
 _PASSES = 6  # walls seen from behind that a ray may go through
 _NEAR = 0.05  # m in front of the eye is not drawn
 _HIDDEN = 0.22  # share of a line's opacity that is left behind a surface
@@ -63,9 +65,7 @@ class Picture:
         """Polylines, each (N, 3) m in map; colour RGB, width px of the saved picture."""
         seen, hidden = (np.zeros(self.depth.shape, np.uint8) for _ in range(2))
         for strip in strips:
-            fine = np.concatenate(
-                [np.linspace(a, b, 60, endpoint=False) for a, b in zip(strip[:-1], strip[1:], strict=True)] + [strip[-1:]]
-            )
+            fine = np.concatenate([np.linspace(a, b, 60, endpoint=False) for a, b in pairwise(strip)] + [strip[-1:]])
             pixels, z = self.view.project(fine)
             middle, at = (z[:-1] + z[1:]) / 2, (pixels[:-1] + pixels[1:]) / 2
             shown = (z[:-1] > _NEAR) & (z[1:] > _NEAR)
@@ -114,6 +114,15 @@ class Picture:
     def _blend(self, mask: np.ndarray, colour: Sequence[int], opacity: float) -> None:
         share = (opacity / 255.0) * mask[..., None].astype(np.float32)
         self.image = self.image * (1 - share) + np.array(colour, np.float32) * share
+
+
+def save(image: np.ndarray, file: Path) -> None:
+    """Write a PNG of 256 colours, a third of the size of all of them."""
+    from PIL import Image
+
+    full = Image.fromarray(image)
+    few = full.quantize(256, method=Image.Quantize.MAXCOVERAGE)
+    full.quantize(palette=few, dither=Image.Dither.FLOYDSTEINBERG).save(file, optimize=True)
 
 
 def _render(surface: Surface, view: View) -> tuple[np.ndarray, Floats]:

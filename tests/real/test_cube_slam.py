@@ -30,3 +30,21 @@ def test_the_joint_mode_leaves_good_poses_where_they_are(data_dir):
     assert moved.max() < 0.05
     (cabinet,) = result.map.resolved()
     assert np.linalg.norm(cabinet.position[:2] - CABINET) <= 0.06
+
+
+def test_the_cabinet_stands_in_its_own_surface(data_dir):
+    """The fused surface of the cabinet, the floor left out, holds the object; and its middle is what the poses say."""
+    log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
+    result = offline.run(log, load_settings(None, ("mode=fixed",)), Ledger())
+    assert result.surface is not None
+    vertices = result.surface.vertices
+    floor = np.median(vertices[:, 2])
+    assert abs(floor) < 0.03
+    near = np.linalg.norm(vertices[:, :2] - CABINET, axis=1) < 0.8
+    cabinet = vertices[near & (vertices[:, 2] > floor + 0.06)]
+    low, high = np.quantile(cabinet, [0.005, 0.995], axis=0)
+    (placed,) = result.map.resolved()
+    assert (low < placed.position).all()
+    assert (placed.position < high).all()
+    assert np.linalg.norm((low + high)[:2] / 2 - CABINET) < 0.05
+    assert (high - low).max() < 1.0
