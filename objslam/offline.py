@@ -100,6 +100,7 @@ def _summary(
 ) -> dict[str, Any]:
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
+        "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
         "detection_frames": sum(len(detections.frame_stamps) for detections in found),
         "frames_on_path": frames,
         "detections": sum(len(detections) for detections in found),

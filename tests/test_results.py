@@ -236,6 +236,9 @@ def test_a_result_holds_what_was_estimated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rays["origin"], result.origins)
     np.testing.assert_array_equal(rays["direction"], result.directions)
     np.testing.assert_array_equal(rays["weight"], result.weight)
+    np.testing.assert_array_equal(rays["box"], result.rays.box)
+    np.testing.assert_array_equal(rays["score"], result.rays.score)
+    assert rays["camera"] == ["front"] * len(result.rays)
     unresolved = strict_json(tmp_path / "objects.json")["objects"][2]  # type: ignore[index]
     assert set(unresolved["ray"]) == {"origin", "direction"}
 

@@ -28,6 +28,7 @@ from objslam.types import MapObject, ObjectMap
 _UNIX_TIME = 1e8  # s; stamps beyond it are dates
 _BINS, _FEW_BINS = 32, 16
 _EXPLAINED = {
+    "images": "colour images",
     "detection_frames": "camera frames",
     "frames_on_path": "of them on the path",
     "keyframes": "of them with a usable box",
@@ -84,7 +85,7 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
     errors, scores = _evaluation(out, objects)
     mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
     chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
-    images, no_images = images_of(log or _log_path(summary), summary.get("images")) if crops else ({}, None)
+    images, no_images = images_of(log or _log_path(summary), summary.get("counts", {}).get("images")) if crops else ({}, None)
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     begin = float(rays.stamp.min()) if len(rays) else 0.0
