@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def coarser(surface: Surface, most: int) -> Surface:
         triangles = into[surface.triangles].astype(np.int32)
         a, b, c = triangles.T
         normals = _sums(surface.normals, into, len(counts))
-        return Surface(
+        few = Surface(
             vertices=(_sums(surface.vertices, into, len(counts)) / counts[:, None]).astype(np.float32),
             normals=(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)).astype(np.float32),
             colours=None
@@ -58,7 +59,16 @@ def coarser(surface: Surface, most: int) -> Surface:
             else (_sums(surface.colours, into, len(counts)) / counts[:, None]).round().astype(np.uint8),
             triangles=triangles[(a != b) & (b != c) & (c != a)],
         )
+        return _not_turned(few)
     return surface
+
+
+def _not_turned(surface: Surface) -> Surface:
+    """Without the triangles that were turned over: where both sides of something thin fell into one cell."""
+    a, b, c = (surface.vertices[corner] for corner in surface.triangles.T)
+    normal = surface.normals[surface.triangles].sum(axis=1)
+    right = np.einsum("ti,ti->t", np.cross(b - a, c - a), normal) > 0
+    return replace(surface, triangles=surface.triangles[right])
 
 
 def _sums(values: Any, into: Any, count: int) -> Any:
