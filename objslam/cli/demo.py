@@ -54,4 +54,4 @@ def demo(
         run_log(read(log, ledger), settings, ledger, out / mode, model)
         # a map from odometry alone begins where the odometry does: how it lies in the room is not its to say
         evaluate_folder(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
-    say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: rerun {out / 'joint' / 'recording.rrd'}")
+    say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: objslam view {out / 'joint'}")
