@@ -125,7 +125,7 @@ def _log_marks(recording: Any, f: Field, o: MapObject, name: str, eye: Eye) -> N
     ):
         if not np.isfinite(place).all():
             continue
-        recording.log(f"map/field/{path}", rr.Points3D([place], colors=[colour], radii=0.03 * size), static=True)
+        recording.log(f"map/field/{path}", rr.Points3D([place], colors=[colour], radii=0.045 * size), static=True)
         top = place + nearer + [0.0, 0.0, lift * size]
         text = rr.Points3D([top], colors=[_TEXT], radii=0.0, labels=[label], show_labels=True)
         recording.log(f"map/field/{path}/label", text, static=True)
