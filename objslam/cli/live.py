@@ -133,11 +133,14 @@ def live(
 
 def _look_for_journal(file: Path, resume: bool) -> None:
     from objslam.errors import OutputError
+    from objslam.ledger import Ledger
+    from objslam.live.journal import is_journal, messages
     from objslam.results import SUMMARY
 
     if resume and not file.is_file():
         raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
-    if not resume and file.is_file() and not (file.parent / SUMMARY).is_file():
+    unfinished = is_journal(file) and not (file.parent / SUMMARY).is_file()
+    if not resume and unfinished and next(messages(file, Ledger()), None) is not None:
         raise OutputError(
             "the journal of a session that did not end",
             where=str(file),

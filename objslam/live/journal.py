@@ -10,7 +10,7 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-import time
+import threading
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,7 +40,6 @@ class Journal:
     def __init__(self, file: Path, resume: bool = False) -> None:
         """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use."""
         self.file = file
-        self._synced = time.monotonic()
         try:
             self._stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
@@ -57,22 +56,39 @@ class Journal:
         self._end = end
         if end == 0:
             self._append(MAGIC)
+        self._closed = threading.Event()
+        self._unsynced: OSError | None = None
+        self._syncing = threading.Thread(target=self._sync, name="objslam journal", daemon=True)
+        self._syncing.start()
 
     def write(self, message: Message) -> None:
-        """Append one message. When this returns, a killed process has not lost it."""
+        """Append one message. When this returns, a killed process has not lost it; a second later, nor has a machine."""
+        if self._unsynced is not None:
+            raise OutputError(f"cannot write the journal: {self._unsynced.strerror}", where=str(self.file))
         content = encode(message)
         self._append(_HEAD.pack(len(content), zlib.crc32(content)) + content)
-        now = time.monotonic()
-        if now - self._synced > _SYNC_EVERY:
-            self._synced = now
-            os.fdatasync(self._stream)
 
     def close(self) -> None:
         """All of it to the disk; nothing is written any more."""
         if self._stream >= 0:
+            self._closed.set()
+            self._syncing.join()
             os.fsync(self._stream)
             os.close(self._stream)
             self._stream = -1
+
+    def _sync(self) -> None:
+        """In a thread of its own: a disk takes milliseconds for it, a slow one far more, and no message is to wait."""
+        synced = 0
+        while not self._closed.wait(_SYNC_EVERY):
+            end = self._end
+            if end != synced:
+                try:
+                    os.fdatasync(self._stream)
+                except OSError as error:
+                    self._unsynced = error
+                    return
+                synced = end
 
     def _append(self, data: bytes) -> None:
         try:

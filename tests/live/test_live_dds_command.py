@@ -1,0 +1,56 @@
+"""objslam live dds, as a user runs it: a robot in one process, the session in another, Ctrl-C at the end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from robot import Drive, sent, start
+
+pytest.importorskip("cyclonedds")
+
+
+def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
+    domain = 10 + os.getpid() % 9
+    env = {name: value for name, value in os.environ.items() if name != "CYCLONEDDS_URI"}
+    command = [
+        sys.executable,
+        "-m",
+        "objslam",
+        "live",
+        "dds",
+        "--domain",
+        str(domain),
+        "-o",
+        str(tmp_path / "out"),
+        "--publish",
+    ]
+    command += ["--set", "output.recording=false", "--set", "output.picture=false"]
+    live = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    said = sent(start(Drive(domain, seconds=3.0, bad=2)))
+    time.sleep(0.5)
+    live.send_signal(signal.SIGINT)
+    out, err = live.communicate(timeout=60)
+    assert live.returncode == 0, err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["live"]["odometry"] == len(said["odometry"])
+    assert summary["live"]["frames"] == len(said["detections"])
+    assert summary["live"]["localization"] == 1
+    assert summary["dropped"]["message that cannot be decoded"] == 2
+    assert "wrote" in out
+
+
+def test_wrong_use_is_one_line(tmp_path):
+    for options, code, words in (
+        (["dds", "--domain", "999"], 2, "no DDS domain"),
+        (["dds", "--interface", "no such"], 2, "no network interface"),
+        (["dds", "--topic", "wheels=/odom"], 2, "is not role=/name"),
+        (["rclpy"], 1, "rclpy cannot be imported"),
+    ):
+        command = [sys.executable, "-m", "objslam", "live", *options, "-o", str(tmp_path / "out")]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert (done.returncode, len(done.stderr.strip().splitlines())) == (code, 1), done.stderr
+        assert words in done.stderr
