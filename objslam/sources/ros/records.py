@@ -13,7 +13,7 @@ Message = tuple["Connection", int, bytes]
 """Connection, time of recording (ns), and the serialised message."""
 Messages = Iterator[Message]
 
-_MAX_NAME = 256
+MAX_NAME = 256
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
 
@@ -75,14 +75,15 @@ class FileReport:
 
 def plain(name: str) -> str:
     """The name of a topic or frame as one line can show it: what is not printable is replaced, what is long is cut."""
-    if len(name) <= _MAX_NAME and name.isprintable():
+    if len(name) <= MAX_NAME and name.isprintable():
         return name
-    return "".join(c if c.isprintable() else "\ufffd" for c in name[:_MAX_NAME])
+    return "".join(c if c.isprintable() else "\ufffd" for c in name[:MAX_NAME])
 
 
 def frame_name(frame_id: str) -> str:
     """A frame as tf knows it: ROS 1 wrote some of them with a leading slash."""
-    return plain(frame_id.lstrip("/"))
+    name = frame_id.lstrip("/")
+    return name if len(name) <= MAX_NAME and name.isprintable() else plain(name)
 
 
 def type_name(name: str) -> str:

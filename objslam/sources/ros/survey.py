@@ -15,7 +15,7 @@ from objslam.sources.boxes import BoxCollector
 from objslam.sources.ros.boxes2d import MAX_BOXES, Found, tag_boxes, vision_boxes
 from objslam.sources.ros.decode import Undecodable, make_decoder, read_head, read_length
 from objslam.sources.ros.recording import Recording, read_messages
-from objslam.sources.ros.records import Connection, FileReport, frame_name
+from objslam.sources.ros.records import MAX_NAME, Connection, FileReport, frame_name
 from objslam.sources.ros.rows import PoseRows, choose_times
 from objslam.sources.ros.tf_tree import MAX_TRANSFORMS, TfRows
 from objslam.types import Floats, Ints
@@ -32,7 +32,8 @@ _MAX_TOPICS = 10_000
 class Topic:
     """What one pass learned of a topic.
 
-    logged: times of recording, ns. stamps: the header's, ns, for the types that matter. frames: frame_ids and how often.
+    logged: times of recording, ns. stamps: the header's, ns, for the types that matter. frames: frame_ids and how often, as
+    they came.
     refused: why messages could not be used, and how many. poses: by (frame, child frame). boxes: with the tracker's names
     and, by the index of the box, the points of tags that come without a box. infos: distinct CameraInfo messages. image:
     the first message, decoded.
@@ -63,7 +64,7 @@ class Topic:
     @property
     def frame(self) -> str:
         """The frame_id that most messages carry, without a leading slash; "" if none does."""
-        return max(self.frames, key=lambda frame: self.frames[frame], default="")
+        return frame_name(max(self.frames, key=lambda frame: self.frames[frame], default=""))
 
     def times(self) -> Ints:
         """(N,) ns: the header's stamps; the times of recording where there are none, or all are zero."""
@@ -143,20 +144,21 @@ def _stamped(connection: Connection, topic: Topic, data: bytes) -> int:
     """Note the header of a message; the number behind it is returned."""
     stamp, frame, number = read_head(data, connection.encoding)
     topic.stamps.append(stamp)
-    topic.frames[frame_name(frame)] += 1
+    topic.frames[frame[:MAX_NAME]] += 1
     return number
 
 
 def _poses(connection: Connection, topic: Topic, decode: Callable[[bytes], Any]) -> Callable[[bytes, int], None]:
     odometry, covariance = connection.type == ODOMETRY, connection.type != POSES[0]
+    rows_of: dict[tuple[str, str], PoseRows] = {}  # by the names as they came, which are a few
 
     def handle(data: bytes, logged: int) -> None:
         _stamped(connection, topic, data)
         message = decode(data)
-        frame = frame_name(message.header.frame_id), frame_name(message.child_frame_id) if odometry else ""
-        rows = topic.poses.get(frame)
+        names = message.header.frame_id[:MAX_NAME], message.child_frame_id[:MAX_NAME] if odometry else ""
+        rows = rows_of.get(names)
         if rows is None:
-            rows = topic.poses[frame] = PoseRows()
+            rows = rows_of[names] = topic.poses.setdefault((frame_name(names[0]), frame_name(names[1])), PoseRows())
         pose = message.pose.pose if covariance else message.pose
         rows.add(topic.stamps[-1], logged, pose.position, pose.orientation)
 
@@ -201,7 +203,8 @@ def _boxes(connection: Connection, topic: Topic, decode: Callable[[bytes], Any],
     boxes = topic.boxes
 
     def handle(data: bytes, logged: int) -> None:
-        if read_head(data, connection.encoding)[2] > MAX_BOXES:
+        stamp, frame, number = read_head(data, connection.encoding)
+        if number > MAX_BOXES:
             raise Undecodable(f"more than {MAX_BOXES} detections in one message")
         if len(data) > _MAX_SMALL:
             raise Undecodable(f"a message of more than {_MAX_SMALL >> 20} MiB")
@@ -209,7 +212,8 @@ def _boxes(connection: Connection, topic: Topic, decode: Callable[[bytes], Any],
             found = list(find(decode(data)))
         except (AttributeError, TypeError, LookupError, ValueError) as error:
             raise Undecodable(f"not laid out as detections are ({error})") from error
-        _stamped(connection, topic, data)
+        topic.stamps.append(stamp)
+        topic.frames[frame[:MAX_NAME]] += 1
         place = f"{topic.name} at {logged / 1e9:.3f} s"
         boxes.add_frame(logged / 1e9, place)
         for box, name, score, track, points in found:
