@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import DetectorError
-from objslam.live.ros_cameras import Boxes, Drop
+from objslam.live.frames import Boxes, Drop
 from objslam.sources.ros.decode import Undecodable
 from objslam.sources.ros.images import colour_image
 from objslam.sources.ros.records import frame_name

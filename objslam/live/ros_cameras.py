@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from objslam.errors import LogError
+from objslam.live.depth_images import DepthImages
+from objslam.live.frames import Boxes, Drop
 from objslam.live.interface import Sink
 from objslam.live.tf_buffer import TfBuffer, Unknown
 from objslam.sources.camera_file import Calibration
@@ -23,35 +25,10 @@ from objslam.types import Camera, Floats
 PATIENCE = 1.0
 """s that boxes wait for their camera's calibration and place; a transform is behind its image by a moment at the most."""
 
+_DEPTH_WAIT = 0.2  # s that boxes wait for a depth image
 _MAX_WAITING = 200
 _MAX_CAMERAS = 64
 _STILL = 1e-9
-
-Drop = Callable[[str, str], None]
-"""Called with the reason why something was dropped, and where."""
-
-
-@dataclass
-class Boxes:
-    """The boxes of one image: stamp, s; frame: the camera's, as tf names it, "" where unknown; arrived: s, any clock.
-
-    points: by the index of its box, a tag that comes without a box (see boxes2d). size: of the image, where known.
-    """
-
-    topic: str
-    stamp: float
-    frame: str
-    arrived: float
-    boxes: Floats
-    labels: Sequence[str]
-    scores: Floats
-    track_ids: Sequence[int] | None = None
-    points: dict[int, Floats] = field(default_factory=dict)
-    size: tuple[int, int] | None = None
-
-    @property
-    def place(self) -> str:
-        return f"{self.topic} at {self.stamp:.3f} s"
 
 
 @dataclass
@@ -86,6 +63,7 @@ class Cameras:
         self._frames: list[str] = []
         self._waiting: deque[Boxes] = deque()
         self._topics: dict[str, str] = {}
+        self._depths = DepthImages(drop)
 
     def add_info(self, topic: str, info: Any) -> None:
         """Take a sensor_msgs/CameraInfo: a calibration that changes is pushed anew with the next boxes."""
@@ -99,6 +77,10 @@ class Cameras:
             return
         self._infos[frame] = key, topic, info
         self._known = {name: known for name, known in self._known.items() if frame not in (name, known.source)}
+
+    def add_depth(self, topic: str, message: Any, stamp: float) -> None:
+        """Take a depth image, registered to the camera whose frame it has: the boxes of that moment get their depths."""
+        self._depths.add(topic, message, stamp)
 
     def add(self, boxes: Boxes) -> None:
         """Push boxes, or keep them until they can be. Of each camera, those of one topic: two would count things twice."""
@@ -142,6 +124,8 @@ class Cameras:
                 return str(unknown)
             self._drop("detection frame whose camera's place at that time is not known", f"{boxes.place}: {unknown}")
             return ""
+        if waited < _DEPTH_WAIT and self._depths.awaits(boxes):
+            return "its depth image has not come"
         if known.pushed is None:
             self._sink.push_camera(replace(camera, base_T_camera=place))
         elif np.abs(place - known.pushed).max() > _STILL:
@@ -149,7 +133,8 @@ class Cameras:
         known.pushed = place
         if boxes.points:
             boxes.boxes[list(boxes.points)] = boxes_of_points(camera, np.array(list(boxes.points.values())))
-        self._sink.push_detections(boxes.stamp, name, boxes.boxes, boxes.labels, boxes.scores, track_ids=boxes.track_ids)
+        depths = self._depths.at(boxes, camera)
+        self._sink.push_detections(boxes.stamp, name, boxes.boxes, boxes.labels, boxes.scores, depths, boxes.track_ids)
         return ""
 
     def _place(self, known: _Known, stamp: float) -> Floats:

@@ -13,8 +13,9 @@ import numpy as np
 
 from objslam.errors import ConfigError
 from objslam.ledger import Ledger
+from objslam.live.frames import Boxes
 from objslam.live.interface import Sink
-from objslam.live.ros_cameras import Boxes, Cameras
+from objslam.live.ros_cameras import Cameras
 from objslam.live.tf_buffer import TfBuffer, Unknown
 from objslam.sources.camera_file import Calibration
 from objslam.sources.ros.boxes2d import MAX_BOXES, tag_boxes, vision_boxes
@@ -114,6 +115,9 @@ class RosMessages:
                 self._take_boxes(type_, topic, message, received)
             elif type_ == CAMERA_INFO:
                 self._cameras.add_info(topic, message)
+                self._cameras.settle(self._clock())
+            elif type_ in (IMAGE, COMPRESSED) and topic in self._options.topics.get("depth", ()):
+                self._cameras.add_depth(topic, message, _stamp(message.header, received))
                 self._cameras.settle(self._clock())
             elif type_ in (IMAGE, COMPRESSED) and self._detector is not None:
                 self._detector.offer(topic, message, _stamp(message.header, received))

@@ -48,7 +48,8 @@ class TopicChoice:
         if type_ == CAMERA_INFO:
             return self._allows("camera_info", name, default=True)
         if type_ in (IMAGE, COMPRESSED):
-            return self.images and self._allows("image", name, default=False)
+            image = self.images and self._allows("image", name, default=False)
+            return image or self._allows("depth", name, default=False)
         if type_ == ODOMETRY and self._allows("odometry", name, default=False):
             return True
         return type_ in (ODOMETRY, *POSES) and self._allows("localization", name, default=False)

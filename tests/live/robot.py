@@ -60,6 +60,7 @@ class Recorder:
     localization: list = field(default_factory=list)
     mounts: list = field(default_factory=list)
     detections: list = field(default_factory=list)
+    depths: list = field(default_factory=list)
     lock: Any = field(default_factory=threading.Lock)
 
     def push_camera(self, camera):
@@ -79,6 +80,7 @@ class Recorder:
         return True
 
     def push_detections(self, stamp, camera, boxes, labels, scores, depths=None, track_ids=None):
+        self.depths.append(depths)
         self.detections.append((stamp, camera, np.array(boxes), list(labels), np.array(scores), track_ids, time.time()))
         return True
 

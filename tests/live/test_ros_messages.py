@@ -279,6 +279,39 @@ def test_two_detectors_on_one_camera_do_not_count_twice(maker):
     assert robot.dropped == {"detection frame of a camera from another topic than the one taken": 1}
 
 
+def test_depth_images_give_boxes_their_depth(maker):
+    robot = Robot(maker, topics=parse_topics(["depth=/front/depth"]))
+    robot.odometry(1.0)
+    robot.tf(0.0, ("base_link", OPTICAL, BASE_T_CAMERA), static=True)
+    robot.info()
+    robot.detections(1.0)
+    millimetres = np.full((480, 640), 2500, np.uint16)
+    millimetres[:, 250:] = 0
+    metres = np.full((480, 640), np.nan, np.float32)
+    metres[:, 250:] = 1.5
+
+    def depth(t, array, encoding):
+        robot.send("sensor_msgs/msg/Image", "/front/depth", maker.image(ns(t), array, encoding, OPTICAL))
+
+    depth(1.1, millimetres, "16UC1")
+    robot.detections(1.11)
+    robot.detections(1.3)  # before its depth image: it waits
+    assert len(robot.sink.detections) == 2
+    depth(1.3, metres, "32FC1")
+    depth(1.4, millimetres[::2], "16UC1")
+    robot.detections(1.4)
+    assert robot.sink.depths[0] is None
+    np.testing.assert_allclose(robot.sink.depths[1:], [[2.5, np.nan], [np.nan, 1.5], [np.nan, np.nan]])
+    robot.detections(1.5)
+    robot.now = 0.3
+    robot.messages.tick()
+    assert len(robot.sink.detections) == 5
+    assert robot.dropped == {
+        "depth image that has not the camera's size": 1,
+        "depth of a frame without a depth image": 1,
+    }
+
+
 def test_april_tags_are_boxes(maker):
     robot = Robot(maker)
     robot.odometry(1.0)

@@ -48,6 +48,7 @@ def wanted(*choices, images=False, settled=True, messages=None):
         (("odometry=tf", "detections=none"), False, set()),
         (("localization=/amcl_pose",), False, {"/amcl_pose", "/odom", "/front/detections", "/tags"}),
         (("image=/ui", "detections=/tags"), True, {"/odom", "/ui", "/tags"}),
+        (("depth=/front/depth/image", "detections=/tags"), False, {"/odom", "/front/depth/image", "/tags"}),
     ],
 )
 def test_topics_by_type_and_choice(choices, images, more):

@@ -112,11 +112,27 @@ def colour_image(message: Any) -> NDArray[Any]:
     return _convert(image, "COLOR_GRAY2BGR") if image.ndim == 2 else image
 
 
+def depth_image(message: Any) -> NDArray[Any]:
+    """A sensor_msgs/Image or CompressedImage of depth as (H, W), uint16, in `DEPTH_SCALE` units per metre, 0 where unknown.
+
+    Undecodable where it is none.
+    """
+    if not hasattr(message, "format"):
+        return _depth_units(_pixels(message)[0])
+    data, packing = bytes(message.data), message.format.lower().replace(" ", "")
+    if "compresseddepth" in packing:
+        return _compressed_depth(data, packing)
+    image = decode_image(data)
+    if image is None:
+        raise Undecodable(f"not an image of the format {message.format[:40]!r}")
+    return _depth_units(image)
+
+
 def _raw(message: Any, depth: bool) -> tuple[bytes, str]:
     """A sensor_msgs/Image as the content of a PNG file."""
-    image, conversion = _pixels(message)
     if depth:
-        return _encode(_depth_units(image)), ".png"
+        return _encode(depth_image(message)), ".png"
+    image, conversion = _pixels(message)
     if image.dtype == np.float32:
         raise Undecodable("it is of floats, which no colour image is")
     return _encode(image if conversion is None else _convert(image, conversion)), ".png"
@@ -153,19 +169,18 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 def _compressed(message: Any, depth: bool) -> tuple[bytes, str]:
     """A sensor_msgs/CompressedImage as the content of a file, and the ending of its name."""
     data = message.data.tobytes()
-    packing = message.format.lower().replace(" ", "")
-    if "compresseddepth" in packing:
-        return _compressed_depth(data, packing), ".png"
+    if depth or "compresseddepth" in message.format.lower().replace(" ", ""):
+        return _encode(depth_image(message)), ".png"
     ending = next((ending for magic, ending in _ENDINGS.items() if data.startswith(magic)), None)
-    if ending is not None and not depth:
+    if ending is not None:
         return data, ending
     image = decode_image(data)
     if image is None:
         raise Undecodable(f"not an image of the format {message.format[:40]!r}")
-    return _encode(_depth_units(image) if depth else image), ".png"
+    return _encode(image), ".png"
 
 
-def _compressed_depth(data: bytes, packing: str) -> bytes:
+def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
     """compressed_depth_image_transport: a PNG behind a header, of floats as quantised inverse depth (a / depth + b)."""
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise Undecodable("its compressed depth is not PNG")
@@ -176,7 +191,7 @@ def _compressed_depth(data: bytes, packing: str) -> bytes:
         a, b = np.frombuffer(data, dtype="<f4", count=2, offset=4)
         with np.errstate(divide="ignore", invalid="ignore"):
             image = np.where(image > 0, a / (image - b), np.nan).astype(np.float32)
-    return _encode(_depth_units(image))
+    return _depth_units(image)
 
 
 def _depth_units(image: NDArray[Any]) -> NDArray[Any]:
