@@ -13,13 +13,14 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.errors import SolveError
+from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.graph.factors import l_key, x_key
 from objslam.graph.optimise import levenberg_marquardt, read_points, read_poses
 from objslam.types import Floats, Ints
 
-_RELINEARISE = 0.02  # rad, m; a variable that moved by more is linearised anew
-_EVERY = 10  # updates, where nobody asks for it
+_RELINEARISE = (0.02, 0.05)  # rad, m; a variable that moved by more is linearised anew
+_EVERY = 1_000_000  # updates, where nobody asks for it: the caller knows when there is time
 _HELD = 1.0  # m; a prior on every landmark for a graph that is indeterminate without
 _HELD_POSE = (0.5, 2.0)  # rad, m; and on every pose, for one that is even then
 _EQ1_SIGMA, _L1_RADIANS = 0.05, 1e-4  # as `grow` has them
@@ -159,6 +160,37 @@ class IncrementalGraph:
         except RuntimeError:
             return np.full((3, 3), np.nan)
 
+    def relative_covariance(self, before: int, now: int) -> Floats:
+        """Covariance (6, 6) of X(now) as seen from X(before), in the frame of now's camera; NaN where the graph does not tell."""
+        try:
+            joint = self._isam.jointMarginalCovariance([x_key(before), x_key(now)]).fullMatrix()
+        except RuntimeError:
+            return np.full((6, 6), np.nan)
+        step = inverse(self.pose(before)) @ self.pose(now)
+        jacobian = np.hstack([-adjoint(inverse(step)), np.eye(6)])
+        return np.asarray(jacobian @ joint @ jacobian.T)
+
+    def save(self) -> tuple[object, ...]:
+        """What `restore` goes back to."""
+        self.refresh()
+        k = self._kept
+        rays = {number: list(group) for number, group in k.rays.items()}
+        kept = _Kept(dict(k.chain), dict(k.absolute), rays, dict(k.landmarks))
+        return kept, dict(self._poses), dict(self._points)
+
+    def restore(self, saved: tuple[object, ...]) -> None:
+        """The graph as it was when it was saved."""
+        self._kept, self._poses, self._points = saved  # type: ignore[assignment]
+        self._stale = False
+        self._fill(self._kept.graph())
+        self._clear()
+
+    def bend(self, ids: Ints, poses: Floats, landmarks: Ints, points: Floats) -> None:
+        """Keyframes ids (K,) at other poses (K, 4, 4), landmarks (n,) at other points (n, 3); `rebuild` or `solve` must follow."""
+        self.refresh()
+        self._poses.update(zip(ids.tolist(), poses, strict=True))
+        self._points.update(zip(landmarks.tolist(), points, strict=True))
+
     def solve(self, iterations: int) -> None:
         """All variables by Levenberg-Marquardt from where they are, for so many iterations, and iSAM2 anew from there.
 
@@ -227,7 +259,11 @@ class IncrementalGraph:
 
     def _empty(self) -> gtsam.ISAM2:
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(_RELINEARISE)
+        turn, way = _RELINEARISE
+        limits = gtsam.ISAM2ThresholdMap()
+        limits.insert(("x", np.array([turn] * 3 + [way] * 3)))
+        limits.insert(("l", np.array([way] * 3)))
+        parameters.setRelinearizeThreshold(limits)
         parameters.relinearizeSkip = _EVERY
         return gtsam.ISAM2(parameters)
 

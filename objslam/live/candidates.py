@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from objslam.association.refit import refit
 from objslam.association.sightings import Sightings
 from objslam.config import Settings
 from objslam.graph.incremental import IncrementalGraph
-from objslam.live.meeting import Meeting, information, meet, sightings
+from objslam.live.meeting import Meeting, information, meet, misses, sightings
 from objslam.types import Floats, Ints
 
 _DEPTH, _DEPTH_SIGMA = 2.5, 2.0  # m; where an object is taken to be that has been seen from one place only
-_AGAIN = 1.3  # times as many rays as when it was last tried, before it is tried again
+_AGAIN = 1.5  # times as many rays, or as wide a spread, as when it was last tried, before it is tried again
 _AGREE = 0.7  # share of the rays of a track that must agree, and of those that merely share a label
 _AGREE_BY_LABEL = 0.5
 _SLACK = 0.02  # m; the poses of one stretch fit each other that well
+_STEPS, _CAUCHY = 3, 6.0  # of the first guess, and squared deviations at which a ray counts half in it
+_RECENT = 30  # rays that a first guess is made of
 _LONGEST = 200  # rays that a candidate keeps: the older ones of a longer one are thinned
 
 
@@ -25,8 +27,8 @@ _LONGEST = 200  # rays that a candidate keeps: the older ones of a longer one ar
 class Candidate:
     """Rays of one thing: number of each ray, its keyframe, direction (3,) in the camera, sigma, range, range_sigma.
 
-    position (3,) and covariance (3, 3): a first guess in map. drift: (6, 6) gathered when it was last seen. by_label: its
-    rays share nothing but the label, and it waits as long as it takes.
+    position (3,) and covariance (3, 3): a first guess in map, from the rays as they lay when they came. drift: (6, 6)
+    gathered when it was last seen. by_label: its rays share nothing but the label, and it waits as long as it takes.
     """
 
     id: int
@@ -39,6 +41,10 @@ class Candidate:
     covariance: Floats = field(default_factory=lambda: np.eye(3))
     rays: list[tuple[int, int, Floats, float, float, float]] = field(default_factory=list)
     tried: int = 0
+    spread: float = 0.0
+    tried_spread: float = 0.0
+    _ahead: Floats | None = None
+    _lines: list[Floats] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -47,15 +53,19 @@ class Candidate:
         """The numbers of its rays."""
         return np.array([ray[0] for ray in self.rays], dtype=np.int64)
 
-    def keyframes(self) -> Ints:
-        """The keyframe of each ray."""
-        return np.array([ray[1] for ray in self.rays], dtype=np.int64)
-
-    def thin(self) -> None:
-        """At most so many rays, the older ones left out alternately."""
+    def extend(self, ray: tuple[int, int, Floats, float, float, float], map_T_camera: Floats) -> None:
+        """One more ray, from a camera that is taken to be there; of very many, the older ones are left out alternately."""
+        self.rays.append(ray)
         if len(self.rays) > _LONGEST:
             half = len(self.rays) // 2
             self.rays = self.rays[:half:2] + self.rays[half:]
+        _, _, direction, sigma, range_, range_sigma = ray
+        origin, n = map_T_camera[:3, 3], map_T_camera[:3, :3] @ direction
+        if self._ahead is None:
+            self._ahead = n
+            self.position = origin + (range_ if np.isfinite(range_) else _DEPTH) * n
+        self.spread = max(self.spread, math.acos(min(1.0, float(n @ self._ahead))))
+        self._lines = [*self._lines[1 - _RECENT :], np.array([*origin, *n, sigma, range_, range_sigma])]
 
     def sight(self, graph: IncrementalGraph) -> Sightings:
         """Its rays in map, as the graph has the poses now."""
@@ -64,32 +74,57 @@ class Candidate:
         ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], np.array(direction))
         return sightings(poses[:, :3, 3], ahead, np.array(sigma), np.array(range_), np.array(range_sigma))
 
-    def guess(self, graph: IncrementalGraph) -> None:
-        """Place it: where its rays meet if they do, else at a usual distance on the last one."""
-        s = self.sight(graph)
-        last = len(s) - 1
-        depth = s.range[last] if np.isfinite(s.range[last]) else _DEPTH
-        if len(s) == 1:
-            self.position = s.origin[last] + depth * s.direction[last]
-        else:
-            everything = np.arange(len(s))
-            self.position = refit(s, everything, 0 * everything, self.position[None], np.ones(1))[0]
-        n = s.direction[last]
-        along = np.outer(n, n) / _DEPTH_SIGMA**2
-        self.covariance = np.linalg.inv(information(s, self.position).sum(axis=0) + along + 1e-3 * np.eye(3))
+    def move(self, new_T_old: Floats) -> None:
+        """Put it where the map has been moved to by a pose (4, 4)."""
+        turn = new_T_old[:3, :3]
+        self.position = turn @ self.position + new_T_old[:3, 3]
+        self.covariance = turn @ self.covariance @ turn.T
+        self._ahead = None if self._ahead is None else turn @ self._ahead
+        for line in self._lines:
+            line[:3], line[3:6] = turn @ line[:3] + new_T_old[:3, 3], turn @ line[3:6]
+
+
+def place(candidates: list[Candidate]) -> None:
+    """Where candidates are, all at once: where the last of their rays meet; along these, what they do not tell stays."""
+    if not candidates:
+        return
+    number = np.array([len(c._lines) for c in candidates])
+    lines = np.concatenate([np.array(c._lines) for c in candidates])
+    index = np.repeat(np.arange(len(candidates)), number)
+    s = sightings(lines[:, :3], lines[:, 3:6], lines[:, 6], lines[:, 7], lines[:, 8])
+    points = np.array([c.position for c in candidates])
+    away = s.direction[np.cumsum(number) - 1]
+    hold = away[:, :, None] * away[:, None, :] / _DEPTH_SIGMA**2 + 1e-3 * np.eye(3)
+    for _ in range(_STEPS):
+        off = np.minimum(misses(s, points[index]), 1e3)
+        gain = information(s, points[index]) / (1 + off**2 / _CAUCHY)[:, None, None]
+        to = points[index] - s.origin
+        along = np.einsum("ri,ri->r", to, s.direction)
+        beyond = np.where(np.isfinite(s.range), s.range - along, 0.0)
+        target = (along + beyond)[:, None] * s.direction - to
+        total, pull = hold.copy(), np.zeros((len(candidates), 3, 1))
+        np.add.at(total, index, gain)
+        np.add.at(pull, index, gain @ target[:, :, None])
+        points = points + np.linalg.solve(total, pull)[:, :, 0]
+    total = hold
+    np.add.at(total, index, information(s, points[index]))
+    for candidate, point, covariance in zip(candidates, points, np.linalg.inv(total), strict=True):
+        candidate.position, candidate.covariance = point, covariance
 
 
 def ripe(candidate: Candidate, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> Meeting | None:
     """Where a candidate is once its rays carry that: enough of them, enough parallax or ranges, and hardly one against it."""
     live = settings.live
-    if len(candidate) < max(live.min_rays, _AGAIN * candidate.tried):
+    if len(candidate) < live.min_rays:
         return None
-    s = candidate.sight(graph)
-    ranged = bool(np.isfinite(s.range).any())
+    if len(candidate) < _AGAIN * candidate.tried and candidate.spread < _AGAIN * candidate.tried_spread:
+        return None
     least = np.radians(settings.joint.min_parallax_deg)
-    if not ranged and not _spread(s.direction) >= least:
+    ranged = any(np.isfinite(ray[4]) for ray in candidate.rays)
+    if not ranged and candidate.spread < least:
         return None
-    candidate.tried = len(candidate)
+    candidate.tried, candidate.tried_spread = len(candidate), candidate.spread
+    s = candidate.sight(graph)
     met = meet(s, rng, _SLACK)
     if met is None or met.agree.sum() < live.min_rays or (met.parallax < least and not ranged):
         return None
@@ -98,8 +133,3 @@ def ripe(candidate: Candidate, graph: IncrementalGraph, settings: Settings, rng:
     away = float(np.median(np.linalg.norm(met.position - s.origin[met.agree], axis=1)))
     surely = np.sqrt(np.linalg.eigvalsh(met.covariance)[-1]) <= settings.triangulation.max_rel_sigma * away
     return met if surely else None
-
-
-def _spread(direction: Floats) -> float:
-    """An upper bound on the parallax of directions (R, 3): twice the widest angle off the first."""
-    return 2 * float(np.arccos(np.clip(direction @ direction[0], -1.0, 1.0)).max())

@@ -10,16 +10,17 @@ import bisect
 
 import numpy as np
 
+from objslam.association.sightings import Sightings
 from objslam.config import Settings
 from objslam.geometry import adjoint, inverse, is_planar
 from objslam.graph import factors
 from objslam.graph.incremental import Bearings, IncrementalGraph
 from objslam.live import known as landmarks
 from objslam.live import upkeep
-from objslam.live.candidates import Candidate, ripe
+from objslam.live.candidates import Candidate, place, ripe
 from objslam.live.counters import Counters
 from objslam.live.matching import Doubt, FrameRays, best_of_label, in_map, match, match_by_label
-from objslam.live.meeting import information, misses
+from objslam.live.meeting import information, misses, sightings
 from objslam.live.messages import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
 from objslam.live.path import PathBuffer
 from objslam.live.table import Table
@@ -28,8 +29,8 @@ from objslam.types import Camera, Detections, Floats, Ints, Keyframes, label_tab
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
 _MOUNTS = 4096  # of one camera that are kept
-_SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop that closes: the graph is given more time,
-_TURNS = 3  # so many updates
+_SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop that closes: the graph is given more time
+_ASK = 10  # keyframes after which the graph is asked how well it knows where it is
 _CANDIDATES = 150  # at the most
 _TRACKS = 4096  # of the detector, that are remembered
 
@@ -49,12 +50,14 @@ class Mapper:
         self.by_label = settings.association.method != "global"
         self.together: dict[tuple[int, int], int] = {}
         self.apart: dict[tuple[int, int], int] = {}
+        self.looked_at: object = None
         self.rng = np.random.default_rng(settings.seed)
         self.waiting: list[tuple[float, int, FrameMessage, float]] = []
         seconds = settings.live.max_late + _KEPT
         self.odometry = PathBuffer(settings.odometry, seconds)
         self.localization = PathBuffer(settings.odometry, seconds)
         self.polished = self.frames = 0
+        self.unsettled = False
         self.tracks: dict[int, int] = {}
         self._label_number: dict[str, int] = {}
         self._mounts: dict[str, tuple[list[float], list[Floats]]] = {}
@@ -65,6 +68,7 @@ class Mapper:
         self._unlocalized: list[int] = []
         self._localizations = 0
         self._flat = True
+        self._doubts: dict[int, Floats] = {}
         self._next_ray = self._next_keyframe = self._next_object = self._next_candidate = self._count = 0
 
     @property
@@ -221,6 +225,7 @@ class Mapper:
         )
         for i in free.tolist():
             self._candidate(rays, i, numbers[i], k, stamp, doubt)
+        place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == k])
         if len(matched):
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
         self._births(k)
@@ -239,13 +244,7 @@ class Mapper:
         s = in_map(take(rays, matched), pose)
         known.position[rows] = self.graph.points(known.id[rows])
         off = misses(s, known.position[rows])
-        if (off * s.sigma).max() > _SETTLE:
-            for _ in range(_TURNS):
-                self.graph.update(relinearise=True)
-            pose = self.graph.pose(k)
-            s = in_map(take(rays, matched), pose)
-            known.position[rows] = self.graph.points(known.id[rows])
-            off = misses(s, known.position[rows])
+        self.unsettled |= bool((off * s.sigma).max() > _SETTLE)
         known.information[rows] += information(s, known.position[rows])
         known.squared[rows] += np.minimum(off, 6.0) ** 2
         known.seen[rows] += 1
@@ -321,11 +320,8 @@ class Mapper:
         self, candidate: Candidate, rays: FrameRays, i: int, number: int, k: int, stamp: float, doubt: Doubt
     ) -> None:
         seen = (rays.direction[i], float(rays.sigma[i]), float(rays.range[i]), float(rays.range_sigma[i]))
-        candidate.rays.append((int(number), k, *seen))
+        candidate.extend((int(number), k, *seen), self.graph.pose(k))
         candidate.last, candidate.drift = max(candidate.last, stamp), doubt.drift
-        candidate.thin()
-        if not candidate.by_label:
-            candidate.guess(self.graph)
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""
@@ -346,6 +342,20 @@ class Mapper:
             range_sigma=sigma,
         )
 
+    def sight(self, at: Ints) -> Sightings:
+        """Rows (n,) of the rays in map, as of the graph's last refresh."""
+        rays = self.rays
+        ids, index = np.unique(rays.keyframe[at], return_inverse=True)
+        poses = self.graph.poses(ids)[index]
+        ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], rays.direction[at])
+        return sightings(poses[:, :3, 3], ahead, rays.sigma[at], rays.range[at], rays.range_sigma[at])
+
+    def move_candidates(self, new_T_old: Floats, since: float) -> None:
+        """Candidates seen from a stamp on moved by a pose (4, 4), as the path was."""
+        for candidate in self.candidates:
+            if candidate.last >= since:
+                candidate.move(new_T_old)
+
     def rows_of(self, ids: Ints) -> Ints:
         """The rows of landmarks by their ids, which must be there."""
         return np.searchsorted(self.known.id, ids)
@@ -359,7 +369,11 @@ class Mapper:
         motion, covariance = factors.motions(self._pair(before, row), self.settings)
         k = int(self.keyframes.id[before])
         back = adjoint(inverse(motion[0]))
-        doubt = back @ self.graph.pose_covariance(k) @ back.T + covariance[0]
+        if k not in self._doubts:  # asked for now and then: between, the odometry adds to it
+            self._doubts = {k: self.graph.pose_covariance(k)}
+        doubt = back @ self._doubts[k] @ back.T + covariance[0]
+        if self._next_keyframe % _ASK:
+            self._doubts[self._next_keyframe] = doubt
         return self.graph.pose(k) @ motion[0], doubt, (motion[0], covariance[0])
 
     def _pair(self, before: int, row: dict[str, object]) -> Keyframes:
@@ -413,9 +427,7 @@ class Mapper:
         self.known.position[:] = self.known.position @ there[:3, :3].T + there[:3, 3]
         spun = there[:3, :3]
         self.known.information[:] = spun @ self.known.information @ spun.T
-        for candidate in self.candidates:
-            candidate.position = spun @ candidate.position + there[:3, 3]
-            candidate.covariance = spun @ candidate.covariance @ spun.T
+        self.move_candidates(there, -np.inf)
 
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
         """Some of the keyframes (n,), as offline has them."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.association.assign import gate_limit
 from objslam.association.landmarks import RANGE_LOSS, Landmarks
-from objslam.association.matches import Edges, choose, gated_edges
+from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
 from objslam.live.known import carried, covariances, noise
@@ -17,8 +17,9 @@ from objslam.live.table import Table
 from objslam.types import Floats, Ints
 
 _VIEW = np.cos(np.radians(40.0))  # landmarks further off every box of a frame are not looked at
-_CLEAR = 6.0  # squared deviations by which the best of several places that are all uncertain must be better
-_LOOSE = 3.0  # times the noise of a ray: a bearing that is predicted less well is uncertain
+_ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough
+_CLEAR = 6.0  # squared deviations by which the best of several places that are all rough must be better
+_WIDEST = 0.3  # m; a place that is rougher than that tells no landmark from another
 _BY_LABEL = 4.0  # times the gate, where only one object has the label
 
 
@@ -65,20 +66,23 @@ def match(
     tracks: the landmark (id) that a detector's track was given last.
     """
     rows, position, spread, noises = predicted(rays, map_T_camera, known, doubt)
-    waiting = [i for i, c in enumerate(candidates) if not c.by_label and c.label in rays.label]
+    here = set(rays.label.tolist())
+    waiting = [i for i, c in enumerate(candidates) if not c.by_label and c.label in here]
     if not len(rows) and not waiting:
         return np.full(len(rays), -1, dtype=np.int64)
     ours = [candidates[i] for i in waiting]
     places = np.concatenate([position, *(c.position[None] for c in ours)])
-    moved = [carried(c.position[None] - map_T_camera[:3, 3], doubt.drift - c.drift, map_T_camera, doubt.camera_from_drift)
-             for c in ours]  # fmt: skip
-    covariance = np.concatenate([spread, *(c.covariance + m for c, m in zip(ours, moved, strict=True))])
+    own = np.array([c.covariance for c in ours]).reshape(-1, 3, 3)
+    since = np.array([doubt.drift - c.drift for c in ours]).reshape(-1, 6, 6)
+    to = places[len(rows) :] - map_T_camera[:3, 3]
+    covariance = np.concatenate([spread, own + carried(to, since, map_T_camera, doubt.camera_from_drift)])
     label = np.concatenate([known.label[rows], np.array([c.label for c in ours], dtype=np.int64)])
     accepts = label[:, None] == np.arange(labels)
     s = in_map(rays, map_T_camera)
     limit = gate_limit(gate)
     edges = gated_edges(s, Landmarks(places, covariance, np.append(noises, np.ones(len(ours))), accepts), limit)
-    edges = _clear(edges, len(rows))
+    away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
+    edges = _clear(edges, rays.sigma[edges.ray] * away, len(rows))
     number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
@@ -86,8 +90,8 @@ def match(
         ids = np.append(known.id[rows], np.full(len(ours), -2))
         cost = cost - np.where(before[edges.ray] == ids[edges.landmark], 2.0, 0.0)
     unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
-    chosen = choose(edges, cost, np.zeros(len(rays), dtype=np.int64), unmatched)
-    return np.where(chosen >= 0, number[chosen], -1) if len(number) else chosen
+    chosen = _best(edges, cost, len(rays), len(places), unmatched)
+    return np.where(chosen >= 0, number[chosen], -1)
 
 
 def match_by_label(rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, gate: float) -> tuple[Ints, Ints]:
@@ -149,16 +153,29 @@ def predicted(
     return rows, known.position[rows], own + since, noise(known, rows)
 
 
-def _clear(edges: Edges, landmarks: int) -> Edges:
-    """Without the matches of rays that could as well be of another landmark, where both are expected somewhere there."""
-    loose = (edges.vague > 2 * np.log(_LOOSE)) & (edges.landmark < landmarks)
+def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
+    """The place of each ray (n,) of one frame, -1 none, with the least total cost: what `matches.choose` is for a log."""
+    from scipy.optimize import linear_sum_assignment
+
+    gain = np.zeros((rays, places))
+    gain[edges.ray, edges.landmark] = np.maximum(unmatched - cost, 0.0)
+    chosen = np.full(rays, -1, dtype=np.int64)
+    ray, place = linear_sum_assignment(gain, maximize=True)
+    real = gain[ray, place] > 0
+    chosen[ray[real]] = place[real]
+    return chosen
+
+
+def _clear(edges: Edges, own: Floats, landmarks: int) -> Edges:
+    """Without the matches to landmarks that are expected only roughly, where it could as well be another; own: (n,) m.
+
+    Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`).
+    """
+    rough = (edges.vague > 2 * np.log(_ROUGH)) & (edges.landmark < landmarks)
+    width = own * np.exp(edges.vague / 4)  # the side of a square as large as what the landmark covers
     order = np.lexsort((edges.cost, edges.ray))
     ray, cost = edges.ray[order], edges.cost[order]
-    doubtful = np.zeros(int(edges.ray.max(initial=-1)) + 1, dtype=bool)
-    second = np.flatnonzero((np.diff(ray) == 0) & (np.diff(cost) < _CLEAR)) + 1
-    first = np.flatnonzero(np.diff(ray, prepend=-1))
-    rivals = second[np.isin(second - 1, first)]
-    both = loose[order[rivals]] & loose[order[rivals - 1]]
-    doubtful[ray[rivals[both]]] = True
-    keep = ~(doubtful[edges.ray] & loose)
+    rivals = np.flatnonzero((np.diff(ray) == 0) & (np.diff(cost) < _CLEAR) & (np.diff(ray, prepend=-1)[:-1] != 0)) + 1
+    both = rough[order[rivals]] & rough[order[rivals - 1]]
+    keep = ~(rough & (np.isin(edges.ray, ray[rivals[both]]) | (width > _WIDEST)))
     return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])

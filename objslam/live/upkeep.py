@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.extent import grouped_median
-from objslam.association.sightings import Sightings
 from objslam.errors import SolveError
 from objslam.graph import factors
+from objslam.live.joining import join, without
 from objslam.live.known import covariances, noise
-from objslam.live.meeting import meet, misses, sightings
+from objslam.live.loops import close_loop
+from objslam.live.meeting import meet, misses
 from objslam.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
 _EVERY = 10  # keyframes
+_TURNS = 3  # updates that the graph is given when a loop has closed
 _FIRST, _GROWTH = (
     20,
     1.5,
@@ -44,10 +46,13 @@ def after_keyframe(m: Mapper) -> None:
     """Every few keyframes, whatever is due."""
     if m.keyframes_so_far % _EVERY:
         return
-    m.graph.update(relinearise=True)
+    for _ in range(_TURNS if m.unsettled else 1):
+        m.graph.update(relinearise=True)
+    m.unsettled = False
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
     if not m.by_label:
+        close_loop(m)
         _merge(m)
         _drop_ghosts(m)
     if len(m.keyframes) > m.settings.live.max_keyframes:
@@ -77,7 +82,7 @@ def _reconsider(m: Mapper) -> bool:
     if not len(held):
         return False
     row = m.rows_of(rays.owner[held])
-    s = _sight(m, held)
+    s = m.sight(held)
     off = misses(s, known.position[row])
     support = _support(off, row, rays.used[held], len(known))
     if m.by_label:
@@ -115,14 +120,6 @@ def _support(off: Floats, row: Ints, used: Bools, count: int) -> Bools:
     return np.asarray(off <= _MISS * np.clip(usual, 1.0, _WIDEST)[row])
 
 
-def _sight(m: Mapper, at: Ints) -> Sightings:
-    rays = m.rays
-    ids, index = np.unique(rays.keyframe[at], return_inverse=True)
-    poses = m.graph.poses(ids)[index]
-    ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], rays.direction[at])
-    return sightings(poses[:, :3, 3], ahead, rays.sigma[at], rays.range[at], rays.range_sigma[at])
-
-
 def _forget(m: Mapper) -> None:
     """Candidates out of sight for too long."""
     now, live = float(m.keyframes.stamp.max()), m.settings.live
@@ -157,25 +154,10 @@ def _merge(m: Mapper) -> None:
             continue
         keep, drop = (i, j) if known.seen[i] >= known.seen[j] else (j, i)
         gone.add(drop)
-        _join(m, keep, drop)
+        join(m, keep, drop)
     if gone:
         m.counters.accept("merged objects", len(gone))
-        _without(m, np.array(sorted(gone)))
-
-
-def _join(m: Mapper, keep: int, drop: int) -> None:
-    known, rays = m.known, m.rays
-    mine = np.flatnonzero(rays.owner == known.id[drop])
-    m.graph.drop_rays(rays.number[mine])
-    rays.owner[mine] = known.id[keep]
-    known.information[keep] += known.information[drop]
-    for name in ("squared", "seen", "expected", "rejected"):
-        getattr(known, name)[keep] += getattr(known, name)[drop]
-    known.first[keep] = min(known.first[keep], known.first[drop])
-    if known.last[drop] > known.last[keep]:
-        known.last[keep], known.drift[keep] = known.last[drop], known.drift[drop]
-    known.far[keep] = max(known.far[keep], known.far[drop])
-    m.graph.add_rays(m.bearings(mine[rays.used[mine]]))
+        without(m, np.array(sorted(gone)))
 
 
 def _drop_ghosts(m: Mapper) -> None:
@@ -187,20 +169,7 @@ def _drop_ghosts(m: Mapper) -> None:
         mine = np.isin(m.rays.owner, known.id[ghost])
         m.graph.drop_rays(m.rays.number[mine])
         m.rays.owner[mine], m.rays.used[mine] = -1, False
-        _without(m, ghost)
-
-
-def _without(m: Mapper, rows: Ints) -> None:
-    """Landmarks whose rays have gone elsewhere, away."""
-    ids = set(m.known.id[rows].tolist())
-    m.graph.drop_landmarks(m.known.id[rows])
-    kept = np.ones(len(m.known), dtype=bool)
-    kept[rows] = False
-    m.known.keep(kept)
-    m.together = {pair: n for pair, n in m.together.items() if not ids & set(pair)}
-    m.apart = {pair: n for pair, n in m.apart.items() if not ids & set(pair)}
-    m.graph.rebuild()
-    m.known.position[:] = m.graph.points(m.known.id)
+        without(m, ghost)
 
 
 def thin(m: Mapper) -> None:

@@ -1,0 +1,148 @@
+"""A session comes back to where it has been: landmarks of now that are landmarks of long ago become one, several at once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.association.constellation import Constellation, Recognition, recognise
+from objslam.errors import SolveError
+from objslam.geometry import inverse
+from objslam.graph.closure import bend
+from objslam.live.joining import join, without
+from objslam.live.known import covariances
+from objslam.live.meeting import misses
+from objslam.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from objslam.live.mapper import Mapper
+
+_EVIDENCE, _LEAD = 7.0, 3.0  # log odds against new landmarks, and against another place
+_HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
+_FEWEST = 2  # landmarks on either side
+_PLACE, _DISTORTION = 0.07, 0.02  # m, and m per m from the robot: by how much a neighbourhood is bent in itself
+_MARGIN = 2.0  # m around all landmarks that could hold some too
+_LEAST = (0.02, 0.02, 0.01)  # m, m, rad; no pose is known better than that to another
+_ANCHORS = 3
+_ITERATIONS = 15
+_HOLDS, _FITS = 0.7, 4.0  # share of a closed loop's rays that must still fit, to so many standard deviations
+_BENT = 0.02  # m
+
+
+def close_loop(m: Mapper) -> None:
+    """Look for a loop that closes, and close it; where too many rays contradict it afterwards, all is as it was."""
+    known = m.known
+    newest = int(np.argmax(m.keyframes.stamp))
+    heading = np.sqrt(np.maximum((m.keyframes.drift[newest] - known.drift)[:, 2, 2], 0.0))
+    there = heading > _HORIZON
+    here = ~there
+    state = (tuple(known.id[here].tolist()), int(there.sum()))
+    if state == m.looked_at:
+        return
+    m.looked_at = state
+    possible = here[:, None] & there & (known.label[:, None] == known.label) & ~_together(m)
+    one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
+    if len(one) < _FEWEST or len(two) < _FEWEST:
+        return
+    found = _recognise(m, one, two, possible[np.ix_(one, two)], newest)
+    if found is not None:
+        _close(m, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.correction)
+
+
+def _recognise(m: Mapper, one: Ints, two: Ints, possible: Bools, newest: int) -> Recognition | None:
+    known, k = m.known, m.keyframes
+    pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
+    low, high = known.position[:, :2].min(axis=0) - _MARGIN, known.position[:, :2].max(axis=0) + _MARGIN
+    density = np.bincount(known.label)[known.label[one]] / float(np.prod(high - low))
+    a, b = (_constellation(m, which, pivot) for which in (one, two))
+    lately = np.unique(known.last[two])[::-1]
+    best: Recognition | None = None
+    for stamp in lately[np.linspace(0, len(lately) - 1, min(_ANCHORS, len(lately))).astype(np.int64)]:
+        anchor = int(np.argmin(np.abs(k.stamp - stamp)))
+        prior = _planar(m, anchor, newest)
+        if anchor == newest or prior is None:
+            continue
+        found = recognise(a, b, pivot, prior, density, possible)
+        if found is None or found.evidence < _EVIDENCE or found.lead < _LEAD or len(found.pairs) < _FEWEST:
+            continue
+        if best is None or found.evidence > best.evidence:
+            best = found
+    return best
+
+
+def _planar(m: Mapper, before: int, now: int) -> Floats | None:
+    """Covariance (3, 3) of the camera now as seen from before: x, y, yaw along the map's axes; None where nobody knows."""
+    ids = m.keyframes.id
+    turn = np.kron(np.eye(2), m.graph.pose(int(ids[now]))[:3, :3])
+    spread = turn @ m.graph.relative_covariance(int(ids[before]), int(ids[now])) @ turn.T
+    planar = spread[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(_LEAST) ** 2
+    return planar if np.isfinite(planar).all() else None
+
+
+def _constellation(m: Mapper, which: Ints, pivot: Floats) -> Constellation:
+    known = m.known
+    bent = _PLACE**2 + _DISTORTION**2 * ((known.position[which, :2] - pivot) ** 2).sum(axis=1)
+    spread = covariances(known, which) + bent[:, None, None] * np.eye(3)
+    return Constellation(known.position[which], spread, known.label[which])
+
+
+def _together(m: Mapper) -> Bools:
+    """Whether two landmarks (N, N) of one label were ever seen in one frame."""
+    known = m.known
+    result = np.zeros((len(known), len(known)), dtype=bool)
+    row = {int(j): i for i, j in enumerate(known.id.tolist())}
+    for a, b in m.together:
+        result[row[a], row[b]] = result[row[b], row[a]] = True
+    return result
+
+
+def _close(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
+    """Bend the path so that landmarks now (P,) lie on the old ones (P,), make them one, and solve; or leave all as it was."""
+    known, k, rays = m.known, m.keyframes, m.rays
+    m.graph.refresh()
+    saved, table = m.graph.save(), (known.copy(), rays.owner.copy(), dict(m.together), dict(m.apart))
+    order = np.argsort(k.stamp, kind="stable")
+    poses, stamps = m.graph.poses(k.id[order]), k.stamp[order]
+    left, back = float(known.last[old].max()), float(known.first[now].min())
+    begin = int(np.searchsorted(stamps, min(left, back)).clip(0, len(order) - 2))
+    end = max(int(np.searchsorted(stamps, max(back, left)).clip(0, len(order) - 1)), begin + 1)
+    drift = np.maximum.accumulate(k.drift[order][:, 2, 2])
+    bent = bend(poses, correction, begin, end, drift)
+    # landmarks go along with the pose that saw them last
+    last = np.searchsorted(stamps, known.last).clip(0, len(order) - 1)
+    carried = bent[last] @ inverse(poses[last])
+    points = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position) + carried[:, :3, 3]
+    m.graph.bend(k.id[order], bent, known.id, points)
+    known.position[:] = points
+    mine = np.flatnonzero(np.isin(rays.owner, known.id[np.concatenate([now, old])]) & rays.used)
+    ids = known.id[old]
+    for i, j in zip(old.tolist(), now.tolist(), strict=True):
+        join(m, i, j)
+    without(m, np.unique(now), rebuild=False)
+    try:
+        m.graph.solve(_ITERATIONS)
+    except SolveError:
+        held = False
+    else:
+        known.position[:] = m.graph.points(known.id)
+        held = _holds(m, mine)
+    if held:
+        m.counters.accept("loops closed")
+        m.counters.accept("merged objects", len(ids))
+        m.move_candidates(correction, back)
+        return
+    m.counters.accept("loops not closed after all")
+    m.known, rays.owner[:], m.together, m.apart = table
+    m.graph.restore(saved)
+    m.known.position[:] = m.graph.points(m.known.id)
+
+
+def _holds(m: Mapper, mine: Ints) -> bool:
+    """Whether the rays (n,) of the landmarks that became one still fit them."""
+    m.graph.refresh()
+    s = m.sight(mine)
+    points = m.known.position[m.rows_of(m.rays.owner[mine])]
+    distance = np.linalg.norm(points - s.origin, axis=1)
+    allowed = _FITS * np.hypot(1.0, _BENT / (distance * s.sigma))
+    return bool(np.mean(misses(s, points) < allowed) >= _HOLDS)
