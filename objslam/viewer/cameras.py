@@ -34,12 +34,13 @@ def camera_path(camera: Camera) -> str:
     return str(rr.new_entity_path(["map", "camera", camera.name])).lstrip("/")
 
 
-def log_cameras(recording: Any, result: RunResult, size: float) -> None:
+def log_cameras(recording: Any, result: RunResult, size: float) -> int:
     """`map/camera/NAME` moves; below it `image`, `boxes` in the colours of their objects (grey unexplained, red rejected),
     and `map`, the objects where they should be in the image. size: m, of the map.
 
-    Images are scaled down as the settings say, and all pixels with them.
+    Images are scaled down as the settings say, and all pixels with them. Returns how many of them could not be read.
     """
+    unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
     for index, camera in enumerate(result.cameras):
         mine = np.flatnonzero(result.keyframes.camera == index)
@@ -55,9 +56,10 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> None:
         if images is not None:
             shown, which = choose(images, stamps, result.settings.output.images)
             shape = (round(camera.width * scale), round(camera.height * scale))
-            _send_images(recording, path, stamps, shown, jpegs(images, which, *shape))
+            unread += _send_images(recording, path, stamps, shown, jpegs(images, which, *shape))
         _send_boxes(recording, path, result, mine, scale)
         _send_objects(recording, path, result, camera, stamps, poses, scale)
+    return unread
 
 
 def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
@@ -83,8 +85,11 @@ def _send_poses(recording: Any, path: str, stamps: Floats, poses: Floats) -> Non
     recording.send_columns(path, [stamp_column(stamps)], columns)
 
 
-def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> None:
-    """The images of the stamps (n,) shown; the others get none, for boxes on the image of another moment would mislead."""
+def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
+    """The images of the stamps (n,) shown, and how many could not be read.
+
+    The other stamps get none: boxes on the image of another moment would mislead.
+    """
     import rerun as rr
 
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
@@ -96,6 +101,7 @@ def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images:
         columns = rr.EncodedImage.columns(blob=blobs).partition(counts)
         recording.send_columns(f"{path}/image", [stamp_column(stamps)], columns)
         recording.log(f"{path}/image", rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
+    return len(shown) - len(blobs)
 
 
 def _send_boxes(recording: Any, path: str, result: RunResult, mine: Ints, scale: float) -> None:

@@ -55,9 +55,12 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     if len(result.keyframes):
         log_base(recording, result)
         log_rays(recording, result)
-        log_cameras(recording, result, float(np.linalg.norm(eye.position - eye.target)))
+        unread = log_cameras(recording, result, float(np.linalg.norm(eye.position - eye.target)))
         log_residuals(recording, result)
-        _log_lines(recording, drive_lines(result), stamp_column)
+        lines = drive_lines(result)
+        if unread:
+            lines.insert(1, Line(lines[0].at, "WARN", f"{unread} images could not be read"))
+        _log_lines(recording, lines, stamp_column)
     log_steps(recording, result)
     log_costs(recording, result)
     log_seconds(recording, result.summary.get("seconds", {}))

@@ -222,6 +222,7 @@ def test_images_are_those_of_their_moment_and_never_more_than_asked_for(record: 
             pixels = cv2.imdecode(np.array(row[0], dtype=np.uint8), cv2.IMREAD_COLOR)
             assert pixels.shape == (240, 320, 3)
             np.testing.assert_allclose(pixels[100, 100], (k, 128, 255 - k), atol=6)
+    assert ["1 images could not be read"] in r.get("/log", "TextLog:text")
     few = dataclasses.replace(result, settings=Settings.model_validate({"output": {"images": 5, "image_width": 640}}))
     blobs = record(few).get("/map/camera/front/image", "EncodedImage:blob")
     assert sum(len(row) for row in blobs) == 5
