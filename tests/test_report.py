@@ -16,6 +16,7 @@ import pytest
 from synthetic_result import clusters, synthetic_result
 
 from objslam import config, offline
+from objslam.cli import main
 from objslam.config import Settings
 from objslam.errors import OutputError
 from objslam.evaluation import evaluate, write_evaluation
@@ -282,6 +283,19 @@ def test_what_is_damaged_is_named(tmp_path: Path, name: str) -> None:
     with pytest.raises(OutputError):
         write_report(tmp_path)
     assert not (tmp_path / "report.html").exists()
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    write_result(result, tmp_path / "out")
+    for folder, code in (("out", 0), ("nowhere", 1)):
+        monkeypatch.setattr("sys.argv", ["objslam", "report", str(tmp_path / folder)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == code
+    told = capsys.readouterr()
+    assert told.out == f"wrote {tmp_path / 'out' / 'report.html'}\n"
+    assert told.err == f"objslam: {tmp_path / 'nowhere'}: there is no such result folder\n"
 
 
 def test_a_new_result_takes_the_old_report_away(tmp_path: Path) -> None:

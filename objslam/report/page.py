@@ -30,14 +30,14 @@ _BINS, _FEW_BINS = 32, 16
 _EXPLAINED = {
     "images": "colour images",
     "detection_frames": "camera frames",
-    "frames_on_path": "of them on the path",
-    "keyframes": "of them with a usable box",
+    "frames_on_path": "camera frames on the path",
+    "keyframes": "keyframes (with a usable box)",
     "detections": "boxes",
     "rays": "usable boxes (rays)",
     "rays_rejected": "rays rejected as outliers",
     "rays_unexplained": "rays that no object explains",
     "objects": "objects",
-    "unresolved": "of them unresolved",
+    "unresolved": "unresolved objects",
 }
 
 
@@ -85,7 +85,8 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
     errors, scores = _evaluation(out, objects)
     mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
     chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
-    images, no_images = images_of(log or _log_path(summary), summary.get("counts", {}).get("images")) if crops else ({}, None)
+    counts = summary.get("counts", {})
+    images, no_images = images_of(log or _log_path(summary), counts.get("images")) if crops else ({}, None)
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     begin = float(rays.stamp.min()) if len(rays) else 0.0
@@ -130,7 +131,7 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
         histogram=histogram(rays.residual, rays.weight, _BINS),
         scores=scores,
         no_images=no_images,
-        counts=[(_EXPLAINED.get(key, key), value) for key, value in summary.get("counts", {}).items()],
+        counts=[(_EXPLAINED.get(key, key), value) for key, value in counts.items()],
         unexplained=summary.get("unexplained_share", {}),
         dropped=_dropped(summary),
         warnings=summary.get("warnings", []),
