@@ -61,7 +61,7 @@ class _Kept:
 
 
 class IncrementalGraph:
-    """Poses X(k) of keyframes and places L(j) of landmarks, numbered by the caller, upwards; what was added counts from `update` on.
+    """Poses X(k) of keyframes and places L(j) of landmarks, by the caller's numbers, upwards; `update` works in what was added.
 
     rebuilds: how often an update threw and the graph was built anew.
     """
@@ -161,7 +161,7 @@ class IncrementalGraph:
             return np.full((3, 3), np.nan)
 
     def relative_covariance(self, before: int, now: int) -> Floats:
-        """Covariance (6, 6) of X(now) as seen from X(before), in the frame of now's camera; NaN where the graph does not tell."""
+        """Covariance (6, 6) of X(now) as seen from X(before), in its camera's frame; NaN where the graph does not tell."""
         try:
             joint = self._isam.jointMarginalCovariance([x_key(before), x_key(now)]).fullMatrix()
         except RuntimeError:
@@ -186,7 +186,7 @@ class IncrementalGraph:
         self._clear()
 
     def bend(self, ids: Ints, poses: Floats, landmarks: Ints, points: Floats) -> None:
-        """Keyframes ids (K,) at other poses (K, 4, 4), landmarks (n,) at other points (n, 3); `rebuild` or `solve` must follow."""
+        """Keyframes ids (K,) at other poses (K, 4, 4), landmarks (n,) at other points (n, 3); `rebuild` must follow."""
         self.refresh()
         self._poses.update(zip(ids.tolist(), poses, strict=True))
         self._points.update(zip(landmarks.tolist(), points, strict=True))

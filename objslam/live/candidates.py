@@ -113,7 +113,7 @@ def place(candidates: list[Candidate]) -> None:
 
 
 def ripe(candidate: Candidate, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> Meeting | None:
-    """Where a candidate is once its rays carry that: enough of them, enough parallax or ranges, and hardly one against it."""
+    """Where a candidate is once its rays carry that: enough of them, enough parallax or ranges, few against it."""
     live = settings.live
     if len(candidate) < live.min_rays:
         return None

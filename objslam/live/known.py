@@ -59,6 +59,12 @@ def carried(to: Floats, drift: Floats, map_T_camera: Floats, camera_from_drift: 
     return np.asarray(jacobian @ drift @ np.swapaxes(jacobian, 1, 2))
 
 
+def gathered(now: Floats, then: Floats) -> Floats:
+    """What drift (6, 6) was gathered since it was `then` (n, 6, 6): nothing for a frame that comes late, from before."""
+    since = now - then
+    return np.where((np.trace(since, axis1=1, axis2=2) > 0)[:, None, None], since, 0.0)
+
+
 def in_view(known: Table, camera: Camera, map_T_camera: Floats) -> Bools:
     """Which landmarks (N,) should be seen: well inside the image, and from no further than they were seen."""
     from objslam.rays import project

@@ -11,7 +11,7 @@ from objslam.errors import SolveError
 from objslam.geometry import inverse
 from objslam.graph.closure import bend
 from objslam.live.joining import join, without
-from objslam.live.known import covariances
+from objslam.live.known import covariances, gathered
 from objslam.live.meeting import misses
 from objslam.types import Bools, Floats, Ints
 
@@ -34,7 +34,7 @@ def close_loop(m: Mapper) -> None:
     """Look for a loop that closes, and close it; where too many rays contradict it afterwards, all is as it was."""
     known = m.known
     newest = int(np.argmax(m.keyframes.stamp))
-    heading = np.sqrt(np.maximum((m.keyframes.drift[newest] - known.drift)[:, 2, 2], 0.0))
+    heading = np.sqrt(np.maximum(gathered(m.keyframes.drift[newest], known.drift)[:, 2, 2], 0.0))
     there = heading > _HORIZON
     here = ~there
     state = (tuple(known.id[here].tolist()), int(there.sum()))
@@ -98,10 +98,11 @@ def _together(m: Mapper) -> Bools:
 
 
 def _close(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
-    """Bend the path so that landmarks now (P,) lie on the old ones (P,), make them one, and solve; or leave all as it was."""
+    """Bend the path so that landmarks now (P,) lie on the old (P,), make them one, solve; or leave all as it was."""
     known, k, rays = m.known, m.keyframes, m.rays
     m.graph.refresh()
-    saved, table = m.graph.save(), (known.copy(), rays.owner.copy(), dict(m.together), dict(m.apart))
+    saved = m.graph.save()
+    table = known.copy(), rays.owner.copy(), dict(m.together), dict(m.apart)
     order = np.argsort(k.stamp, kind="stable")
     poses, stamps = m.graph.poses(k.id[order]), k.stamp[order]
     left, back = float(known.last[old].max()), float(known.first[now].min())

@@ -11,7 +11,7 @@ from objslam.association.landmarks import RANGE_LOSS, Landmarks
 from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
-from objslam.live.known import carried, covariances, noise
+from objslam.live.known import carried, covariances, gathered, noise
 from objslam.live.meeting import sightings
 from objslam.live.table import Table
 from objslam.types import Floats, Ints
@@ -73,7 +73,7 @@ def match(
     ours = [candidates[i] for i in waiting]
     places = np.concatenate([position, *(c.position[None] for c in ours)])
     own = np.array([c.covariance for c in ours]).reshape(-1, 3, 3)
-    since = np.array([doubt.drift - c.drift for c in ours]).reshape(-1, 6, 6)
+    since = gathered(doubt.drift, np.array([c.drift for c in ours]).reshape(-1, 6, 6))
     to = places[len(rows) :] - map_T_camera[:3, 3]
     covariance = np.concatenate([spread, own + carried(to, since, map_T_camera, doubt.camera_from_drift)])
     label = np.concatenate([known.label[rows], np.array([c.label for c in ours], dtype=np.int64)])
@@ -144,7 +144,7 @@ def predicted(
         wanted &= off.max(axis=1, initial=-1.0) > _VIEW
     rows = np.flatnonzero(wanted)
     to = to[rows]
-    since = carried(to, doubt.drift - known.drift[rows], map_T_camera, doubt.camera_from_drift)
+    since = carried(to, gathered(doubt.drift, known.drift[rows]), map_T_camera, doubt.camera_from_drift)
     own = covariances(known, rows)
     if np.isfinite(doubt.pose).all():
         placed = carried(to, doubt.pose, map_T_camera, np.eye(6))
