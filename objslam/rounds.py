@@ -15,7 +15,7 @@ from objslam.geometry import inverse
 from objslam.keyframes import correct_poses
 from objslam.ledger import Ledger
 from objslam.trace import Round, Trace, Why
-from objslam.types import Association, Camera, Floats, Keyframes, Rays
+from objslam.types import Association, Camera, Floats, Ints, Keyframes, Rays
 
 if TYPE_CHECKING:
     from objslam.graph.batch import Estimate
@@ -125,8 +125,10 @@ def _joint(
             return Solution(keyframes, rays, by_label, solved, (), tuple(trace.rounds if trace else ()))
 
     map_T_camera = keyframes.map_T_camera
+    guess: tuple[Association, Floats] | None = None
     if not keyframes.localized_every:
-        map_T_camera = explore(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
+        explored = explore(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
+        map_T_camera, guess = explored.map_T_camera, (explored.association, explored.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
@@ -136,8 +138,8 @@ def _joint(
         at = correct_poses(frames.stamps, frames.map_T_base, keyframes.stamps, keyframes.map_T_base, map_T_base)
         scale = 1.0 if rounds else _FIRST
         noise = np.hypot(all_rays.sigma, scale * _SOLVED_YAW), scale * _SOLVED_XY
-        found = _associate(frames, all_rays, cameras, settings, at @ frames.base_T_camera, noise)
-        changed = len(rays) if association is None else int((found.object != association.object).sum())
+        found = _associate(frames, all_rays, cameras, settings, at @ frames.base_T_camera, noise, guess)
+        changed = len(rays) if association is None else rays_moved(association.object, found.object)
         rounds.append({"objects": found.count, "rays_changed": changed})
         if changed == 0:
             break
@@ -147,10 +149,10 @@ def _joint(
             merged = merge_unseen_together(rays, association, estimate)
             if merged.count == association.count:
                 break
-            rounds.append({"objects": merged.count, "rays_changed": int((merged.object != association.object).sum())})
+            rounds.append({"objects": merged.count, "rays_changed": rays_moved(association.object, merged.object)})
             association = merged
             estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera)
-        map_T_base = estimate.map_T_base
+        map_T_base, guess = estimate.map_T_base, (association, estimate.positions)
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
@@ -166,13 +168,33 @@ def _associate(
     settings: Settings,
     map_T_camera: Floats,
     noise: tuple[Floats, float],
+    guess: tuple[Association, Floats] | None = None,
 ) -> Association:
     from objslam.association.search import associate
 
     sigma, place = noise
     return associate(
-        rays, frames, cameras, settings, map_T_camera=map_T_camera, sigma=sigma, position_sigma=place, seed=settings.seed
+        rays,
+        frames,
+        cameras,
+        settings,
+        map_T_camera=map_T_camera,
+        sigma=sigma,
+        position_sigma=place,
+        seed=settings.seed,
+        guess=guess,
     )
+
+
+def rays_moved(before: Ints, after: Ints) -> int:
+    """How many rays (R,) went to another object, whatever numbers the objects have: -1 is no object."""
+    from scipy.optimize import linear_sum_assignment
+
+    shared = np.zeros((before.max(initial=-1) + 1, after.max(initial=-1) + 1), dtype=np.int64)
+    both = (before >= 0) & (after >= 0)
+    np.add.at(shared, (before[both], after[both]), 1)
+    stayed = shared[linear_sum_assignment(shared, maximize=True)].sum() + ((before < 0) & (after < 0)).sum()
+    return len(before) - int(stayed)
 
 
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate) -> Association:

@@ -63,12 +63,14 @@ def associate(
     sigma: Floats,
     position_sigma: float = 0.0,
     seed: int = 0,
+    guess: tuple[Association, Floats] | None = None,
 ) -> Association:
     """Which ray belongs to which object, at the camera poses (K, 4, 4) of the keyframes.
 
     keyframes: all frames that were looked at, those without any box too: what was not seen counts as well. sigma: (R,) rad
-    and position_sigma: m, the noise of the rays with that of the poses. Objects come sorted by label, then by the frame that
-    saw them first, and nothing depends on the order of rays and keyframes. Rays that no object at rest explains have none.
+    and position_sigma: m, the noise of the rays with that of the poses. guess: an association of these rays to begin from,
+    and where its objects are, (N, 3), NaN for those to forget. Objects come sorted by label, then by the frame that saw them
+    first, and nothing depends on the order of rays and keyframes. Rays that no object at rest explains have none.
     """
     s, ray, keyframe = sight(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
     view = View(
@@ -81,8 +83,7 @@ def associate(
     )
     gate = gate_limit(settings.association.gate)
     work = _Work(s, view, len(rays.label_names), gate, settings.association, _device(settings), seed)
-    nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), work.labels)
-    state = State(nothing, np.full(len(s), -1, dtype=np.int64))
+    state = _begin(work, ray, guess)
     for turn in range(_TURNS):
         before = len(state.landmarks)
         state = _settle(work, _explore(work, state, turn, _PARALLAX), 2)
@@ -101,6 +102,17 @@ def associate(
         accepts = adopted(s, state, work.visits(state), view, gate)
         state = _drop_all(work, _settle(work, replace(state, landmarks=replace(state.landmarks, accepts=accepts))))
     return _result(work, state, ray)
+
+
+def _begin(work: _Work, ray: Ints, guess: tuple[Association, Floats] | None) -> State:
+    """The landmarks that are guessed, or none; ray: (R,) which ray each sighting is."""
+    if guess is None:
+        nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), work.labels)
+        return State(nothing, np.full(len(work.s), -1, dtype=np.int64))
+    association, position = guess
+    landmarks = Landmarks.new(position, np.ones(len(position)), association.label, work.labels)
+    state = State(landmarks, association.object[ray])
+    return _settle(work, state.keep((state.number >= _MIN_RAYS) & np.isfinite(position).all(axis=1)))
 
 
 def _device(settings: config.Settings) -> str:

@@ -2,8 +2,8 @@
 
 As in `grow`, keyframes are added a few at a time at the poses that the solved ones predict. Their rays are given to the
 landmarks known so far by predicted bearing, with the odometry's drift in the gate; what is left over in the last stretch of
-the drive, where poses still agree with each other, is searched for new landmarks. Only the poses are kept in the end: with
-them a global association can begin.
+the drive, where poses still agree with each other, is searched for new landmarks. With the poses and landmarks that come of
+it a global association can begin.
 """
 
 from __future__ import annotations
@@ -11,33 +11,41 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from objslam.association.assign import assign
+from objslam.association.lay import lay
 from objslam.association.search import associate
 from objslam.config import Settings
-from objslam.geometry import adjoint, inverse, lift_se2
+from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
+from objslam.graph.closure import Closure, Known, bend, find_closure
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
 from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
+from objslam.rays import angles_off
 from objslam.triangulation import triangulate
-from objslam.types import Bools, Camera, Floats, Ints, Keyframes, Rays
+from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
 
-_STRETCH = 150  # keyframes in which new landmarks are looked for
-_TURN, _PLACE = np.radians(1.5), 0.1  # rad, m; how finely headings are tried, and what they leave open
+_HORIZON = 0.1  # rad of drift in heading: landmarks not seen for longer are no longer expected where they were
+_STRETCH = 150  # keyframes in which new landmarks are looked for, at the most
+_PLACE = 0.1  # m
+_LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02  # share of the drift, rad, m that laying a step leaves open
 _FEWEST = 5  # rays that must agree on a new landmark: a wrong one pulls on every pose after it
-_ITERATIONS = 3
+_ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
+_HOLDS = 0.7  # share of a closed loop's rays that must still fit
+_FITS = 4.0  # standard deviations
 _FLOOR = 0.02  # m; landmarks are never taken to be known better than that
 
 
-@dataclass
-class _Known:
-    """The landmarks so far: position (N, 3), covariance (N, 3, 3), label (N,), the keyframe that saw them last (N,)."""
+@dataclass(frozen=True)
+class Explored:
+    """Camera poses (K, 4, 4) in map, which is the odometry's frame: its first keyframe is held; which ray is of which
+    landmark, and where those are, (N, 3)."""
 
-    position: Floats
-    covariance: Floats
-    label: Ints
-    last: Ints
+    map_T_camera: Floats
+    association: Association
+    positions: Floats
 
 
 def explore(
@@ -46,17 +54,14 @@ def explore(
     cameras: tuple[Camera, ...],
     settings: Settings,
     progress: Callable[[int, int], None],
-) -> Floats:
-    """Camera poses (K, 4, 4) in map, which is the odometry's frame: its first keyframe is held.
-
-    progress(done, total) is called in keyframes.
-    """
+) -> Explored:
+    """Poses and landmarks, a few keyframes at a time; progress(done, total) is called in keyframes."""
     motion, covariance = factors.motions(keyframes, settings)
+    heading = _heading_drift(keyframes)
     map_T_camera = keyframes.map_T_camera.copy()
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
     owner = np.full(len(rays), -1, dtype=np.int64)
-    nobody = np.zeros(0, dtype=np.int64)
-    known = _Known(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody)
+    known = Known.nothing()
     graph = build_graph([anchor(map_T_camera[0])])
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
@@ -64,10 +69,13 @@ def explore(
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
-        owner[new], map_T_camera = _recognise(rays, new, known, keyframes, map_T_camera, begin, end)
+        owner[new], map_T_camera = _recognise(
+            rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end
+        )
         fresh = new[owner[new] >= 0]
-        born = _discover(rays, owner, known, keyframes, map_T_camera, end, cameras, settings)
-        fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known.label) - len(born))]) if len(born) else fresh
+        stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - _HORIZON**2)))
+        born = _discover(rays, owner, known, keyframes, map_T_camera, stretch, end, cameras, settings)
+        fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known) - len(born))]) if len(born) else fresh
         known.last[owner[fresh]] = np.maximum(known.last[owner[fresh]], rays.keyframe[fresh])
 
         for group in (
@@ -78,83 +86,133 @@ def explore(
         ):
             for factor in group:
                 graph.push_back(factor)
-        if len(known.label):
-            landmarks = np.arange(len(known.label))
-            values = make_values(map_T_camera[:end], known.position, landmarks)
-            values = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values
+        if len(known):
+            values = _solve(graph, map_T_camera[:end], known, _ITERATIONS)
             map_T_camera[:end] = read_poses(values)
             known.position = read_points(values)
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
+            found = find_closure(known, _active(known, heading, end - 1), rays, owner, graph, values, map_T_camera, end - 1)
+            if found is not None:
+                closed = _close(found, known, rays, owner, map_T_camera[:end], heading, motion, covariance, settings)
+                if closed is not None:
+                    graph, known, owner, map_T_camera[:end] = closed
         progress(end, len(keyframes))
-    return map_T_camera
+    return Explored(map_T_camera, Association(owner, known.label), known.position)
+
+
+def _solve(graph: gtsam.NonlinearFactorGraph, map_T_camera: Floats, known: Known, iterations: int) -> gtsam.Values:
+    values = make_values(map_T_camera, known.position, np.arange(len(known)))
+    return levenberg_marquardt(graph, values, iterations, 1e-4).values
+
+
+def _close(
+    found: Closure,
+    known: Known,
+    rays: Rays,
+    owner: Ints,
+    map_T_camera: Floats,
+    heading: Floats,
+    motion: Floats,
+    covariance: Floats,
+    settings: Settings,
+) -> tuple[gtsam.NonlinearFactorGraph, Known, Ints, Floats] | None:
+    """The graph, landmarks, owners and poses with the loop closed, or None where too many rays contradict it then."""
+    now, old = found.now, found.before
+    back = int(known.first[now].min())
+    left = int(np.minimum(known.last[old], back).max())
+    end = len(map_T_camera)
+    poses = bend(map_T_camera, found.correction, min(left, max(back - 1, 0)), back, heading[:end])
+    into = np.arange(len(known))
+    into[now] = old
+    kept = np.flatnonzero(into == np.arange(len(known)))
+    number = np.searchsorted(kept, into)
+    first, last = known.first.copy(), known.last.copy()
+    np.minimum.at(first, into, known.first)
+    np.maximum.at(last, into, known.last)
+    # landmarks go along with the pose that saw them last
+    carried = poses[known.last] @ inverse(map_T_camera[known.last])
+    position = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position) + carried[:, :3, 3]
+    merged = Known(position[kept], known.covariance[kept], known.label[kept], first[kept], last[kept])
+    owned = np.where(owner >= 0, number[owner], -1)
+    held = np.flatnonzero((owned >= 0) & (rays.keyframe < end))
+    graph = build_graph(
+        [anchor(map_T_camera[0])],
+        factors.betweens(motion[: end - 1], covariance[: end - 1], 0),
+        ray_factors(rays, owned, held, "huber", settings),
+        range_factors(rays, owned, held),
+        landmark_priors(np.arange(len(merged)), merged.position, settings),
+    )
+    values = _solve(graph, poses, merged, _ITERATIONS_OF_A_LOOP)
+    poses, merged.position = read_poses(values), read_points(values)
+    mine = held[np.isin(owned[held], number[old])]
+    some = rays.take(mine)
+    origins, directions = some.in_map(poses)
+    off = angles_off(origins, directions, merged.position[owned[mine]])
+    distance = np.linalg.norm(merged.position[owned[mine]] - origins, axis=1)
+    if np.mean(off < _FITS * np.hypot(some.sigma, _FLOOR / distance)) < _HOLDS:
+        return None
+    merged.covariance = _covariances(rays, owned, merged.position, poses)
+    return graph, merged, owned, poses
+
+
+def _heading_drift(keyframes: Keyframes) -> Floats:
+    """(K,) rad^2, the variance of the heading that the odometry has gathered by each keyframe."""
+    assert keyframes.drift is not None
+    return np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
+
+
+def _active(known: Known, heading: Floats, now: int) -> Bools:
+    """Which landmarks (N,) were seen so lately that they are expected where they are."""
+    return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
 
 
 def _recognise(
-    rays: Rays, new: Ints, known: _Known, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
+    rays: Rays, new: Ints, known: Known, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """The known landmark of each of the new rays (n,), or -1, and the poses (K, 4, 4) that explain most of them.
+    """The active landmark of each of the new rays (n,), or -1, and the poses (K, 4, 4) with which they fit.
 
-    Within a step the odometry predicts well. Before it, out of sight of anything, the heading may have drifted far: then
-    headings on both sides are tried for the whole step at once, and the one that most rays agree with is taken.
+    Landmarks may stand closer together than the odometry's heading is known: ray by ray each would take its nearest. So the
+    step is first laid onto the landmarks as a whole.
     """
-    if len(new) == 0 or len(known.label) == 0:
+    if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
-    some = rays.take(new)
-    drifted = _drifted(keyframes, begin - 1)
-    heading = float(np.sqrt(np.linalg.eigvalsh(drifted[begin, :3, :3])[-1]))
-    turns = np.arange(1, int(3 * heading / _TURN) + 1) * _TURN
-    spread = drifted if len(turns) == 0 else _drifted(keyframes, begin) + np.diag([_TURN] * 3 + [_PLACE] * 3) ** 2
-    best, best_poses = np.full(len(new), -1, dtype=np.int64), map_T_camera
-    best_score = -np.inf
-    for turn in (0.0, *np.stack([turns, -turns], axis=1).ravel()):
-        poses = map_T_camera if turn == 0 else _turned(map_T_camera, begin, end, turn)
-        owner = assign(
-            some,
-            known.position,
-            known.covariance,
-            _accepts(known.label, len(rays.label_names)),
-            poses,
-            some.sigma,
-            pose_covariance=spread,
-        )
-        owner = np.where(_in_range(some, owner, known, poses), owner, -1)
-        seen = np.bincount(owner[owner >= 0], minlength=1)
-        # a constellation that shows twice tells no more than once: each landmark counts up to three times
-        score = np.minimum(seen, 3).sum() - 0.1 * (owner < 0).sum() - 0.5 * (turn / max(heading, _TURN)) ** 2
-        if score > best_score:
-            best, best_score, best_poses = owner, score, poses
-    return best, best_poses
+    some, which = rays.take(new), np.flatnonzero(active)
+    drift = _drifted(keyframes, begin - 1)
+    correction = lay(some, known.position[which], known.label[which], map_T_camera, drift[end - 1], begin)
+    poses = map_T_camera.copy()
+    poses[begin:end] = correction @ poses[begin:end]
+    left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
+    owner = assign(
+        some,
+        np.where(active[:, None], known.position, np.nan),
+        known.covariance,
+        _accepts(known.label, len(rays.label_names)),
+        poses,
+        some.sigma,
+        pose_covariance=left,
+    )
+    return np.where(_in_range(some, owner, known, poses), owner, -1), poses
 
 
-def _in_range(rays: Rays, owner: Ints, known: _Known, map_T_camera: Floats) -> Bools:
+def _in_range(rays: Rays, owner: Ints, known: Known, map_T_camera: Floats) -> Bools:
     """Which rays (n,) do not contradict their landmark by the range that came with them."""
     origins, _ = rays.in_map(map_T_camera)
     distance = np.linalg.norm(known.position[owner] - origins, axis=1)
     return ~(np.abs(rays.range - distance) > 4 * rays.range_sigma + _PLACE)
 
 
-def _turned(map_T_camera: Floats, begin: int, end: int, angle: float) -> Floats:
-    """The poses with those of a step turned about its first, around the vertical."""
-    pivot = map_T_camera[begin, :3, 3]
-    turn = lift_se2(np.array([0.0, 0.0, angle]))
-    turn[:3, 3] = pivot - turn[:3, :3] @ pivot
-    poses = map_T_camera.copy()
-    poses[begin:end] = turn @ poses[begin:end]
-    return poses
-
-
 def _discover(
     rays: Rays,
     owner: Ints,
-    known: _Known,
+    known: Known,
     keyframes: Keyframes,
     map_T_camera: Floats,
+    begin: int,
     end: int,
     cameras: tuple[Camera, ...],
     settings: Settings,
 ) -> Ints:
-    """New landmarks among the rays of the last stretch that have no owner; they become owners. Their indices."""
-    begin = max(0, end - _STRETCH)
+    """New landmarks among the rays of the last stretch, from begin to end, that have no owner; they become owners."""
     free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
     none = np.zeros(0, dtype=np.int64)
     if len(free) < _FEWEST:
@@ -187,6 +245,10 @@ def _discover(
     known.position = np.concatenate([known.position, placed.positions[ready]])
     known.covariance = np.concatenate([known.covariance, placed.covariance[ready]])
     known.label = np.concatenate([known.label, found.label[ready]])
+    mine = owner[free] >= born[0] if len(born) else np.zeros(len(free), dtype=bool)
+    seen_first = np.full(len(known.label), len(keyframes), dtype=np.int64)
+    np.minimum.at(seen_first, owner[free][mine], rays.keyframe[free][mine])
+    known.first = np.concatenate([known.first, seen_first[born]])
     known.last = np.concatenate([known.last, np.zeros(len(born), dtype=np.int64)])
     return born
 

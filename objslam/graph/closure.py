@@ -1,0 +1,151 @@
+"""Loops closed while a drive is explored: landmarks of now that are landmarks of long ago become one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from objslam.association.constellation import Constellation, recognise
+from objslam.geometry import adjoint, exp_se3, inverse, log_se3
+from objslam.graph.factors import x_key
+from objslam.types import Bools, Floats, Ints, Rays
+
+_EVIDENCE, _LEAD = 7.0, 3.0  # log odds against new landmarks, and against another place
+_PLACE, _DISTORTION = 0.07, 0.02  # m, and m per m from the robot: by how much a neighbourhood is bent in itself
+_MARGIN = 2.0  # m around all landmarks that could hold some too
+_EPOCHS = 8
+_FEWEST = 2  # landmarks on either side
+_LEAST = (0.02, 0.02, 0.01)  # m, m, rad; no pose is known better than that to another
+_SLIPS = (1.0, 3.0, 10.0)  # times the drift that was promised: wheels slip more than a Gaussian says
+_EPOCH = 40  # keyframes
+
+
+@dataclass
+class Known:
+    """Landmarks so far: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe that saw them (N,)."""
+
+    position: Floats
+    covariance: Floats
+    label: Ints
+    first: Ints
+    last: Ints
+
+    @classmethod
+    def nothing(cls) -> Known:
+        nobody = np.zeros(0, dtype=np.int64)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody)
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Landmarks of now (P,) that are those of before (P,); correction: (4, 4) of the poses of now; evidence: log odds."""
+
+    correction: Floats
+    now: Ints
+    before: Ints
+    evidence: float
+
+
+def find_closure(
+    known: Known,
+    active: Bools,
+    rays: Rays,
+    owner: Ints,
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    map_T_camera: Floats,
+    now: int,
+) -> Closure | None:
+    """Which landmarks of now are landmarks of before, if any are for sure.
+
+    Two ways lead there. The robot comes back after a long drift: then the active landmarks (N,) are among those not seen for
+    long. Or its wheels slipped, or somebody pushed it: then all that was born since is there already.
+    """
+    together = _seen_together(rays, owner, len(known))
+    low, high = known.position[:, :2].min(axis=0) - _MARGIN, known.position[:, :2].max(axis=0) + _MARGIN
+    density = np.bincount(known.label)[known.label] / float(np.prod(high - low))
+    pivot = map_T_camera[now, :2, 3]
+    born = active & (known.first >= now - _EPOCH)
+    best: Closure | None = None
+    marginals: gtsam.Marginals | None = None
+    for here, there in ((active, ~active), (born, ~born)):
+        possible = here[:, None] & there & (known.label[:, None] == known.label) & ~together
+        one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
+        if len(one) < _FEWEST or len(two) < _FEWEST:
+            continue
+        marginals = marginals or _marginals(graph, values)
+        if marginals is None:
+            return None
+        before = np.minimum(known.last[two], known.first[one].min())
+        epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
+        anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
+        a, b = (_constellation(known, which, pivot) for which in (one, two))
+        for prior in relative_covariances(marginals, map_T_camera, anchors, now):
+            found = recognise(a, b, pivot, prior, density[one], possible[np.ix_(one, two)])
+            if found is None or found.evidence < _EVIDENCE or found.lead < _LEAD:
+                continue
+            if best is None or found.evidence > best.evidence:
+                best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
+    return best
+
+
+def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | None:
+    """None where the graph is indeterminate: a loop that cannot be judged stays open."""
+    try:
+        return gtsam.Marginals(graph, values)
+    except RuntimeError:
+        return None
+
+
+def _constellation(known: Known, which: Ints, pivot: Floats) -> Constellation:
+    bent = _PLACE**2 + _DISTORTION**2 * ((known.position[which, :2] - pivot) ** 2).sum(axis=1)
+    return Constellation(
+        known.position[which], known.covariance[which] + bent[:, None, None] * np.eye(3), known.label[which]
+    )
+
+
+def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
+    """Whether two landmarks (N, N) were ever in one frame."""
+    from scipy.sparse import csr_array
+
+    held = np.flatnonzero(owner >= 0)
+    frames = int(rays.keyframe.max(initial=0)) + 1
+    table = csr_array((np.ones(len(held)), (owner[held], rays.keyframe[held])), shape=(count, frames))
+    return np.asarray((table @ table.T).toarray() > 0)
+
+
+def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
+    """Covariances (3, 3) of the camera `now` relative to each of the anchor keyframes: x, y, yaw along the map's axes.
+
+    Each comes as the graph has it, and for wheels that slipped more than they should.
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
+    result = []
+    for anchor in anchors:
+        if anchor >= now:
+            continue
+        joint = marginals.jointMarginalCovariance([x_key(anchor), x_key(now)]).fullMatrix()
+        relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
+        jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])
+        planar = (turn @ jacobian @ joint @ jacobian.T @ turn.T)[np.ix_([3, 4, 2], [3, 4, 2])]
+        if np.isfinite(planar).all():
+            result += [slip**2 * (planar + np.diag(_LEAST) ** 2) for slip in _SLIPS]
+    return result
+
+
+def bend(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
+    """The path (K, 4, 4) with the correction spread over keyframes begin to end by the drift (K,) gathered there."""
+    gathered = drift - drift[begin]
+    share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)
+    share[:begin] = 0.0
+    # about the place where it begins: nothing swings out on the way
+    centre = np.eye(4)
+    centre[:3, 3] = map_T_camera[begin, :3, 3]
+    twist = log_se3(inverse(centre) @ correction @ centre)
+    return np.asarray(centre @ exp_se3(share[:, None] * twist) @ inverse(centre) @ map_T_camera)
