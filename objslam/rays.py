@@ -104,7 +104,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 def box_rays(
     detections: Detections, camera: Camera, settings: Settings, ledger: Ledger
 ) -> tuple[Detections, Floats, Floats]:
-    """The usable boxes (M) of a camera, their directions (M, 3), unit, in its frame, sigmas (M,), rad; the rest is counted."""
+    """The usable boxes (M) of a camera, their unit directions (M, 3) in its frame, sigmas (M,), rad; the rest is counted."""
     boxes = detections.take(_usable(detections, camera, settings, ledger))
     directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
     ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
