@@ -19,6 +19,7 @@ from objslam.types import Association, Camera, Floats, Ints, Keyframes, Rays
 
 if TYPE_CHECKING:
     from objslam.graph.batch import Estimate
+    from objslam.graph.explore import Explored
 
 # What solved poses still err by, seen from the objects: with it an association at them is neither too sure nor too tolerant.
 _SOLVED_XY = 0.02  # m
@@ -56,8 +57,11 @@ def solve(
     settings: Settings,
     ledger: Ledger,
     progress: Progress,
+    start: Explored | None = None,
 ) -> Solution:
     """Find and solve the objects of a log; frames are all that have a pose, those without a ray too.
+
+    start: what is known already of the keyframes with a ray, where the joint mode need not explore nor trust labels.
 
     Where no frame has two boxes of one label, and the rays bear it out, every label is one object: in joint mode the graph
     grows with that knowledge. Else the association is global: in fixed mode once, at the poses as they are; in joint mode
@@ -84,7 +88,7 @@ def solve(
         return Solution(keyframes, rays_of_keyframes, association, estimate, (), tuple(trace.rounds if trace else ()))
     if not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation")
-    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace)
+    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start)
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
@@ -104,6 +108,7 @@ def _joint(
     ledger: Ledger,
     progress: Progress,
     trace: Trace | None,
+    start: Explored | None,
 ) -> Solution:
     from objslam.graph import batch
     from objslam.graph.explore import explore
@@ -117,7 +122,7 @@ def _joint(
             trace.end_round(why, association, solved)
         return solved
 
-    if _may_be_by_label(settings, all_rays):
+    if start is None and _may_be_by_label(settings, all_rays):
         by_label = associate_by_label(rays)
         solved = solve_round("labels", by_label)
         if _labels_tell(settings, by_label, solved.weight):
@@ -126,9 +131,10 @@ def _joint(
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
-    if not keyframes.localized_every:
-        explored = explore(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
-        map_T_camera, guess = explored.map_T_camera, (explored.association, explored.positions)
+    if start is None and not keyframes.localized_every:
+        start = explore(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
+    if start is not None:
+        map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
