@@ -39,3 +39,17 @@ def test_warnings_are_kept_once_and_come_after_the_drops():
 def test_ledgers_share_nothing():
     Ledger().drop("no pose")
     assert Ledger().lines() == []
+
+
+def test_what_another_counted_is_taken_over() -> None:
+    ledger, other = Ledger(), Ledger()
+    ledger.drop("late", 2, "stamp 1")
+    ledger.warn("slow")
+    other.drop("late", 3, "stamp 2")
+    other.drop("torn")
+    other.warn("slow")
+    other.warn("hot")
+    ledger.add(other)
+    assert ledger.dropped == {"late": 5, "torn": 1}
+    assert ledger.examples == {"late": ["stamp 1", "stamp 2"], "torn": []}
+    assert ledger.warnings == ["slow", "hot"]
