@@ -264,6 +264,8 @@ class Live(Section):
     where it was."""
     min_rays: Annotated[int, Field(ge=3)] = 5
     """boxes that must agree before an object enters the graph."""
+    reassociate: Annotated[int, Field(ge=0)] = 6000
+    """up to so many boxes, all are associated anew in the end, as offline does: a matter of seconds."""
     forget: Positive = 5.0
     """s; a few boxes that are not seen again for so long are left unexplained."""
 

@@ -12,33 +12,34 @@ from objslam.description import describe, summarise
 from objslam.errors import SolveError
 from objslam.live.mapper import Mapper
 from objslam.results import RunResult
-from objslam.rounds import Solution, merge_unseen_together, seen_something
+from objslam.rounds import Solution, seen_something, solve
 from objslam.types import Association, Floats, Ints, Keyframes, Rays, Trajectory
 
 
 def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
-    """The result of a session: the batch solve of the joint mode, from the poses and with the association of the session.
+    """The result of a session: the joint mode's association and solve in turns, from what the session knows.
+
+    Where labels tell objects apart, or there are more rays than live.reassociate, its association stands.
 
     SolveError where nothing was seen.
     """
     from objslam.graph import batch
+    from objslam.graph.explore import Explored
 
     begin = time.perf_counter()
     settings = mapper.settings.model_copy(update={"mode": "joint"})
     ledger = mapper.counters.ledger
-    keyframes, rays, association, poses = collected(mapper)
+    keyframes, rays, association, poses, positions = collected(mapper)
     if not len(rays):
         raise SolveError("nothing was seen that could be mapped", where=name, hint="; ".join(ledger.lines()) or None)
-    estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
-    for _ in range(settings.joint.max_rounds if not mapper.by_label else 0):
-        merged = merge_unseen_together(rays, association, estimate)
-        if merged.count == association.count:
-            break
-        association = merged
-        start = estimate.map_T_base @ keyframes.base_T_camera
-        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=start)
-    solution = Solution(keyframes, rays, association, estimate, ())
     cameras = tuple(mapper.cameras)
+    if mapper.by_label or len(rays) > settings.live.reassociate:
+        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+        solution = Solution(keyframes, rays, association, estimate, ())
+    else:
+        start = Explored(poses, association, positions)
+        solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start)
+    keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     accepted = mapper.counters.accepted()
@@ -68,8 +69,8 @@ def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
     )
 
 
-def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats]:
-    """Keyframes in the order of time, rays in theirs, who is whose, and the camera poses (K, 4, 4), as offline has them.
+def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats, Floats]:
+    """Keyframes in the order of time, rays in theirs, who is whose, camera poses (K, 4, 4) and places (N, 3).
 
     With a localisation, keyframes that it does not cover are left out, as offline does. Candidates with enough rays are
     objects too, which the solve may leave unresolved.
@@ -81,7 +82,7 @@ def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats]:
         order = order[k.localized[order]]
     number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
     number[k.id[order]] = np.arange(len(order))
-    owner, label = _owners(mapper)
+    owner, label, place = _owners(mapper)
     at = number[r.keyframe]
     rows = np.flatnonzero(at >= 0)
     rows = rows[np.argsort(at[rows], kind="stable")]
@@ -105,18 +106,20 @@ def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats]:
     held, object_ = np.unique(owner[rows], return_inverse=True)
     none = len(held) > 0 and held[0] < 0
     association = Association(object_ - int(none), label[held[int(none) :]])
-    return keyframes, rays, association, poses[kept]
+    return keyframes, rays, association, poses[kept], place[held[int(none) :]]
 
 
-def _owners(mapper: Mapper) -> tuple[Ints, Ints]:
-    """The object (R,) of each ray, -1 none, candidates numbered after the landmarks, and the label of each object."""
+def _owners(mapper: Mapper) -> tuple[Ints, Ints, Floats]:
+    """The object (R,) of each ray, -1 none, candidates after the landmarks, and the label and place of each object."""
     known, rays = mapper.known, mapper.rays
     owner = rays.owner.copy()
     first = int(known.id.max(initial=-1)) + 1
     enough = [c for c in mapper.candidates if len(c) >= mapper.settings.live.min_rays]
     label = np.zeros(first + len(enough), dtype=np.int64)
     label[known.id] = known.label
+    place = np.zeros((len(label), 3))
+    place[known.id] = known.position
     for i, candidate in enumerate(enough, first):
         owner[np.searchsorted(rays.number, candidate.numbers())] = i
-        label[i] = candidate.label
-    return owner, label
+        label[i], place[i] = candidate.label, candidate.position
+    return owner, label, place
