@@ -36,11 +36,12 @@ from objslam.types import Log, ObjectMap
 
 ONLY_ODOMETRY = {"localization": None, "odometry": Odometry()}
 QUIET = ("output.recording=false", "output.picture=false")
+LABELS = {**ONLY_ODOMETRY, "objects": 12, "classes": 12, "false": 0.0}
 DRIVES = (
-    *(("demo", {}, seed) for seed in range(3)),
-    *(("demo", ONLY_ODOMETRY, seed) for seed in range(3)),
-    *(("demo", {**ONLY_ODOMETRY, "objects": 12, "classes": 12, "false": 0.0}, seed) for seed in range(2)),
-    *(("drift", {}, seed) for seed in range(2)),
+    *(("demo, localised", "demo", {}, seed) for seed in range(3)),
+    *(("demo, odometry", "demo", ONLY_ODOMETRY, seed) for seed in range(3)),
+    *(("demo, odometry, own labels", "demo", LABELS, seed) for seed in range(2)),
+    *(("drift", "drift", {}, seed) for seed in range(2)),
 )
 
 
@@ -92,8 +93,8 @@ def same() -> None:
     print(
         f"{'drive':<34}{'both':>6}{'live':>6}{'offline':>9}{'RMSE m':>9}{'before the end':>24}{'live s':>8}{'offline s':>11}"
     )
-    jobs = [(f"{name} {seed} {' '.join(changes)}"[:33], simulate(preset(name, **changes), seed), settings_for("rays.pixel_sigma=2"))
-            for name, changes, seed in DRIVES]  # fmt: skip
+    simulated = settings_for("rays.pixel_sigma=2")
+    jobs = [(f"{what} {seed}", simulate(preset(name, **changes), seed), simulated) for what, name, changes, seed in DRIVES]
     folder = os.environ.get("OBJSLAM_DATA")
     if folder and (Path(folder) / "mrclam_ds6").is_dir():
         for robot in (1, 3, 5):
@@ -125,7 +126,7 @@ def large(frames: int, rate: float, classes: int = 10) -> Log:
     return simulate(
         preset(
             "large", **ONLY_ODOMETRY, frames=frames, frame_rate=rate, classes=classes, odometry_rate=200.0, speed=0.8,
-            laps=None, max_range=4.5, min_view_share=0.002,
+            laps=None, max_range=6.0, min_view_share=0.002,
         ),
         1,
     )  # fmt: skip
@@ -341,7 +342,7 @@ def memory(minutes: int) -> None:
     slope = np.polyfit(late[:, 0] / 60, late[:, 1], 1)[0]
     took = time.perf_counter() - begin
     print(
-        f"memory: {sizes[-1][1]:.0f} MB after {minutes} min, growing by {slope:.1f} MB/h from minute {minutes / 6:.0f} on; {took:.0f} s"
+        f"memory: {sizes[-1][1]:.0f} MB after {minutes} min, {slope:+.1f} MB/h from minute {minutes / 6:.0f} on; {took:.0f} s"
     )
     print(
         f"{against_truth(session.snapshot().map, log)}; {session.counters.accepted()}; dropped {session.counters.dropped()}"

@@ -61,7 +61,7 @@ class _Kept:
 
 
 class IncrementalGraph:
-    """Poses X(k) of keyframes and places L(j) of landmarks, by the caller's numbers, upwards; `update` works in what was added.
+    """Poses X(k) of keyframes and places L(j) of landmarks, numbered by the caller; `update` works in what was added.
 
     rebuilds: how often an update threw and the graph was built anew.
     """
@@ -111,7 +111,7 @@ class IncrementalGraph:
     def update(self, relinearise: bool = False) -> None:
         """Work in what was added. relinearise: look for variables that moved, now rather than some time."""
         try:
-            self._isam.update(self._new, self._values, [], None, None, None, relinearise)
+            self._update(relinearise)
         except RuntimeError:  # indeterminate: counted, and the graph goes on from the factors kept
             self.rebuilds += 1
             self._rescue()
@@ -250,6 +250,9 @@ class IncrementalGraph:
         self.refresh()
         self._points[j] = position
 
+    def _update(self, relinearise: bool) -> None:
+        self._isam.update(self._new, self._values, [], None, None, None, relinearise)
+
     def _add(self, kept: dict[int, gtsam.NonlinearFactor], key: int, factor: gtsam.NonlinearFactor) -> None:
         kept[key] = factor
         self._new.push_back(factor)
@@ -283,9 +286,8 @@ class IncrementalGraph:
         return values
 
     def _read(self, values: gtsam.Values) -> None:
-        # both come in the order of their keys, which is the order in which they were added
-        self._poses = dict(zip(self._poses, read_poses(values), strict=True))
-        self._points = dict(zip(self._points, read_points(values), strict=True))
+        self._poses = dict(zip(sorted(self._poses), read_poses(values), strict=True))
+        self._points = dict(zip(sorted(self._points), read_points(values), strict=True))
 
     def _rescue(self) -> None:
         """iSAM2 anew after it threw, with priors on what nothing holds, as strong as it takes."""

@@ -1,0 +1,138 @@
+"""The growing graph against the batch solve of the same factors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drives import ODOMETRY_ALONE, make_drive
+
+from objslam.geometry import exp_se3, inverse
+from objslam.graph import factors
+from objslam.graph.incremental import Bearings, IncrementalGraph
+from objslam.graph.marginals import marginal_covariances
+from objslam.graph.optimise import levenberg_marquardt, make_values, read_points, read_poses
+from objslam.ledger import Ledger
+from objslam.live.meeting import meet, sightings
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return make_drive(0, "mode=joint", frames=150, false=0.0, **ODOMETRY_ALONE)
+
+
+def bearings(drive, which):
+    rays, owner = drive.rays.take(which), drive.association.object[which]
+    return Bearings(which, rays.keyframe, owner, rays.direction, rays.sigma, rays.range, rays.range_sigma)
+
+
+def grown(drive):
+    """A graph that has taken the drive keyframe by keyframe, landmarks where their rays meet once parallax says where."""
+    graph, motion = IncrementalGraph(drive.settings), factors.motions(drive.keyframes, drive.settings)
+    waiting, known = {j: [] for j in range(len(drive.points))}, set()
+    pose = drive.keyframes.map_T_camera[0]
+    for k in range(len(drive.keyframes)):
+        if k:
+            pose = graph.pose(k - 1) @ motion[0][k - 1]
+        graph.add_keyframe(k, pose)
+        if k:
+            graph.add_motion(k - 1, k, motion[0][k - 1], motion[1][k - 1])
+        else:
+            graph.add_anchor(0, pose)
+        for r in np.flatnonzero(drive.rays.keyframe == k).tolist():
+            j = int(drive.association.object[r])
+            waiting[j].append(r)
+            if j in known:
+                graph.add_rays(bearings(drive, np.array([r])))
+                continue
+            b = bearings(drive, np.array(waiting[j]))
+            poses = np.array([graph.pose(i) for i in b.keyframe])
+            ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], b.direction)
+            s = sightings(poses[:, :3, 3], ahead, b.sigma, b.range, b.range_sigma)
+            met = meet(s, np.random.default_rng(0), 0.02) if len(s) >= 5 else None
+            if met is not None and met.parallax > np.radians(8) and met.agree.all():
+                known.add(j)
+                graph.add_landmark(j, met.position)
+                graph.add_rays(b)
+        graph.update(relinearise=k % 10 == 0)
+    assert len(known) >= 10
+    return graph, np.array(sorted(known))
+
+
+def batch(drive, graph, landmarks):
+    whole = graph._kept.graph()
+    values = make_values(drive.keyframes.map_T_camera, drive.points, landmarks)
+    return whole, levenberg_marquardt(whole, values, 100, 1e-10).values
+
+
+def test_it_ends_where_the_batch_solve_does(drive):
+    graph, landmarks = grown(drive)
+    for _ in range(8):
+        graph.update(relinearise=True)
+    graph.refresh()
+    _, values = batch(drive, graph, landmarks)
+    np.testing.assert_allclose(graph.points(landmarks), read_points(values), atol=0.02)
+    graph.solve(50)  # to the very minimum
+    graph.refresh()
+    np.testing.assert_allclose(graph.points(landmarks), read_points(values), atol=2e-3)
+    np.testing.assert_allclose(graph.poses(np.arange(len(drive.keyframes))), read_poses(values), atol=2e-3)
+
+
+def test_covariances_are_those_of_the_batch_solve(drive):
+    graph, landmarks = grown(drive)
+    graph.solve(50)
+    whole, values = batch(drive, graph, landmarks)
+    expected = marginal_covariances(whole, values, landmarks, Ledger())
+    found = np.array([graph.point_covariance(j) for j in landmarks.tolist()])
+    np.testing.assert_allclose(found, expected, rtol=0.05, atol=1e-6)
+    i, j = landmarks[:2].tolist()
+    difference = graph.difference_covariance(i, j)
+    assert np.linalg.eigvalsh(difference)[0] > 0
+    assert np.trace(difference) < np.trace(found[0] + found[1])  # they share the path's drift
+    last = len(drive.keyframes) - 1
+    relative = graph.relative_covariance(last - 1, last)
+    assert np.trace(relative) < np.trace(graph.pose_covariance(last))
+
+
+def test_what_throws_is_rescued_from_the_factors_kept(drive):
+    graph, landmarks = grown(drive)
+    graph.refresh()
+    before = graph.points(landmarks)
+    last = len(drive.keyframes) - 1
+    loose = drive.keyframes.map_T_camera[last]
+    graph.add_keyframe(last + 1, loose)  # held by one bearing alone
+    one = bearings(drive, np.flatnonzero(np.isin(drive.association.object, landmarks))[-1:])
+    graph.add_rays(replace(one, number=np.array([10_000]), keyframe=np.array([last + 1])))
+    graph.update()
+    assert graph.rebuilds == 1
+    graph.refresh()
+    np.testing.assert_allclose(graph.points(landmarks), before, atol=0.05)
+
+
+def test_what_is_dropped_is_gone_and_saved_comes_back(drive):
+    graph, landmarks = grown(drive)
+    graph.refresh()
+    saved, size, points = graph.save(), graph._kept.graph().size(), graph.points(landmarks)
+    mine = np.flatnonzero(drive.association.object == landmarks[0])
+    graph.drop_rays(mine)
+    graph.drop_landmarks(landmarks[:1])
+    graph.rebuild()
+    assert graph._kept.graph().size() < size - 5
+    graph.restore(saved)
+    assert graph._kept.graph().size() == size
+    graph.refresh()
+    np.testing.assert_allclose(graph.points(landmarks), points, atol=0.02)
+
+
+def test_moved_as_a_whole(drive):
+    graph, landmarks = grown(drive)
+    graph.refresh()
+    points, last = graph.points(landmarks), graph.pose(len(drive.keyframes) - 1)
+    moved = exp_se3(np.array([[0.0, 0.0, 0.7, 3.0, -2.0, 0.0]]))[0]
+    graph.drop_absolute()
+    graph.move(moved)
+    graph.add_anchor(0, graph.pose(0))
+    graph.rebuild()
+    graph.refresh()
+    np.testing.assert_allclose(graph.points(landmarks), points @ moved[:3, :3].T + moved[:3, 3], atol=0.02)
+    step = inverse(moved @ last) @ graph.pose(len(drive.keyframes) - 1)
+    np.testing.assert_allclose(step, np.eye(4), atol=0.02)

@@ -1,0 +1,153 @@
+"""Journals: what goes in comes out, and damage costs no more than what it hit."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from scipy.spatial.transform import Rotation
+
+from objslam.errors import LogError, OutputError
+from objslam.geometry import make_pose
+from objslam.ledger import Ledger
+from objslam.live.journal import Journal, is_journal, messages, read_journal
+from objslam.live.messages import CameraMessage, FrameMessage, MountMessage, NoteMessage, PoseMessage, decode, encode
+from objslam.simulation import make_camera
+from objslam.sources import read
+
+FINITE = st.floats(-1e6, 1e6)
+POSES = st.builds(
+    lambda v, t: make_pose(Rotation.from_rotvec(v).as_matrix(), np.array(t)),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(FINITE, FINITE, FINITE),
+)
+
+
+@st.composite
+def frames(draw):
+    count = draw(st.integers(0, 4))
+    return FrameMessage(
+        draw(FINITE),
+        draw(st.text(max_size=5)),
+        draw(npst.arrays(np.float64, (count, 4), elements=FINITE)),
+        tuple(draw(st.lists(st.text(max_size=5), min_size=count, max_size=count))),
+        draw(npst.arrays(np.float64, count, elements=st.floats(0, 1))),
+        draw(npst.arrays(np.float64, count, elements=st.one_of(st.just(np.nan), st.floats(0.1, 10)))),
+        draw(npst.arrays(np.int64, count, elements=st.integers(-1, 9))),
+    )
+
+
+MESSAGES = st.one_of(
+    st.builds(PoseMessage, st.sampled_from(["odometry", "localization"]), FINITE, POSES),
+    st.builds(MountMessage, FINITE, st.text(max_size=9), POSES),
+    st.builds(NoteMessage, FINITE, POSES),
+    st.just(CameraMessage(make_camera("links", yaw=0.3))),
+    frames(),
+)
+
+
+def same(one, other):
+    assert type(one) is type(other)
+    for a, b in zip(vars(one).values(), vars(other).values(), strict=True):
+        if hasattr(a, "matrix"):
+            same(a, b)
+        elif isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+        else:
+            assert a == b
+
+
+@given(MESSAGES)
+def test_a_message_survives_to_the_last_bit(message):
+    same(decode(encode(message)), message)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_no_message(data):
+    if data[:1] in b"OLMCFN" and len(data) > 1:
+        data = data[:1] + b"\x00" + data[1:]  # no JSON begins so, and no other record is so short
+    with pytest.raises(LogError, match="record"):
+        decode(data[:90])
+
+
+def write(file, found, resume=False):
+    journal = Journal(file, resume)
+    for message in found:
+        journal.write(message)
+    journal.close()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(MESSAGES, max_size=6), st.data())
+def test_a_torn_end_costs_the_last_record_only(tmp_path_factory, found, data):
+    file = tmp_path_factory.mktemp("journal") / "journal.objslam"
+    write(file, found)
+    sizes = np.cumsum([8] + [8 + len(encode(m)) for m in found])
+    cut = data.draw(st.integers(8, int(sizes[-1])))
+    file.write_bytes(file.read_bytes()[:cut])
+    whole = int(np.searchsorted(sizes, cut, side="right")) - 1
+    ledger = Ledger()
+    back = list(messages(file, ledger))
+    for one, other in zip(back, found[:whole], strict=True):
+        same(one, other)
+    assert bool(ledger.dropped) == (cut != sizes[whole])
+    write(file, found[whole:], resume=True)  # goes on where the whole records end
+    again = list(messages(file, Ledger()))
+    for one, other in zip(again, found, strict=True):
+        same(one, other)
+
+
+def pose(stamp, x):
+    return PoseMessage("odometry", stamp, make_pose(np.eye(3), np.array([x, 0.0, 0.0])))
+
+
+def test_a_flipped_bit_ends_the_journal_there(tmp_path):
+    file = tmp_path / "journal.objslam"
+    write(file, [pose(float(i), i) for i in range(10)])
+    data = bytearray(file.read_bytes())
+    data[8 + 5 * 121 + 40] ^= 1
+    file.write_bytes(bytes(data))
+    ledger = Ledger()
+    assert len(list(messages(file, ledger))) == 5
+    assert "torn record" in ledger.lines()[0]
+
+
+def test_two_sessions_do_not_share_a_journal(tmp_path):
+    first = Journal(tmp_path / "j")
+    with pytest.raises(OutputError, match="another session"):
+        Journal(tmp_path / "j", resume=True)
+    first.close()
+
+
+def test_what_is_no_journal(tmp_path):
+    (tmp_path / "j").write_bytes(b"something else")
+    assert not is_journal(tmp_path / "j")
+    with pytest.raises(OutputError, match="no journal"):
+        Journal(tmp_path / "j", resume=True)
+    assert (tmp_path / "j").read_bytes() == b"something else"
+    with pytest.raises(LogError):
+        list(messages(tmp_path / "j", Ledger()))
+
+
+def test_a_journal_is_a_log(tmp_path):
+    file = tmp_path / "drive" / "journal.objslam"
+    file.parent.mkdir()
+    camera, arm = make_camera("front"), make_pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+
+    def frame(stamp, *labels):
+        count = len(labels)
+        box = np.tile([10.0, 10.0, 20.0, 20.0], (count, 1))
+        return FrameMessage(stamp, "front", box, labels, np.ones(count), np.full(count, np.nan), np.full(count, -1))
+
+    found = [CameraMessage(camera), *(pose(float(i), i) for i in range(4)), frame(2.0, "cup", "ball"), frame(1.0)]
+    write(file, [*found, MountMessage(1.5, "front", arm)])
+    log = read(file.parent, Ledger())
+    assert log.name == "drive"
+    np.testing.assert_array_equal(log.odometry.stamps, [0, 1, 2, 3])
+    detections, mount = log.cameras[0].detections, log.cameras[0].mount
+    np.testing.assert_array_equal(detections.frame_stamps, [1.0, 2.0])
+    assert [detections.label_names[i] for i in detections.label] == ["cup", "ball"]
+    np.testing.assert_array_equal(mount.poses, [camera.base_T_camera, arm])
+    write(file, found[:3])
+    with pytest.raises(LogError, match="no frames"):
+        read_journal(file, Ledger())

@@ -1,0 +1,86 @@
+"""objslam live as a user runs it: replayed, killed, resumed, interrupted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from objslam.config import Odometry
+from objslam.ledger import Ledger
+from objslam.live.journal import messages
+from objslam.results import load_map
+from objslam.simulation import preset, simulate
+from objslam.sources import read
+from objslam.sources.folder import write_log_folder
+
+QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("live") / "log"
+    drive = preset("demo", frames=150, classes=12, false=0.0, localization=None, odometry=Odometry())
+    write_log_folder(simulate(drive, 0), folder)
+    return folder
+
+
+def command(log, out, *more):
+    return [sys.executable, "-m", "objslam", "live", str(log), "-o", str(out), *QUIET, *more]
+
+
+def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    done = subprocess.run(command(log, whole, "--speed", "0"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    process = subprocess.Popen(command(log, out, "--speed", "5", "--interval", "0.2"), stderr=subprocess.DEVNULL)
+    file = out / "journal.objslam"
+    end = time.monotonic() + 40
+    while time.monotonic() < end and not (
+        file.exists() and file.stat().st_size > 30_000 and (out / "objects.json").exists()
+    ):
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    accepted = sum(1 for _ in messages(out, Ledger()))
+    json.loads((out / "objects.json").read_text())  # whole, whenever it was killed
+
+    again = subprocess.run(command(log, out), capture_output=True, text=True, timeout=60)
+    assert again.returncode == 1
+    assert "--resume" in again.stderr
+    done = subprocess.run(command(log, out, "--speed", "0", "--resume"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert sum(1 for _ in messages(out, Ledger())) >= accepted
+    one, other = load_map(out).objects, load_map(whole).objects
+    assert [o.label for o in one] == [o.label for o in other]
+    assert max(abs(a.position - b.position).max() for a, b in zip(one, other, strict=True)) < 1e-6
+    assert {"summary.json", "config.yaml", "trajectory.txt", "rays.parquet"} <= {f.name for f in out.iterdir()}
+    kept, original = read(out, Ledger()), read(log, Ledger())
+    assert len(kept.odometry) == len(original.odometry)
+    assert len(kept.cameras[0].detections) == len(original.cameras[0].detections)
+
+
+def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command(log, tmp_path / "out", "--speed", "5", "--no-journal"), **pipes)
+    end = time.monotonic() + 40
+    while time.monotonic() < end and not (tmp_path / "out" / "objects.json").exists():
+        time.sleep(0.02)
+    time.sleep(1.5)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=40)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert "wrote" in out
+    assert (tmp_path / "out" / "summary.json").exists()
+    assert not (tmp_path / "out" / "journal.objslam").exists()
+
+
+def test_nothing_to_go_on_with(log, tmp_path):
+    done = subprocess.run(command(log, tmp_path / "out", "--resume"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "no journal" in done.stderr
+    assert not (tmp_path / "out").exists()

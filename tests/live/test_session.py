@@ -1,0 +1,268 @@
+"""A session against the truth of simulated drives, and against what robots do to it."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.config import Odometry, load_settings
+from objslam.errors import SolveError
+from objslam.geometry import inverse, lift_se2
+from objslam.graph.incremental import IncrementalGraph
+from objslam.live.adapters.replay import ReplayAdapter, events
+from objslam.live.interface import Sink
+from objslam.live.session import Session
+from objslam.simulation import preset, simulate
+
+SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
+
+
+def make_log(seed=0, **changes):
+    drive = {"frames": 150, "classes": 12, "false": 0.0, "localization": None, "odometry": Odometry(), **changes}
+    return simulate(preset("demo", **drive), seed)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return make_log()
+
+
+def drive(log, settings=SETTINGS, pushes=None, **more):
+    session = Session(settings, **more).start()
+    session.push_camera(log.cameras[0].camera)
+    for _, frame, push in pushes if pushes is not None else events(log):
+        push(session)
+        if frame:
+            assert session.wait(30)
+    return session
+
+
+def errors(found, log):
+    """How far each object found is from the true one of its label; every label must be there at most once."""
+    true = {o.label: o.position for o in log.truth.objects}
+    names = [o.label for o in found.objects]
+    assert len(names) == len(set(names))
+    return {o.label: float(np.linalg.norm(o.position - true[o.label])) for o in found.resolved()}
+
+
+def test_a_session_is_a_sink():
+    sink: Sink = Session(SETTINGS)
+    assert sink.push_odometry(1.0, np.eye(4)) is True
+
+
+def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
+    session = drive(log)
+    snapshot = session.snapshot()
+    off = errors(snapshot.map, log)
+    assert len(off) >= 10
+    assert max(off.values()) < 0.15
+    assert all(np.linalg.eigvalsh(o.covariance)[0] > 0 for o in snapshot.map.resolved())
+    assert snapshot.keyframes == len(snapshot.path) > 70
+    assert snapshot.counters["frames"] == 150
+    assert 0 < snapshot.update[0] <= snapshot.update[1]
+    result = session.stop()
+    off = errors(result.map, log)
+    assert len(off) >= 11
+    assert max(off.values()) < 0.15
+    assert result.summary["counts"]["detection_frames"] == 150
+    assert len(result.rays) == len(result.weight) == len(result.association.object)
+    assert session.snapshot().stamp == pytest.approx(result.keyframes.stamps.max())
+
+
+def test_several_objects_of_a_label(tmp_path):
+    log = simulate(preset("demo", frames=250), 1)
+    found = drive(log).stop().map.resolved()
+    true = [(o.label, o.position) for o in log.truth.objects]
+    near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]
+    assert len(found) >= 11
+    assert max(near) < 0.1
+
+
+def test_localization_that_comes_late_moves_the_map():
+    log = make_log(localization=preset("demo").localization)
+    turned = lift_se2(np.array([5.0, -3.0, 1.0]))
+    poses = [(s, turned @ p) for s, p in zip(log.localization.stamps, log.localization.poses, strict=True)]
+    middle = poses[len(poses) // 3][0]
+    session = Session(SETTINGS).start()
+    session.push_camera(log.cameras[0].camera)
+    later = iter(p for p in poses if p[0] >= middle)
+    following = next(later)
+    for stamp, frame, push in events(replace(log, localization=None)):
+        while following is not None and following[0] <= stamp:
+            assert session.push_localization(*following)
+            following = next(later, None)
+        push(session)
+        if frame:
+            session.wait(30)
+    true = {o.label: turned[:3, :3] @ o.position + turned[:3, 3] for o in log.truth.objects}
+    found = session.snapshot().map.resolved()
+    assert len(found) >= 10
+    assert max(np.linalg.norm(o.position - true[o.label]) for o in found) < 0.15
+    session.abort()
+
+
+def test_localization_alone():
+    log = make_log(odometry=None, localization=preset("demo").localization)
+    off = errors(drive(log).stop().map, log)
+    assert len(off) >= 10
+    assert max(off.values()) < 0.15
+
+
+def test_an_update_that_throws_leads_to_a_rebuild(log, monkeypatch):
+    update, count = IncrementalGraph._update, [0]
+
+    def throws(self, relinearise):
+        count[0] += 1
+        if count[0] in (30, 60):
+            raise RuntimeError("Indeterminate linear system detected")
+        update(self, relinearise)
+
+    monkeypatch.setattr(IncrementalGraph, "_update", throws)
+    session = drive(log)
+    assert session.snapshot().rebuilds == 2
+    off = errors(session.snapshot().map, log)
+    assert len(off) >= 10
+    assert max(off.values()) < 0.15
+    session.abort()
+
+
+def test_growth_is_bounded_and_the_map_stays(log):
+    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=60"))
+    from objslam.live import upkeep
+
+    kept, upkeep._KEPT_FREE = upkeep._KEPT_FREE, 20
+    try:
+        session = drive(log, settings)
+    finally:
+        upkeep._KEPT_FREE = kept
+    snapshot = session.snapshot()
+    assert len(snapshot.path) <= 70 < snapshot.keyframes
+    off = errors(snapshot.map, log)
+    assert len(off) >= 10
+    assert max(off.values()) < 0.2
+    session.abort()
+
+
+def test_what_was_pushed_in_disorder(log):
+    rng = np.random.default_rng(0)
+    pushes = list(events(log))
+    at = np.arange(len(pushes)) + np.where(rng.random(len(pushes)) < 0.1, rng.integers(0, 20, len(pushes)), 0)
+    mixed = [pushes[i] for i in np.argsort(at, kind="stable") for _ in range(2)]
+    session = drive(log, pushes=mixed)
+    dropped = session.counters.dropped()
+    assert dropped["odometry that is late"] > 0
+    assert dropped["odometry that came before"] > 0
+    assert dropped["frame that came before"] == 150
+    assert max(errors(session.stop().map, log).values()) < 0.15
+
+
+@pytest.mark.parametrize("jump", [10.0, -10.0])
+def test_a_clock_that_jumps_and_odometry_that_starts_anew(log, jump):
+    odometry, detections, camera = log.odometry, log.cameras[0].detections, log.cameras[0].camera
+    middle = odometry.stamps[len(odometry) // 2]
+    reset = inverse(odometry.poses[np.searchsorted(odometry.stamps, middle) - 1])
+    session = Session(SETTINGS).start()
+    session.push_camera(camera)
+    frame = 0
+    for stamp, pose in zip(odometry.stamps, odometry.poses, strict=True):
+        after = stamp >= middle
+        session.push_odometry(stamp + jump * after, reset @ pose if after else pose)
+        while frame < len(detections.frame_stamps) and detections.frame_stamps[frame] <= stamp:
+            at, mine = detections.frame_stamps[frame], detections.frame == frame
+            labels = [detections.label_names[i] for i in detections.label[mine]]
+            session.push_detections(
+                at + jump * (at >= middle), camera.name, detections.boxes[mine], labels, detections.scores[mine]
+            )
+            session.wait(30)
+            frame += 1
+    accepted = session.counters.accepted()
+    assert accepted["odometry started anew"] == 1
+    assert accepted["clock set back" if jump < 0 else "gaps of the odometry"] == 1
+    off = errors(session.stop().map, log)
+    assert len(off) >= 10
+    assert max(off.values()) < 0.15
+
+
+def test_rubbish_is_refused_and_counted(log):
+    session = Session(SETTINGS).start()
+    camera, one = log.cameras[0].camera, np.ones(1)
+    box = np.array([[10.0, 10.0, 30.0, 30.0]])
+    assert not session.push_detections(1.0, "nobody", box, ["cup"], one)
+    assert session.push_camera(camera)
+    bad_poses = (np.full((4, 4), np.nan), 2 * np.eye(4), np.zeros((3, 3)), "pose", None)
+    for pose in bad_poses:
+        assert not session.push_odometry(1.0, pose)
+        assert not session.push_localization(1.0, pose)
+        assert not session.push_mount(1.0, camera.name, pose)
+    assert not session.push_odometry(float("nan"), np.eye(4))
+    assert not session.push_mount(1.0, "nobody", np.eye(4))
+    assert not session.push_camera(replace(camera, matrix=np.zeros((3, 3))))
+    for boxes, labels, scores in ((box, ["cup", "cup"], one), (box[:, :3], ["cup"], one), ("x", ["cup"], one)):
+        assert not session.push_detections(1.0, camera.name, boxes, labels, scores)
+    bad_boxes = np.array([[np.nan, 0, 1, 1], [5, 5, 4, 4], [0, 0, 9, 9], [0, 0, 9, 9]])
+    assert session.push_detections(1.0, camera.name, bad_boxes, ["a", "b", "c", ""], [0.5, 0.5, 7.0, 0.5])
+    assert session.counters.accepted().get("boxes", 0) == 0
+    assert sum(n for reason, n in session.counters.dropped().items() if reason.startswith("box ")) == 4
+    with pytest.raises(SolveError, match="nothing was seen"):
+        session.stop()
+
+
+def test_too_many_frames_are_dropped_by_age_and_counted(log):
+    settings = load_settings(None, ("mode=joint", "live.max_frames_waiting=2", "live.max_lag=0.05"))
+    session = Session(settings).start()
+    session.push_camera(log.cameras[0].camera)
+    for _, _, push in events(log):
+        push(session)
+    assert session.wait(60)
+    dropped = session.counters.dropped()
+    assert dropped["frames that waited too long (live.max_lag)"] > 10
+    used = 150 - dropped["frames that waited too long (live.max_lag)"]
+    assert session.snapshot().keyframes <= used
+    session.abort()
+
+
+def test_frames_that_come_seconds_late_find_their_place(log):
+    pushes = list(events(log))
+    late = [p for p in pushes if p[1]][::7]
+    at = {id(p): p[0] + 1.5 for p in late}
+    order = sorted(pushes, key=lambda p: at.get(id(p), p[0]))
+    session = drive(log, pushes=order)
+    assert session.counters.accepted()["frames out of order"] > 10
+    assert "frame that is late (live.max_late)" not in session.counters.dropped()
+    assert max(errors(session.stop().map, log).values()) < 0.15
+
+
+def test_the_same_messages_make_the_same_map_and_a_killed_session_goes_on(log, tmp_path):
+    whole = drive(log, journal=tmp_path / "whole")
+    unbroken = whole.snapshot().map
+    whole.abort()
+    pushes = list(events(log))
+    first = drive(log, journal=tmp_path / "journal", pushes=pushes[:500])
+    first.abort()  # what a kill leaves is the same: every record is written before it counts
+    with (tmp_path / "journal").open("ab") as stream:
+        stream.write(b"\x40\x00\x00\x00half of a rec")
+    session = Session(SETTINGS, tmp_path / "journal", resume=True).start()
+    assert session.counters.dropped()["torn record at the end of the journal"] == 1
+    for _, frame, push in pushes[500:]:
+        push(session)
+        if frame:
+            session.wait(30)
+    again = session.snapshot().map
+    assert [o.label for o in again.objects] == [o.label for o in unbroken.objects]
+    for one, other in zip(again.objects, unbroken.objects, strict=True):
+        np.testing.assert_allclose(one.position, other.position, atol=1e-6)
+    session.abort()
+
+
+def test_replay_at_a_speed_and_stopped(log):
+    session, stop = Session(SETTINGS).start(), threading.Event()
+    adapter = ReplayAdapter(session, log, speed=20.0)
+    thread = threading.Thread(target=adapter.run, args=(stop,))
+    thread.start()
+    thread.join(0.8)
+    stop.set()
+    thread.join(5)
+    assert not thread.is_alive()
+    assert 10 < session.counters.accepted()["frames"] < 150
+    session.abort()
