@@ -18,7 +18,7 @@ from objslam.association.assign import assign
 from objslam.association.lay import lay
 from objslam.association.search import associate
 from objslam.config import Settings
-from objslam.geometry import adjoint, inverse
+from objslam.geometry import adjoint, inverse, log_se3
 from objslam.graph import factors
 from objslam.graph.closure import Closure, Known, bend, find_closure
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
@@ -33,8 +33,10 @@ _PLACE = 0.1  # m
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02  # share of the drift, rad, m that laying a step leaves open
 _FEWEST = 5  # rays that must agree on a new landmark: a wrong one pulls on every pose after it
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-_HOLDS = 0.7  # share of a closed loop's rays that must still fit
-_FITS = 4.0  # standard deviations
+_STRAY = 13.8  # squared deviations that a ray costs at the most
+_STRAIN = 200.0
+"""Squared deviations by which a loop may raise the cost for each landmark that it joins: on MRCLAM right ones took up to
+110, wrong ones 250 and more."""
 _FLOOR = 0.02  # m; landmarks are never taken to be known better than that
 
 
@@ -93,7 +95,17 @@ def explore(
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
             found = find_closure(known, _active(known, heading, end - 1), rays, owner, graph, values, map_T_camera, end - 1)
             if found is not None:
-                closed = _close(found, known, rays, owner, map_T_camera[:end], heading, motion, covariance, settings)
+                closed = _close(
+                    found,
+                    known,
+                    rays,
+                    owner,
+                    map_T_camera[:end],
+                    heading,
+                    motion,
+                    covariance,
+                    settings,
+                )
                 if closed is not None:
                     graph, known, owner, map_T_camera[:end] = closed
         progress(end, len(keyframes))
@@ -116,7 +128,7 @@ def _close(
     covariance: Floats,
     settings: Settings,
 ) -> tuple[gtsam.NonlinearFactorGraph, Known, Ints, Floats] | None:
-    """The graph, landmarks, owners and poses with the loop closed, or None where too many rays contradict it then."""
+    """The graph, landmarks, owners and poses with the loop closed, or None where it strains them."""
     now, old = found.now, found.before
     back = int(known.first[now].min())
     left = int(np.minimum(known.last[old], back).max())
@@ -143,16 +155,25 @@ def _close(
         landmark_priors(np.arange(len(merged)), merged.position, settings),
     )
     values = _solve(graph, poses, merged, _ITERATIONS_OF_A_LOOP)
+    before = _cost(rays, owner, known.position, map_T_camera, motion, covariance)
     poses, merged.position = read_poses(values), read_points(values)
-    mine = held[np.isin(owned[held], number[old])]
-    some = rays.take(mine)
-    origins, directions = some.in_map(poses)
-    off = angles_off(origins, directions, merged.position[owned[mine]])
-    distance = np.linalg.norm(merged.position[owned[mine]] - origins, axis=1)
-    if np.mean(off < _FITS * np.hypot(some.sigma, _FLOOR / distance)) < _HOLDS:
+    if _cost(rays, owned, merged.position, poses, motion, covariance) > before + _STRAIN * len(now):
         return None
     merged.covariance = _covariances(rays, owned, merged.position, poses)
     return graph, merged, owned, poses
+
+
+def _cost(rays: Rays, owner: Ints, positions: Floats, map_T_camera: Floats, motion: Floats, covariance: Floats) -> float:
+    """Squared deviations of all rays with a landmark, none more than a stray's, and of the odometry, up to here."""
+    held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
+    some = rays.take(held)
+    origins, directions = some.in_map(map_T_camera)
+    off = angles_off(origins, directions, positions[owner[held]])
+    distance = np.linalg.norm(positions[owner[held]] - origins, axis=1)
+    seen = np.minimum(off**2 / (some.sigma**2 + (_FLOOR / distance) ** 2), _STRAY).sum()
+    steps = len(map_T_camera) - 1
+    twist = log_se3(inverse(motion[:steps]) @ inverse(map_T_camera[:-1]) @ map_T_camera[1:])
+    return float(seen + (twist * np.linalg.solve(covariance[:steps], twist[..., None])[..., 0]).sum())
 
 
 def _heading_drift(keyframes: Keyframes) -> Floats:
