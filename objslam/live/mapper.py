@@ -12,26 +12,26 @@ import numpy as np
 
 from objslam.association.sightings import Sightings
 from objslam.config import Settings
-from objslam.geometry import adjoint, inverse, is_planar
+from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.graph.incremental import Bearings, IncrementalGraph
 from objslam.live import known as landmarks
 from objslam.live import upkeep
-from objslam.live.candidates import Candidate, place, ripe
+from objslam.live.births import extend, give_birth, new_candidate
+from objslam.live.candidates import Candidate, place
+from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
+from objslam.live.frame_reader import FrameReader
+from objslam.live.localizing import localize
 from objslam.live.matching import Doubt, FrameRays, best_of_label, in_map, match, match_by_label
 from objslam.live.meeting import information, misses, sightings
 from objslam.live.messages import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
 from objslam.live.path import PathBuffer
-from objslam.live.table import Table
-from objslam.rays import box_rays
-from objslam.types import Camera, Detections, Floats, Ints, Keyframes, label_table
+from objslam.types import Camera, Floats, Ints, Keyframes
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
-_MOUNTS = 4096  # of one camera that are kept
 _SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop that closes: the graph is given more time
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
-_CANDIDATES = 150  # at the most
 _TRACKS = 4096  # of the detector, that are remembered
 
 
@@ -41,8 +41,7 @@ class Mapper:
     def __init__(self, settings: Settings, counters: Counters) -> None:
         self.settings, self.counters = settings, counters
         self.graph = IncrementalGraph(settings)
-        self.cameras: list[Camera] = []
-        self.labels: list[str] = []
+        self.reader = FrameReader(settings, counters.ledger)
         self.keyframes = new_keyframes()
         self.rays = new_rays()
         self.known = landmarks.new_landmarks()
@@ -59,17 +58,25 @@ class Mapper:
         self.polished = self.frames = 0
         self.unsettled = False
         self.tracks: dict[int, int] = {}
-        self._label_number: dict[str, int] = {}
-        self._mounts: dict[str, tuple[list[float], list[Floats]]] = {}
-        self._camera_number: dict[str, int] = {}
         self._frame_number: dict[int, int] = {}
         self._last: dict[int, Floats] = {}
         self._shown: set[int] = set()
-        self._unlocalized: list[int] = []
-        self._localizations = 0
-        self._flat = True
+        self.unlocalized: list[int] = []
+        self.localizations = 0
+        self.flat = True
         self._doubts: dict[int, Floats] = {}
-        self._next_ray = self._next_keyframe = self._next_object = self._next_candidate = self._count = 0
+        self._next_ray = self._next_keyframe = self._count = 0
+        self.next_object = self.next_candidate = 0
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras, in the order in which they came."""
+        return self.reader.cameras
+
+    @property
+    def labels(self) -> list[str]:
+        """The labels by their numbers."""
+        return self.reader.labels
 
     @property
     def keyframes_so_far(self) -> int:
@@ -82,23 +89,13 @@ class Mapper:
             if message.path == "odometry":
                 self.odometry.append(message.stamp, message.pose)
             else:
-                self._localizations += 1
+                self.localizations += 1
                 self.localization.append(message.stamp, message.pose)
-                self._localize()
+                localize(self)
         elif isinstance(message, CameraMessage):
-            number = self._camera_number.get(message.camera.name)
-            if number is None:
-                self._camera_number[message.camera.name] = len(self.cameras)
-                self.cameras.append(message.camera)
-            else:
-                self.cameras[number] = message.camera
+            self.reader.add_camera(message.camera)
         elif isinstance(message, MountMessage):
-            stamps, poses = self._mounts.setdefault(message.camera, ([], []))
-            at = bisect.bisect_right(stamps, message.stamp)
-            stamps.insert(at, message.stamp)
-            poses.insert(at, message.pose)
-            if len(stamps) > _MOUNTS:
-                del stamps[0], poses[0]
+            self.reader.add_mount(message)
         elif isinstance(message, FrameMessage):
             self._count += 1
             bisect.insort(self.waiting, (message.stamp, self._count, message, arrival))
@@ -117,17 +114,17 @@ class Mapper:
         """Work a frame into the map; whether it became a keyframe."""
         max_gap = self.settings.poses.max_gap
         found = self._lead().at(frame.stamp, max_gap)
-        camera = self._camera_number[frame.camera]
+        camera = self.reader.number[frame.camera]
         if found is None:
             self.leave_out(frame, "frames off the path, or in a gap of it")
             return False
         map_T_base, drift = found
         self.frames += 1
         start_T_base = self._lead().from_start(map_T_base)
-        base_T_camera = self._mount(frame)
+        base_T_camera = self.reader.mount(frame)
         number = self._frame_number.get(camera, 0)
         self._frame_number[camera] = number + 1
-        rays = self._rays_of(frame, self.cameras[camera])
+        rays = self.reader.rays(frame)
         moved = self._moved(camera, start_T_base @ base_T_camera)
         shown = set(rays.label.tolist())
         if moved:
@@ -167,10 +164,10 @@ class Mapper:
         if motion is not None:
             assert before is not None
             self.graph.add_motion(int(self.keyframes.id[before]), k, *motion)
-        elif before is None and not self._localized_only():
+        elif before is None and not self.localized_only:
             self.graph.add_anchor(k, guess)
-        self._unlocalized.append(k)
-        self._localize()
+        self.unlocalized.append(k)
+        localize(self)
         self._associate(rays, k, camera, guess, doubt, frame.stamp)
         return True
 
@@ -193,7 +190,7 @@ class Mapper:
         numbers = self._next_ray + np.arange(count)
         self._next_ray += count
         mine = best_of_label(rays) if self.by_label else np.arange(count)
-        some = take(rays, mine)
+        some = rays.take(mine)
         if self.by_label:
             hit, missed = match_by_label(some, guess, known, doubt, settings.association.gate)
             lost = missed >= 0
@@ -203,7 +200,7 @@ class Mapper:
         else:
             hit = match(some, guess, known, self.candidates, doubt, len(self.labels), settings.association.gate, self.tracks)
             for i in np.flatnonzero(hit >= len(known)).tolist():
-                self._extend(self.candidates[hit[i] - len(known)], rays, i, numbers[i], k, stamp, doubt)
+                extend(self, self.candidates[hit[i] - len(known)], rays, i, numbers[i], k, stamp, doubt)
             free = mine[hit < 0]
             hit = np.where(hit < len(known), hit, -1)
         matched = mine[hit >= 0]
@@ -224,11 +221,11 @@ class Mapper:
             used=used,
         )
         for i in free.tolist():
-            self._candidate(rays, i, numbers[i], k, stamp, doubt)
+            new_candidate(self, rays, i, numbers[i], k, stamp, doubt)
         place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == k])
         if len(matched):
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
-        self._births(k)
+        give_birth(self, k)
         self.graph.update()
         self._seen(rays, matched, rows, k, camera, doubt, stamp)
 
@@ -241,7 +238,7 @@ class Mapper:
         known.expected[seen] += 1
         if not len(rows):
             return
-        s = in_map(take(rays, matched), pose)
+        s = in_map(rays.take(matched), pose)
         known.position[rows] = self.graph.points(known.id[rows])
         off = misses(s, known.position[rows])
         self.unsettled |= bool((off * s.sigma).max() > _SETTLE)
@@ -264,64 +261,6 @@ class Mapper:
                     pair = (int(ids[a]), int(ids[b]))
                     if same[pair[0]] == same[pair[1]]:
                         self.together[pair] = self.together.get(pair, 0) + 1
-
-    def _births(self, k: int) -> None:
-        """Candidates that saw something in this keyframe become landmarks where their rays carry it."""
-        born: list[Candidate] = []
-        for candidate in self.candidates:
-            if candidate.rays[-1][1] != k:
-                continue
-            met = ripe(candidate, self.graph, self.settings, self.rng)
-            if met is None:
-                continue
-            born.append(candidate)
-            j = self._next_object
-            self._next_object += 1
-            numbers = candidate.numbers()
-            at = np.searchsorted(self.rays.number, numbers)
-            self.rays.owner[at] = j
-            self.rays.used[at] = met.agree
-            s = candidate.sight(self.graph)
-            inner = s.take(met.agree)
-            self.known.add(
-                id=[j],
-                position=met.position[None],
-                information=information(inner, met.position).sum(axis=0)[None],
-                label=[candidate.label],
-                drift=candidate.drift[None],
-                first=[candidate.first],
-                last=[candidate.last],
-                seen=[int(met.agree.sum())],
-                expected=[len(candidate)],
-                far=[float(np.linalg.norm(met.position - inner.origin, axis=1).max())],
-                squared=[float((misses(inner, met.position) ** 2).clip(max=36.0).sum())],
-                rejected=[0],
-            )
-            self.graph.add_landmark(j, met.position)
-            self.graph.add_rays(self.bearings(at[met.agree]))
-        for candidate in born:
-            self.candidates.remove(candidate)
-
-    def _candidate(self, rays: FrameRays, i: int, number: int, k: int, stamp: float, doubt: Doubt) -> None:
-        label = int(rays.label[i])
-        if self.by_label:
-            for candidate in self.candidates:
-                if candidate.label == label:
-                    self._extend(candidate, rays, i, number, k, stamp, doubt)
-                    return
-        elif len(self.candidates) >= _CANDIDATES:
-            self.candidates.remove(min(self.candidates, key=lambda c: (len(c) >= self.settings.live.min_rays, c.last)))
-        candidate = Candidate(self._next_candidate, label, self.by_label, stamp, stamp, doubt.drift)
-        self._next_candidate += 1
-        self.candidates.append(candidate)
-        self._extend(candidate, rays, i, number, k, stamp, doubt)
-
-    def _extend(
-        self, candidate: Candidate, rays: FrameRays, i: int, number: int, k: int, stamp: float, doubt: Doubt
-    ) -> None:
-        seen = (rays.direction[i], float(rays.sigma[i]), float(rays.range[i]), float(rays.range_sigma[i]))
-        candidate.extend((int(number), k, *seen), self.graph.pose(k))
-        candidate.last, candidate.drift = max(candidate.last, stamp), doubt.drift
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""
@@ -362,7 +301,7 @@ class Mapper:
 
     def _predict(self, before: int | None, row: dict[str, object]) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
         """The first guess (4, 4) of a keyframe's camera, the covariance (6, 6) of that, and its motion by odometry."""
-        if before is None or self._localized_only():
+        if before is None or self.localized_only:
             noise = self.settings.localization
             doubt = np.diag([noise.yaw] * 3 + [noise.xy] * 3) ** 2 if before is not None else np.zeros((6, 6))
             return np.asarray(row["map_T_base"]) @ np.asarray(row["base_T_camera"]), doubt, None
@@ -390,45 +329,6 @@ class Mapper:
             drift=two("drift"),
         )
 
-    def _localize(self) -> None:
-        """Absolute poses for the keyframes that the localisation covers by now."""
-        if not self._localizations or not self._unlocalized:
-            return
-        left = []
-        for k in self._unlocalized:
-            row = int(np.searchsorted(self.keyframes.id, k))
-            if row == len(self.keyframes) or self.keyframes.id[row] != k:
-                continue
-            stamp = float(self.keyframes.stamp[row])
-            if stamp > self.localization.newest:
-                left.append(k)
-                continue
-            found = self.localization.at(stamp, self.settings.poses.max_gap)
-            if found is None:
-                continue
-            self._flat = self._flat and is_planar(np.stack([np.eye(4), self.localization.from_start(found[0])]))
-            first = not self.keyframes.localized.any() and not self._localized_only()
-            if first:
-                self._move_onto(row, found[0])
-            self.keyframes.map_T_base[row] = found[0]
-            self.keyframes.localized[row] = True
-            one = self.keyframe_arrays(np.array([row]))
-            self.graph.add_absolute(k, factors.localizations(one, self.settings, k, self._flat)[0])
-            if first:
-                self.graph.rebuild()
-        self._unlocalized = left
-
-    def _move_onto(self, row: int, map_T_base: Floats) -> None:
-        """The first localisation says where the map is: so far it lay where the odometry began."""
-        self.graph.update()
-        there = map_T_base @ self.keyframes.base_T_camera[row] @ inverse(self.graph.pose(int(self.keyframes.id[row])))
-        self.graph.drop_absolute()
-        self.graph.move(there)
-        self.known.position[:] = self.known.position @ there[:3, :3].T + there[:3, 3]
-        spun = there[:3, :3]
-        self.known.information[:] = spun @ self.known.information @ spun.T
-        self.move_candidates(there, -np.inf)
-
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
         """Some of the keyframes (n,), as offline has them."""
         k = self.keyframes
@@ -439,15 +339,17 @@ class Mapper:
             frame=k.frame[rows],
             base_T_camera=k.base_T_camera[rows],
             map_T_base=k.map_T_base[rows],
-            localized_every=max(1.0, self._next_keyframe / max(self._localizations, 1)) if localized else 0.0,
-            odom_T_base=None if self._localized_only() else k.start_T_base[rows],
-            drift=None if self._localized_only() else k.drift[rows],
+            localized_every=max(1.0, self._next_keyframe / max(self.localizations, 1)) if localized else 0.0,
+            odom_T_base=None if self.localized_only else k.start_T_base[rows],
+            drift=None if self.localized_only else k.drift[rows],
         )
 
     def _lead(self) -> PathBuffer:
-        return self.localization if self._localized_only() else self.odometry
+        return self.localization if self.localized_only else self.odometry
 
-    def _localized_only(self) -> bool:
+    @property
+    def localized_only(self) -> bool:
+        """Whether there has been no odometry."""
         return self.odometry.newest == -np.inf
 
     def _before(self, stamp: float) -> int | None:
@@ -466,79 +368,3 @@ class Mapper:
         step = inverse(last) @ start_T_camera
         turned = np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0))
         return bool(np.linalg.norm(step[:3, 3]) >= live.keyframe_distance or turned >= np.radians(live.keyframe_angle_deg))
-
-    def _mount(self, frame: FrameMessage) -> Floats:
-        stamps, poses = self._mounts.get(frame.camera, ([], []))
-        at = bisect.bisect_right(stamps, frame.stamp)
-        return poses[at - 1] if at else self.cameras[self._camera_number[frame.camera]].base_T_camera
-
-    def _rays_of(self, frame: FrameMessage, camera: Camera) -> FrameRays:
-        names, label = label_table(frame.labels)
-        boxes = Detections(
-            frame_stamps=np.array([frame.stamp]),
-            frame=np.zeros(len(frame), dtype=np.int64),
-            boxes=frame.boxes,
-            label=label,
-            scores=frame.scores,
-            depths=frame.depths,
-            track_ids=frame.track_ids,
-            label_names=names,
-        )
-        boxes, direction, sigma = box_rays(boxes, camera, self.settings, self.counters.ledger)
-        for name in names:
-            if name not in self._label_number:
-                self._label_number[name] = len(self.labels)
-                self.labels.append(name)
-        number = np.array([self._label_number[name] for name in names], dtype=np.int64)
-        depth = boxes.depths if self.settings.depth.use else np.full(len(boxes), np.nan)
-        reach = depth / direction[:, 2]
-        return FrameRays(
-            direction=direction,
-            sigma=sigma,
-            range=reach,
-            range_sigma=self.settings.depth.sigma + self.settings.depth.sigma_per_m * reach,
-            label=number[boxes.label] if len(boxes) else boxes.label,
-            score=boxes.scores,
-            box=boxes.boxes,
-            track=boxes.track_ids,
-        )
-
-
-def take(rays: FrameRays, which: Ints) -> FrameRays:
-    """Some of the rays of a frame (n,)."""
-    return FrameRays(**{name: value[which] for name, value in vars(rays).items()})
-
-
-def new_keyframes() -> Table:
-    """No keyframes yet: columns as `types.Keyframes` has them; start_T_base is odom_T_base from where the odometry began."""
-    pose = (np.float64, (4, 4))
-    return Table(
-        id=(np.int64, ()),
-        stamp=(np.float64, ()),
-        camera=(np.int64, ()),
-        frame=(np.int64, ()),
-        base_T_camera=pose,
-        map_T_base=pose,
-        start_T_base=pose,
-        drift=(np.float64, (6, 6)),
-        localized=(np.bool_, ()),
-    )
-
-
-def new_rays() -> Table:
-    """No rays yet: columns as `types.Rays` has them, the number of each, owner (id of a landmark, -1 none), and whether the
-    graph uses it."""
-    return Table(
-        number=(np.int64, ()),
-        keyframe=(np.int64, ()),
-        direction=(np.float64, (3,)),
-        sigma=(np.float64, ()),
-        range=(np.float64, ()),
-        range_sigma=(np.float64, ()),
-        label=(np.int64, ()),
-        score=(np.float64, ()),
-        box=(np.float64, (4,)),
-        track=(np.int64, ()),
-        owner=(np.int64, ()),
-        used=(np.bool_, ()),
-    )

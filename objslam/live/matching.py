@@ -40,6 +40,10 @@ class FrameRays:
     def __len__(self) -> int:
         return len(self.direction)
 
+    def take(self, rays: Ints) -> FrameRays:
+        """Some of them (m,)."""
+        return FrameRays(**{name: value[rays] for name, value in vars(self).items()})
+
 
 @dataclass(frozen=True)
 class Doubt:
