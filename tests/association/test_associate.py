@@ -271,3 +271,28 @@ def test_strays_alone_make_no_object():
         frame, np.column_stack([centre - 15, centre + 15]), np.zeros(150, dtype=np.int64), scene.cameras[0], ("cup",), 3.0
     )
     assert scene.associate(rays=strays).count == 0
+
+
+def test_a_guess_is_gone_on_from_and_a_wrong_one_does_no_harm():
+    """From its own answer nothing changes; two objects taken for one, and one for two, are put right."""
+    scene = drive(preset("rooms"), 2)
+    plain = scene.associate()
+    origins, directions = scene.rays.in_map(scene.keyframes.map_T_camera)
+
+    def placed(association):
+        settings = Settings().triangulation
+        return triangulate(origins, directions, association.object, association.count, scene.rays.sigma, settings).positions
+
+    again = scene.associate(guess=(plain, placed(plain)))
+    assert (again.object != plain.object).mean() < 0.005
+    np.testing.assert_array_equal(again.label, plain.label)
+
+    wrong = plain.object.copy()
+    wrong[plain.object == 1] = 0
+    half = np.flatnonzero(plain.object == 2)[::2]
+    wrong[half] = plain.count
+    guess = replace(plain, object=wrong, label=np.append(plain.label, plain.label[2]))
+    mended = scene.associate(guess=(guess, placed(guess)))
+    found, true, _ = scene.compare(mended)
+    assert len(found) == mended.count
+    assert set(np.flatnonzero(scene.well_seen())) <= set(true)
