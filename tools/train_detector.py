@@ -3,6 +3,7 @@
 python tools/train_detector.py render --out DATA            images (resumable)
 python tools/train_detector.py train --data DATA --out RUN  checkpoints (resumable), log with mAP
 python tools/train_detector.py export --run RUN --data DATA --onnx objslam/models/ssd7.onnx
+python tools/train_detector.py measure --data DATA          a model on the held-out images (after render --train 0)
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ def main() -> None:
     exporting.add_argument("--data", type=Path, required=True)
     exporting.add_argument("--run", type=Path, required=True)
     exporting.add_argument("--onnx", type=Path, default=Path("objslam/models/ssd7.onnx"))
+    measuring = commands.add_parser("measure", help="measure an ONNX model on the held-out images")
+    measuring.add_argument("--data", type=Path, required=True)
+    measuring.add_argument("--onnx", type=Path, default=Path("objslam/models/ssd7.onnx"))
     arguments = parser.parse_args()
     if arguments.command == "render":
         render_samples(arguments.out, "held_out", arguments.held_out, arguments.seed)
@@ -45,13 +49,16 @@ def main() -> None:
     elif arguments.command == "train":
         torch.set_num_threads(arguments.threads)
         train(arguments.data, arguments.out, arguments.steps, arguments.seed)
+    elif arguments.command == "export":
+        export_and_check(arguments.data, arguments.run, arguments.onnx)
+        print_quality(arguments.data, arguments.onnx)
     else:
-        export_and_measure(arguments.data, arguments.run, arguments.onnx)
+        print_quality(arguments.data, arguments.onnx)
 
 
-def export_and_measure(data: Path, run: Path, file: Path) -> None:
-    """Export the last checkpoint, check that onnxruntime agrees with torch, and print the quality of the exported model."""
-    from ssd.export import export, parity, run_onnx
+def export_and_check(data: Path, run: Path, file: Path) -> None:
+    """Export the last checkpoint, and check that onnxruntime agrees with torch."""
+    from ssd.export import export, parity
 
     state = torch.load(run / "checkpoint.pt", weights_only=True)
     network = Ssd(len(LABELS), SIZE)
@@ -60,6 +67,13 @@ def export_and_measure(data: Path, run: Path, file: Path) -> None:
     held_out = load_samples(data, "held_out")
     box, score = parity(network, file, held_out.images[:64])
     print(f"{file}: {file.stat().st_size / 1e6:.2f} MB after {state['step']} steps; against torch {box:.1e} px, {score:.1e}")
+
+
+def print_quality(data: Path, file: Path) -> None:
+    """Print how well a model finds the objects of the held-out images."""
+    from ssd.export import run_onnx
+
+    held_out = load_samples(data, "held_out")
     quality = measure(run_onnx(file, held_out.images), held_out, len(LABELS), RAW_SCALE)
     print(f"{len(held_out)} held-out images, {int(held_out.counts.sum())} objects: mAP@0.5 {quality.mean:.4f}")
     for label, precision in zip(LABELS, quality.precision, strict=True):
