@@ -246,11 +246,11 @@ class Reconstruction(Section):
 class Live(Section):
     """Mapping while the robot drives."""
 
-    keyframe_distance: NotNegative = 0.03
+    keyframe_distance: NotNegative = 0.01
     """m; a frame becomes a keyframe once its camera has moved so far since the last one,"""
-    keyframe_angle_deg: NotNegative = 2.0
-    """or turned so far, or shows a label that no keyframe since then has."""
-    max_keyframes: Annotated[int, Field(ge=50)] = 3000
+    keyframe_angle_deg: NotNegative = 0.5
+    """or turned so far, or shows a label that no keyframe since then has. Where it stands still, the first ten are taken."""
+    max_keyframes: Annotated[int, Field(ge=50)] = 2500
     """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them summed up:
     what memory and time an update take stays bounded."""
     max_lag: Positive = 0.4

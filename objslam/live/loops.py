@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.association.constellation import Constellation, Recognition, recognise
 from objslam.errors import SolveError
-from objslam.geometry import inverse
+from objslam.geometry import adjoint, inverse
 from objslam.graph.closure import bend
 from objslam.live.joining import join, without
 from objslam.live.known import covariances, gathered
@@ -60,9 +60,9 @@ def _recognise(m: Mapper, one: Ints, two: Ints, possible: Bools, newest: int) ->
     best: Recognition | None = None
     for stamp in lately[np.linspace(0, len(lately) - 1, min(_ANCHORS, len(lately))).astype(np.int64)]:
         anchor = int(np.argmin(np.abs(k.stamp - stamp)))
-        prior = _planar(m, anchor, newest)
-        if anchor == newest or prior is None:
+        if k.stamp[anchor] >= k.stamp[newest]:
             continue
+        prior = _planar(m, anchor, newest)
         found = recognise(a, b, pivot, prior, density, possible)
         if found is None or found.evidence < _EVIDENCE or found.lead < _LEAD or len(found.pairs) < _FEWEST:
             continue
@@ -71,13 +71,19 @@ def _recognise(m: Mapper, one: Ints, two: Ints, possible: Bools, newest: int) ->
     return best
 
 
-def _planar(m: Mapper, before: int, now: int) -> Floats | None:
-    """Covariance (3, 3) of the camera now as seen from before: x, y, yaw along the map's axes; None where nobody knows."""
-    ids = m.keyframes.id
-    turn = np.kron(np.eye(2), m.graph.pose(int(ids[now]))[:3, :3])
-    spread = turn @ m.graph.relative_covariance(int(ids[before]), int(ids[now])) @ turn.T
-    planar = spread[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(_LEAST) ** 2
-    return planar if np.isfinite(planar).all() else None
+def _planar(m: Mapper, before: int, now: int) -> Floats:
+    """Covariance (3, 3) of the camera now as seen from before: x, y, yaw along the map's axes.
+
+    What the odometry gathered in between, or the doubt about the place in the map, whichever is less: both are more than
+    the graph's own relative covariance, which would take longer than a frame may.
+    """
+    k = m.keyframes
+    turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
+    to_camera = adjoint(inverse(k.start_T_base[now] @ k.base_T_camera[now]))
+    drift = to_camera @ (k.drift[now] - k.drift[before]) @ to_camera.T
+    spreads = [turn @ spread @ turn.T for spread in (drift, m.doubt) if np.isfinite(spread).all()]
+    least = min(spreads, key=lambda spread: float(np.trace(spread[3:, 3:])))
+    return np.asarray(least[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(_LEAST) ** 2)
 
 
 def _constellation(m: Mapper, which: Ints, pivot: Floats) -> Constellation:

@@ -31,6 +31,7 @@ from objslam.types import Camera, Floats, Ints, Keyframes
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
 _SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop that closes: the graph is given more time
+_STANDING = 10  # keyframes from one place
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
 _TRACKS = 4096  # of the detector, that are remembered
 
@@ -61,10 +62,12 @@ class Mapper:
         self._frame_number: dict[int, int] = {}
         self._last: dict[int, Floats] = {}
         self._shown: set[int] = set()
+        self._standing = 0
         self.unlocalized: list[int] = []
         self.localizations = 0
         self.flat = True
         self._doubts: dict[int, Floats] = {}
+        self.doubt = np.full((6, 6), np.nan)
         self._next_ray = self._next_keyframe = self._count = 0
         self.next_object = self.next_candidate = 0
 
@@ -129,7 +132,8 @@ class Mapper:
         shown = set(rays.label.tolist())
         if moved:
             self._shown.clear()
-        elif shown <= self._shown:
+            self._standing = 0
+        elif shown <= self._shown and self._standing >= _STANDING:
             self.counters.accept("frames between keyframes")
             return False
         if not len(rays) and not len(self.known):
@@ -159,6 +163,7 @@ class Mapper:
         self._next_keyframe += 1
         self._last[camera] = start_T_base @ base_T_camera
         self._shown |= shown
+        self._standing += 1
         self.keyframes.add(**{name: np.asarray(value)[None] for name, value in row.items()})
         self.graph.add_keyframe(k, guess)
         if motion is not None:
@@ -311,6 +316,7 @@ class Mapper:
         if k not in self._doubts:  # asked for now and then: between, the odometry adds to it
             self._doubts = {k: self.graph.pose_covariance(k)}
         doubt = back @ self._doubts[k] @ back.T + covariance[0]
+        self.doubt = doubt
         if self._next_keyframe % _ASK:
             self._doubts[self._next_keyframe] = doubt
         return self.graph.pose(k) @ motion[0], doubt, (motion[0], covariance[0])

@@ -228,7 +228,7 @@ class Session:
         m = self._mapper
         snapshot = Snapshot(
             stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
-            map=self._describer.map(m),
+            map=self._describer.map(m, whole=self._stopping),
             path=path(m),
             keyframes=m.keyframes_so_far,
             rebuilds=m.graph.rebuilds,

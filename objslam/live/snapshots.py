@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,12 @@ import numpy as np
 from objslam.association.extent import extents
 from objslam.geometry import inverse, widest_angle
 from objslam.live.candidates import Candidate
+from objslam.live.known import covariances
 from objslam.live.mapper import Mapper
 from objslam.live.meeting import misses, sightings
 from objslam.types import Association, Floats, Ints, Keyframes, MapObject, ObjectMap, Rays, Trajectory
 
+_BUDGET = 0.012  # s
 _MOST = 200  # rays of an object that it is described by
 _FEW = 60  # and for its parallax
 
@@ -23,34 +26,45 @@ class Describer:
     def __init__(self) -> None:
         self._said: dict[int, tuple[tuple[int, float], MapObject]] = {}
 
-    def map(self, m: Mapper) -> ObjectMap:
-        """Objects with covariance and status, by their ids; candidates with enough boxes come after them, unresolved."""
+    def map(self, m: Mapper, whole: bool = False) -> ObjectMap:
+        """Objects with covariance and status, by their ids; candidates with enough boxes come after them, unresolved.
+
+        Unless the whole is asked for, what takes longer than a frame may is left for the next time: an object then goes by
+        what was said of it last, at its new place.
+        """
+        end = np.inf if whole else time.perf_counter() + _BUDGET
         known = m.known
         m.graph.refresh()
         points = m.graph.points(known.id)
         objects, said = [], {}
-        for row, j in enumerate(known.id.tolist()):
+        order = np.argsort([self._said[j][0][1] if j in self._said else -np.inf for j in known.id.tolist()], kind="stable")
+        for row in order.tolist():
+            j = int(known.id[row])
             state = (int(known.seen[row]), float(known.last[row]))
             before = self._said.get(j)
-            if before is not None and before[0] == state:
-                described = replace(before[1], position=points[row])
+            if before is not None and (before[0] == state or time.perf_counter() > end):
+                described, state = replace(before[1], position=points[row]), before[0]
+            elif time.perf_counter() > end:  # new: with the covariance that its rays alone give, for now
+                described = self._describe(m, row, j, points[row], covariances(known, np.array([row]))[0])
+                state = (-1, -np.inf)
             else:
-                described = self._describe(m, row, j, points[row])
+                described = self._describe(m, row, j, points[row], m.graph.point_covariance(j))
             said[j] = (state, described)
             objects.append(described)
         self._said = said
+        objects.sort(key=lambda o: o.id)
         first = int(known.id.max(initial=-1)) + 1
         waiting = [c for c in m.candidates if len(c) >= m.settings.live.min_rays]
         objects += [_waiting(m, c, first + i) for i, c in enumerate(waiting)]
         return ObjectMap(tuple(objects))
 
-    def _describe(self, m: Mapper, row: int, j: int, position: Floats) -> MapObject:
+    def _describe(self, m: Mapper, row: int, j: int, position: Floats, covariance: Floats) -> MapObject:
         known, rays = m.known, m.rays
         mine = np.flatnonzero((rays.owner == j) & rays.used)
         count = len(mine)
         some = mine[np.linspace(0, count - 1, min(count, _MOST)).astype(np.int64)] if count else mine
         few = mine[np.linspace(0, count - 1, min(count, _FEW)).astype(np.int64)] if count else mine
-        covariance = m.graph.point_covariance(j) * max(1.0, float(known.squared[row]) / (2 * max(int(known.seen[row]), 1)))
+        covariance = covariance * max(1.0, float(known.squared[row]) / (2 * max(int(known.seen[row]), 1)))
         origin, direction, index = _in_map(m, some)
         s = sightings(origin, direction, rays.sigma[some], rays.range[some], rays.range_sigma[some])
         off = misses(s, position) * s.sigma if count else np.zeros(1)
