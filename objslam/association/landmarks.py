@@ -15,6 +15,9 @@ RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
 """What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
 has its range anywhere within some metres, a right box has a wrong range one time in ten or so."""
 
+BEHIND = 1e6
+"""Standard deviations that count for infinitely many: a point behind the camera."""
+
 
 @dataclass(frozen=True)
 class Landmarks:

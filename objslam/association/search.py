@@ -16,7 +16,7 @@ from objslam.association.assign import gate_limit
 from objslam.association.evidence import chance_odds, detection_rates, prior_odds, size_odds
 from objslam.association.extent import grouped_median, grouped_quantile
 from objslam.association.labels import adopted
-from objslam.association.landmarks import Landmarks, State, offsets, variance
+from objslam.association.landmarks import BEHIND, Landmarks, State, offsets, variance
 from objslam.association.matches import choose, gated_edges, track_bonus
 from objslam.association.motion import rest_odds
 from objslam.association.refit import refit, sums
@@ -36,6 +36,7 @@ _ABOVE = 3.0  # and by how many standard deviations it exceeds what strays give
 _CHANCE = 3.0  # log odds against strays that a point needs to be kept in the search
 _PARALLAX = np.radians(2.0)  # of two rays that make a point
 _NOISE = (1.0, 3.0)  # times the noise that was promised, never less: its tails are heavy
+_FAR = 1e6  # m; parallel rays meet there, things do not stand there
 _POOLED = 30.0  # rays of an object that weigh its own noise as much as that of its class
 
 
@@ -112,7 +113,7 @@ def _begin(work: _Work, ray: Ints, guess: tuple[Association, Floats] | None) -> 
     association, position = guess
     landmarks = Landmarks.new(position, np.ones(len(position)), association.label, work.labels)
     state = State(landmarks, association.object[ray])
-    return _settle(work, state.keep((state.number >= _MIN_RAYS) & np.isfinite(position).all(axis=1)))
+    return _settle(work, state.keep((state.number >= _MIN_RAYS) & (np.abs(position) < _FAR).all(axis=1)))
 
 
 def _device(settings: config.Settings) -> str:
@@ -176,7 +177,7 @@ def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
         position = refit(work.s, held, matched[held], old.position, old.noise)
         state = State(replace(old, position=position), matched)
         state = State(replace(state.landmarks, noise=_noise(work, state)), matched)
-        state = state.keep((state.number >= _MIN_RAYS) & np.isfinite(position).all(axis=1))
+        state = state.keep((state.number >= _MIN_RAYS) & (np.abs(position) < _FAR).all(axis=1))
         if same:
             break
     return state
@@ -187,7 +188,7 @@ def _deviations(work: _Work, state: State) -> tuple[Floats, Ints]:
     held = np.flatnonzero(state.matched >= 0)
     index, r = state.matched[held], work.s.take(held)
     off2, distance = offsets(r, state.landmarks.position[index])
-    return np.sqrt(off2 / variance(r, distance, np.ones(len(r)))), index
+    return np.minimum(np.sqrt(off2 / variance(r, distance, np.ones(len(r)))), BEHIND), index
 
 
 def _class_noise(work: _Work, state: State) -> Floats:

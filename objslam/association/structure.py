@@ -10,7 +10,7 @@ import numpy as np
 from objslam.association.evidence import Rates
 from objslam.association.extent import grouped_median
 from objslam.association.labels import SIZE_RATIO
-from objslam.association.landmarks import State, blurs, offsets, range_costs, sizes, variance
+from objslam.association.landmarks import BEHIND, State, blurs, offsets, range_costs, sizes, variance
 from objslam.association.matches import gated_edges
 from objslam.association.refit import refit
 from objslam.association.sightings import Sightings
@@ -129,7 +129,7 @@ def _gains(s: Sightings, state: State, kind: Ints, visits: Visits, rates: Rates,
     wider = np.maximum(noise[a], noise[b])
     middle = refit(s, pairs.ray, pairs.pair, share * position[a] + (1 - share) * position[b], wider)
     off2, distance = offsets(r, middle[pairs.pair])
-    deviation = np.sqrt(off2 / variance(r, distance, np.ones(len(r))))
+    deviation = np.minimum(np.sqrt(off2 / variance(r, distance, np.ones(len(r)))), BEHIND)
     joint = np.maximum(grouped_median(deviation, pairs.pair, count) / RAYLEIGH_MEDIAN, np.minimum(noise[a], noise[b]))
     one = _ray_costs(r, middle[pairs.pair], joint[pairs.pair], gate)
 
