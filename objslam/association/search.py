@@ -36,7 +36,7 @@ _ABOVE = 3.0  # and by how many standard deviations it exceeds what strays give
 _CHANCE = 3.0  # log odds against strays that a point needs to be kept in the search
 _PARALLAX = np.radians(2.0)  # of two rays that make a point
 _NOISE = (1.0, 3.0)  # times the noise that was promised, never less: its tails are heavy
-_FAR = 1e6  # m; parallel rays meet there, things do not stand there
+_FAR = 1e6  # m from the robot
 _POOLED = 30.0  # rays of an object that weigh its own noise as much as that of its class
 
 
@@ -113,7 +113,7 @@ def _begin(work: _Work, ray: Ints, guess: tuple[Association, Floats] | None) -> 
     association, position = guess
     landmarks = Landmarks.new(position, np.ones(len(position)), association.label, work.labels)
     state = State(landmarks, association.object[ray])
-    return _settle(work, state.keep((state.number >= _MIN_RAYS) & (np.abs(position) < _FAR).all(axis=1)))
+    return _settle(work, state.keep((state.number >= _MIN_RAYS) & _near(work, position)))
 
 
 def _device(settings: config.Settings) -> str:
@@ -177,10 +177,15 @@ def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
         position = refit(work.s, held, matched[held], old.position, old.noise)
         state = State(replace(old, position=position), matched)
         state = State(replace(state.landmarks, noise=_noise(work, state)), matched)
-        state = state.keep((state.number >= _MIN_RAYS) & (np.abs(position) < _FAR).all(axis=1))
+        state = state.keep((state.number >= _MIN_RAYS) & _near(work, position))
         if same:
             break
     return state
+
+
+def _near(work: _Work, position: Floats) -> Bools:
+    """Which places (N, 3) are somewhere on the robot's way, and not where parallel rays meet."""
+    return (np.abs(position - work.s.origin[:1]) < _FAR).all(axis=1)
 
 
 def _deviations(work: _Work, state: State) -> tuple[Floats, Ints]:
