@@ -57,16 +57,21 @@ def replayed(log: Log, settings: Settings) -> tuple[Session, threading.Event]:
     return session, threading.Event()
 
 
-def compare(a: ObjectMap, b: ObjectMap, radius: float = 0.5) -> tuple[int, int, int, float]:
-    """Objects of both maps, those of either alone, and the RMSE, m, without alignment."""
+def compare(a: ObjectMap, b: ObjectMap, radius: float = 1.0) -> tuple[int, int, int, float, float]:
+    """Objects of both maps, those of either alone, and the RMSE, m, as the maps lie and after SE(2) alignment."""
     one, two = a.resolved(), b.resolved()
     gap = np.array([[np.linalg.norm(p.position - q.position) if p.label == q.label else 99.0 for q in two] for p in one])
     gap = gap.reshape(len(one), len(two))
     i, j = linear_sum_assignment(np.minimum(gap, 2 * radius))
     same = gap[i, j] < radius
-    error = gap[i[same], j[same]]
-    rmse = float(np.sqrt(np.mean(error**2))) if len(error) else np.nan
-    return int(same.sum()), len(one) - int(same.sum()), len(two) - int(same.sum()), rmse
+    both = int(same.sum())
+    if not both:
+        return 0, len(one), len(two), np.nan, np.nan
+    mine, theirs = (np.array([m[k].position for k in which[same].tolist()]) for m, which in ((one, i), (two, j)))
+    pose, _ = align(mine, theirs, "se2")
+    laid = mine @ pose[:3, :3].T + pose[:3, 3]
+    rmse, aligned = (float(np.sqrt(((x - theirs) ** 2).sum(axis=1).mean())) for x in (mine, laid))
+    return both, len(one) - both, len(two) - both, rmse, aligned
 
 
 def against_truth(found: ObjectMap, log: Log) -> str:
@@ -91,7 +96,8 @@ def same() -> None:
     """Live against offline."""
     print("the same answer: live against offline joint; objects of both, of one alone, RMSE of those of both")
     print(
-        f"{'drive':<34}{'both':>6}{'live':>6}{'offline':>9}{'RMSE m':>9}{'before the end':>24}{'live s':>8}{'offline s':>11}"
+        f"{'drive':<28}{'both':>6}{'live':>6}{'offline':>9}{'RMSE m':>9}{'aligned':>9}{'before the end':>18}{'live s':>8}"
+        f"{'offline s':>11}"
     )
     simulated = settings_for("rays.pixel_sigma=2")
     jobs = [(f"{what} {seed}", simulate(preset(name, **changes), seed), simulated) for what, name, changes, seed in DRIVES]
@@ -112,11 +118,12 @@ def same() -> None:
         between = time.perf_counter()
         reference = offline.run(log, settings, Ledger())
         end = time.perf_counter()
-        both, mine, theirs, rmse = compare(live.map, reference.map)
-        also, more, fewer, error = compare(last, reference.map)
+        both, mine, theirs, rmse, aligned = compare(live.map, reference.map)
+        also, more, fewer, error, _ = compare(last, reference.map)
         before = f"{also} +{more} -{fewer} {error:.3f}"
         print(
-            f"{name:<34}{both:6d}{mine:6d}{theirs:9d}{rmse:9.3f}{before:>24}{between - begin:8.1f}{end - between:11.1f}",
+            f"{name:<28}{both:6d}{mine:6d}{theirs:9d}{rmse:9.3f}{aligned:9.3f}{before:>18}{between - begin:8.1f}"
+            f"{end - between:11.1f}",
             flush=True,
         )
 
@@ -184,7 +191,7 @@ def overload() -> None:
     took = time.perf_counter() - begin
     session.wait()
     last = session.snapshot()
-    both, mine, theirs, rmse = compare(last.map, reference)
+    both, mine, theirs, rmse, _ = compare(last.map, reference)
     print(f"overload: a frame takes {1e3 * one:.1f} ms, they come every {1e3 * took / 3000:.1f} ms")
     print(f"lag max {max(lags):.3f} s; {len(lags)} keyframes; dropped {last.dropped}")
     print(f"against the same drive without haste: {both} objects in both, {mine} and {theirs} in one, RMSE {rmse:.3f} m")
@@ -235,7 +242,7 @@ def kill(times: int = 20) -> None:
                 done = True
         from objslam.results import load_map
 
-        both, mine, theirs, rmse = compare(load_map(out), load_map(whole))
+        both, mine, theirs, rmse, _ = compare(load_map(out), load_map(whole))
         here, there = (list(messages(f, Ledger())) for f in (out, whole))
         print(f"kill -9: {killed} times, {torn} torn records; messages at each kill {sizes[1:]}")
         print(f"messages in the end {len(here)}, unbroken {len(there)}; {both} objects in both, {mine} and {theirs} in one, "
@@ -270,7 +277,7 @@ def disorder() -> None:
         session.wait()
         dropped, accepted = session.counters.dropped(), session.counters.accepted()
         found = session.stop().map
-        both, mine, theirs, rmse = compare(found, clean)
+        both, mine, theirs, rmse, _ = compare(found, clean)
         events_ = {k: v for k, v in accepted.items() if k not in ("odometry", "frames", "boxes", "cameras", "notes")}
         print(f"{name}: {against_truth(found, log)}; against in order {both} +{mine} -{theirs}, {rmse:.3f} m")
         print(f"    dropped {dropped}; {events_}", flush=True)
@@ -342,7 +349,8 @@ def memory(minutes: int) -> None:
     slope = np.polyfit(late[:, 0] / 60, late[:, 1], 1)[0]
     took = time.perf_counter() - begin
     print(
-        f"memory: {sizes[-1][1]:.0f} MB after {minutes} min, {slope:+.1f} MB/h from minute {minutes / 6:.0f} on; {took:.0f} s"
+        f"memory: {sizes[-1][1]:.0f} MB after {minutes} min, {slope:+.1f} MB/h from minute {minutes / 6:.0f} on; "
+        f"{took:.0f} s"
     )
     print(
         f"{against_truth(session.snapshot().map, log)}; {session.counters.accepted()}; dropped {session.counters.dropped()}"

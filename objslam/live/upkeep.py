@@ -206,6 +206,7 @@ def thin(m: Mapper) -> None:
     m.rays.keep(~lost)
     k.keep(~np.isin(k.id, leaving))
     gone = set(leaving.tolist())
+    m.unlocalized = [number for number in m.unlocalized if number not in gone][-m.settings.live.max_keyframes :]
     for candidate in m.candidates:
         candidate.rays = [ray for ray in candidate.rays if ray[1] not in gone]
     m.candidates = [candidate for candidate in m.candidates if candidate.rays]
