@@ -1,6 +1,6 @@
 """How well association finds objects without identities, and how long it takes.
 
-    python tools/bench_association.py [--seeds 20] [--parts scenes speed drift mrclam]
+    python tools/bench_association.py [--seeds 20] [--parts scenes speed drift mrclam] [--picture PNG]
 
 scenes: drives with known poses and truth. speed: growth with the log. drift: from odometry alone, poses and objects
 together. mrclam: UTIAS MRCLAM 6 without identities, from odometry, from the folder in OBJSLAM_DATA.
@@ -24,7 +24,8 @@ from objslam.evaluation import evaluate
 from objslam.geometry import widest_angle
 from objslam.keyframes import build_keyframes
 from objslam.ledger import Ledger
-from objslam.matching import match
+from objslam.matching import lay_truth, match
+from objslam.picture import draw_map
 from objslam.rays import build_rays
 from objslam.simulation import DriveSettings, pair, preset, simulate
 from objslam.sources import SourceOptions, read
@@ -132,7 +133,7 @@ def speed(frames: int) -> None:
     )
 
 
-def drift(seeds: int) -> None:
+def drift(seeds: int, picture: Path | None) -> None:
     """Print F1 and the path's error against dead reckoning's, of drives mapped from odometry alone."""
     print(f"{'drift, seed':<14}{'F1':>7}{'ATE m':>9}{'dead reckoning m':>18}{'ratio':>7}{'s':>7}")
     scores, ratios = [], []
@@ -144,6 +145,8 @@ def drift(seeds: int) -> None:
         seconds = time.perf_counter() - begin
         assert log.odometry is not None
         assert log.truth is not None
+        if picture is not None and seed == 0:
+            draw_map(result, picture, lay_truth(result.map, log.truth))
         found = evaluate(result.map, log.truth, result.path_after, align="se2", radius=0.5)
         dead = evaluate(result.map, log.truth, log.odometry, align="se2", radius=0.5)
         assert found.path is not None
@@ -182,6 +185,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--picture", type=Path, help="draw the map of the first drive of `drift` into this PNG")
     arguments = parser.parse_args()
     seeds = arguments.seeds
     if "scenes" in arguments.parts:
@@ -197,7 +201,7 @@ def main() -> None:
         for frames in (3_500, 33_500):
             speed(frames)
     if "drift" in arguments.parts:
-        drift(seeds)
+        drift(seeds, arguments.picture)
     if "mrclam" in arguments.parts:
         mrclam()
 
