@@ -51,7 +51,7 @@ def settings_for(*changes: str) -> Settings:
 
 def replayed(log: Log, settings: Settings) -> tuple[Session, threading.Event]:
     """A session that has been fed a whole log, as fast as it takes it."""
-    session = Session(settings).start()
+    session = Session(settings, patient=True).start()
     ReplayAdapter(session, log, None, session.wait).run(threading.Event())
     session.wait()
     return session, threading.Event()

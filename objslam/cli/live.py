@@ -108,7 +108,7 @@ def live(
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume)
-        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name)
+        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=speed == 0)
         stack.callback(session.abort)
         truth = None
         if source in ADAPTERS:

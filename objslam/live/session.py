@@ -32,11 +32,19 @@ class Session:
     """Implements `Sink`. `start` it, push from any thread, take a `snapshot` at any time, `stop` it for the result.
 
     journal: a file that every accepted message is written to first. resume: go on with the journal that is there; its
-    messages are worked in by `start`. Not more than one session writes a journal.
+    messages are worked in by `start`. Not more than one session writes a journal. patient: no frame is too old, for a
+    source that waits for the session.
     """
 
-    def __init__(self, settings: Settings, journal: Path | None = None, resume: bool = False, name: str = "live") -> None:
-        self._settings, self._name = settings, name
+    def __init__(
+        self,
+        settings: Settings,
+        journal: Path | None = None,
+        resume: bool = False,
+        name: str = "live",
+        patient: bool = False,
+    ) -> None:
+        self._settings, self._name, self._patient = settings, name, patient
         self.counters = Counters()
         self._mapper = Mapper(settings, self.counters)
         self._journal_file, self._resume = journal, resume
@@ -211,7 +219,7 @@ class Session:
     def _work_off(self, limit: bool) -> None:
         while (found := self._mapper.ready()) is not None:
             frame, arrival = found
-            if limit and time.perf_counter() - arrival > self._settings.live.max_lag:
+            if limit and not self._patient and time.perf_counter() - arrival > self._settings.live.max_lag:
                 self._mapper.leave_out(frame, "frames that waited too long (live.max_lag)")
                 continue
             if self._mapper.take(frame):
