@@ -8,9 +8,10 @@ import numpy as np
 
 from objslam.association.extent import grouped_median
 from objslam.errors import SolveError
+from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.live.joining import join, without
-from objslam.live.known import covariances, noise
+from objslam.live.known import carried, covariances, gathered, noise
 from objslam.live.loops import close_loop
 from objslam.live.meeting import meet, misses
 from objslam.types import Bools, Floats, Ints
@@ -145,10 +146,8 @@ def _merge(m: Mapper) -> None:
             continue
         if m.apart.get(ids) == fewer // 5:  # nothing new since they were found to be two
             continue
-        spread = m.graph.difference_covariance(*ids)
         rows = np.array([i, j])
-        spread = spread + (covariances(known, rows) * (noise(known, rows) ** 2 - 1)[:, None, None]).sum(axis=0)
-        spread += 2e-4 * np.eye(3)
+        spread = (covariances(known, rows) * (noise(known, rows) ** 2)[:, None, None]).sum(axis=0) + _drifted(m, rows)
         if not np.isfinite(spread).all() or way @ np.linalg.solve(spread, way) > _SAME:
             m.apart[ids] = fewer // 5
             continue
@@ -158,6 +157,24 @@ def _merge(m: Mapper) -> None:
     if gone:
         m.counters.accept("merged objects", len(gone))
         without(m, np.array(sorted(gone)))
+
+
+def _drifted(m: Mapper, rows: Ints) -> Floats:
+    """Covariance (3, 3) of two landmarks' places to each other by how the path drifted between their last sightings.
+
+    Or by how little the newest pose is known, if that is less: both bound what the graph knows, which takes too long to ask.
+    """
+    k, known = m.keyframes, m.known
+    newest = int(np.argmax(k.stamp))
+    pose = m.graph.pose(int(k.id[newest]))
+    first, second = rows[np.argsort(known.last[rows], kind="stable")]
+    to = (known.position[rows].mean(axis=0) - pose[:3, 3])[None]
+    camera_from_drift = adjoint(inverse(k.start_T_base[newest] @ k.base_T_camera[newest]))
+    since = carried(to, gathered(known.drift[second], known.drift[first][None]), pose, camera_from_drift)[0]
+    if not np.isfinite(m.doubt).all():
+        return since
+    placed = carried(to, m.doubt, pose, np.eye(6))[0]
+    return placed if np.trace(placed) < np.trace(since) else since
 
 
 def _drop_ghosts(m: Mapper) -> None:
