@@ -13,7 +13,6 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.errors import SolveError
-from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.graph.factors import l_key, x_key
 from objslam.graph.optimise import levenberg_marquardt, read_points, read_poses
@@ -150,25 +149,6 @@ class IncrementalGraph:
     def point_covariance(self, j: int) -> Floats:
         """Covariance (3, 3) of L(j), m^2; NaN where the graph does not tell."""
         return self._covariance(l_key(j), 3)
-
-    def difference_covariance(self, i: int, j: int) -> Floats:
-        """Covariance (3, 3) of L(i) - L(j), m^2; NaN where the graph does not tell."""
-        try:
-            joint = self._isam.jointMarginalCovariance([l_key(i), l_key(j)])
-            both = joint.at(l_key(i), l_key(j))
-            return np.asarray(joint.at(l_key(i), l_key(i)) + joint.at(l_key(j), l_key(j)) - both - both.T)
-        except RuntimeError:
-            return np.full((3, 3), np.nan)
-
-    def relative_covariance(self, before: int, now: int) -> Floats:
-        """Covariance (6, 6) of X(now) as seen from X(before), in its camera's frame; NaN where the graph does not tell."""
-        try:
-            joint = self._isam.jointMarginalCovariance([x_key(before), x_key(now)]).fullMatrix()
-        except RuntimeError:
-            return np.full((6, 6), np.nan)
-        step = inverse(self.pose(before)) @ self.pose(now)
-        jacobian = np.hstack([-adjoint(inverse(step)), np.eye(6)])
-        return np.asarray(jacobian @ joint @ jacobian.T)
 
     def save(self) -> tuple[object, ...]:
         """What `restore` goes back to."""
