@@ -25,7 +25,7 @@ _FIRST, _GROWTH = (
     20,
     1.5,
 )  # keyframes; the graph is solved as a whole when there are so many, and each time so many times more
-_ITERATIONS = 8
+_ITERATIONS, _FEW, _LARGE = 8, 2, 800  # iterations, and those from so many keyframes on: no frame may wait for long
 _MISS = 4.0  # standard deviations by which a ray may miss its landmark
 _WIDEST = 5.0  # times the noise that was promised
 _RAYLEIGH_MEDIAN = 1.1774
@@ -66,7 +66,7 @@ def after_keyframe(m: Mapper) -> None:
 def polish(m: Mapper) -> None:
     """The whole graph solved by Levenberg-Marquardt, then every ray asked again whether it fits its landmark."""
     try:
-        m.graph.solve(_ITERATIONS)
+        m.graph.solve(_ITERATIONS if len(m.keyframes) < _LARGE else _FEW)
     except SolveError:
         m.counters.accept("solves given up")
     if _reconsider(m):
