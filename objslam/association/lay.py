@@ -23,8 +23,8 @@ def lay(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, covar
     best, or that of a stray.
     """
     axes = map_T_camera[pivot, :3, :3]
-    yaw = float(np.sqrt((axes @ covariance[:3, :3] @ axes.T)[2, 2]))
-    place = np.sqrt(np.diag(axes @ covariance[3:, 3:] @ axes.T)[:2])
+    yaw = float(np.sqrt(max((axes @ covariance[:3, :3] @ axes.T)[2, 2], 0.0)))
+    place = np.sqrt(np.maximum(np.diag(axes @ covariance[3:, 3:] @ axes.T)[:2], 0.0))
     steps = (_steps(place[0], _FINE_SHIFT, _SHIFTS), _steps(place[1], _FINE_SHIFT, _SHIFTS), _steps(yaw, _FINE_TURN, _TURNS))
     grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
     cost = ((grid / np.maximum([*place, yaw], 1e-6)) ** 2).sum(axis=1)

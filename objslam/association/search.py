@@ -185,7 +185,7 @@ def _settle(work: _Work, state: State, times: int = _SETTLED) -> State:
 
 def _near(work: _Work, position: Floats) -> Bools:
     """Which places (N, 3) are somewhere on the robot's way, and not where parallel rays meet."""
-    return (np.abs(position - work.s.origin[:1]) < _FAR).all(axis=1)
+    return np.asarray((np.abs(position - work.s.origin[:1]) < _FAR).all(axis=1))
 
 
 def _deviations(work: _Work, state: State) -> tuple[Floats, Ints]:
