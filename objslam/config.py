@@ -251,8 +251,8 @@ class Live(Section):
     keyframe_angle_deg: NotNegative = 0.5
     """or turned so far, or shows a label that no keyframe since then has. Where it stands still, the first ten are taken."""
     max_keyframes: Annotated[int, Field(ge=50)] = 2500
-    """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them summed up:
-    what memory and time an update take stays bounded."""
+    """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them
+    summed up: what memory and time an update take stays bounded."""
     max_lag: Positive = 0.4
     """s; frames that had to wait for longer are dropped and counted."""
     max_late: Positive = 2.0
@@ -260,8 +260,8 @@ class Live(Section):
     max_frames_waiting: Annotated[int, Field(ge=1)] = 64
     """of more than that the oldest is dropped and counted."""
     max_speed: Positive = 5.0
-    """m/s; odometry that moves faster, or turns faster than 4 times that in rad/s, has jumped: it is taken to have started anew
-    where it was."""
+    """m/s; odometry that moves faster, or turns faster than 4 times that in rad/s, has jumped: it is taken to have
+    started anew where it was."""
     min_rays: Annotated[int, Field(ge=3)] = 5
     """boxes that must agree before an object enters the graph."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
