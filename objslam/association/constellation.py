@@ -15,6 +15,11 @@ from scipy.optimize import linear_sum_assignment
 from objslam.geometry import lift_se2
 from objslam.types import Bools, Floats, Ints
 
+FEWEST = 2  # landmarks that a place is recognised by
+LEAST = (0.02, 0.02, 0.01)  # m, m, rad; no pose is known better than that to another
+_EVIDENCE, _LEAD = 7.0, 3.0  # log odds against new landmarks, and against another place
+_PLACE, _DISTORTION = 0.07, 0.02  # m, and m per m from the robot: by how much a neighbourhood is bent in itself
+_MARGIN = 2.0  # m around all landmarks that could hold some too
 _GATE = 16.3  # chi-squared, 3 degrees of freedom, 0.999
 _PRIOR_GATE = 14.2  # chi-squared, 3 degrees of freedom, 0.997
 _REFINEMENTS = 3
@@ -32,6 +37,18 @@ class Constellation:
     label: Ints
 
 
+def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
+    """The landmarks (N, 3) as they lie around the pivot (2,): what is further away is bent more, against the rest."""
+    bent = _PLACE**2 + _DISTORTION**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
+    return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
+
+
+def densities(position: Floats, label: Ints) -> Floats:
+    """(N,) how many landmarks of the label of each there are per m^2 of where landmarks are."""
+    extent = position[:, :2].max(axis=0) - position[:, :2].min(axis=0) + 2 * _MARGIN
+    return np.asarray(np.bincount(label)[label] / float(np.prod(extent)))
+
+
 @dataclass(frozen=True)
 class Recognition:
     """One constellation found in another.
@@ -45,6 +62,11 @@ class Recognition:
     pairs: Ints
     evidence: float
     lead: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether it may be acted on."""
+        return self.evidence >= _EVIDENCE and self.lead >= _LEAD and len(self.pairs) >= FEWEST
 
 
 def recognise(

@@ -7,17 +7,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from objslam.association.constellation import Constellation, recognise
+from objslam.association.constellation import FEWEST, LEAST, densities, neighbourhood, recognise
 from objslam.geometry import adjoint, exp_se3, inverse, log_se3
 from objslam.graph.factors import x_key
 from objslam.types import Bools, Floats, Ints, Rays
 
-_EVIDENCE, _LEAD = 7.0, 3.0  # log odds against new landmarks, and against another place
-_PLACE, _DISTORTION = 0.07, 0.02  # m, and m per m from the robot: by how much a neighbourhood is bent in itself
-_MARGIN = 2.0  # m around all landmarks that could hold some too
 _EPOCHS = 8
-_FEWEST = 2  # landmarks on either side
-_LEAST = (0.02, 0.02, 0.01)  # m, m, rad; no pose is known better than that to another
 _SLIPS = (1.0, 3.0, 10.0)  # times the drift that was promised: wheels slip more than a Gaussian says
 _EPOCH = 40  # keyframes
 
@@ -67,8 +62,7 @@ def find_closure(
     long. Or its wheels slipped, or somebody pushed it: then all that was born since is there already.
     """
     together = _seen_together(rays, owner, len(known))
-    low, high = known.position[:, :2].min(axis=0) - _MARGIN, known.position[:, :2].max(axis=0) + _MARGIN
-    density = np.bincount(known.label)[known.label] / float(np.prod(high - low))
+    density = densities(known.position, known.label)
     pivot = map_T_camera[now, :2, 3]
     born = active & (known.first >= now - _EPOCH)
     best: Closure | None = None
@@ -76,7 +70,7 @@ def find_closure(
     for here, there in ((active, ~active), (born, ~born)):
         possible = here[:, None] & there & (known.label[:, None] == known.label) & ~together
         one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
-        if len(one) < _FEWEST or len(two) < _FEWEST:
+        if len(one) < FEWEST or len(two) < FEWEST:
             continue
         marginals = marginals or _marginals(graph, values)
         if marginals is None:
@@ -84,12 +78,12 @@ def find_closure(
         before = np.minimum(known.last[two], known.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
         anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
-        a, b = (_constellation(known, which, pivot) for which in (one, two))
+        a, b = (
+            neighbourhood(known.position[which], known.covariance[which], known.label[which], pivot) for which in (one, two)
+        )
         for prior in relative_covariances(marginals, map_T_camera, anchors, now):
             found = recognise(a, b, pivot, prior, density[one], possible[np.ix_(one, two)])
-            if found is None or found.evidence < _EVIDENCE or found.lead < _LEAD:
-                continue
-            if best is None or found.evidence > best.evidence:
+            if found is not None and found.sure and (best is None or found.evidence > best.evidence):
                 best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
     return best
 
@@ -100,13 +94,6 @@ def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
         return gtsam.Marginals(graph, values)
     except RuntimeError:
         return None
-
-
-def _constellation(known: Known, which: Ints, pivot: Floats) -> Constellation:
-    bent = _PLACE**2 + _DISTORTION**2 * ((known.position[which, :2] - pivot) ** 2).sum(axis=1)
-    return Constellation(
-        known.position[which], known.covariance[which] + bent[:, None, None] * np.eye(3), known.label[which]
-    )
 
 
 def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
@@ -135,7 +122,7 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
         jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])
         planar = (turn @ jacobian @ joint @ jacobian.T @ turn.T)[np.ix_([3, 4, 2], [3, 4, 2])]
         if np.isfinite(planar).all():
-            result += [slip**2 * (planar + np.diag(_LEAST) ** 2) for slip in _SLIPS]
+            result += [slip**2 * (planar + np.diag(LEAST) ** 2) for slip in _SLIPS]
     return result
 
 
