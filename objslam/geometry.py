@@ -74,6 +74,18 @@ def log_se3(pose: Floats) -> Floats:
     return np.concatenate([omega, (_left_jacobian_inverse(omega) @ pose[..., :3, 3:])[..., 0]], axis=-1)
 
 
+def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
+    """By how much (N,), rad, poses (N, 4, 4) turn, and how long (N,), m, the arc is that they move along: the lengths of the
+    two halves of `log_se3`."""
+    r, t = pose[:, :3, :3], pose[:, :3, 3]
+    axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
+    sine = np.sqrt((axis * axis).sum(axis=1))
+    turn = np.arctan2(sine, (np.trace(r, axis1=1, axis2=2) - 1) / 2)
+    along2 = ((t * axis).sum(axis=1) / np.maximum(sine, 1e-150)) ** 2
+    chord = np.maximum((t * t).sum(axis=1) - along2, 0.0)
+    return turn, np.sqrt(along2 + chord / np.sinc(turn / (2 * np.pi)) ** 2)
+
+
 def exp_se3(twist: Floats) -> Floats:
     """Exponential (N, 4, 4) of twists (N, 6), rotation first (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
     omega = twist[..., :3]

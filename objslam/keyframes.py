@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.config import Odometry, Settings
 from objslam.errors import LogError
-from objslam.geometry import adjoint, interpolate, inverse, is_planar, log_se3
+from objslam.geometry import adjoint, interpolate, inverse, is_planar, twist_lengths
 from objslam.ledger import Ledger
 from objslam.types import Bools, CameraLog, Floats, Keyframes, Log, Trajectory
 
@@ -136,8 +136,7 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
 
 def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:
     """Covariances (N-1, 6, 6) that the steps between poses (N, 4, 4) add, in the frame that the poses are given in."""
-    twist = log_se3(inverse(start_T_base[:-1]) @ start_T_base[1:])
-    turn, way = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
+    turn, way = twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
     angle = settings.yaw_per_m**2 * way + settings.yaw_per_rad**2 * turn
     x = settings.x_per_m**2 * way + settings.xy_per_rad**2 * turn
     y = settings.y_per_m**2 * way + settings.xy_per_rad**2 * turn

@@ -105,10 +105,12 @@ def box_rays(
     detections: Detections, camera: Camera, settings: Settings, ledger: Ledger
 ) -> tuple[Detections, Floats, Floats]:
     """The usable boxes (M) of a camera, their unit directions (M, 3) in its frame, sigmas (M,), rad; the rest is counted."""
-    boxes = detections.take(_usable(detections, camera, settings, ledger))
+    usable = _usable(detections, camera, settings, ledger)
+    boxes = detections if usable.all() else detections.take(usable)
     directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
     ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
-    boxes, directions = boxes.take(valid), directions[valid]
+    if not valid.all():
+        boxes, directions = boxes.take(valid), directions[valid]
     return boxes, directions, _angle_sigma(camera, directions, _centre_sigma(boxes.boxes, settings))
 
 

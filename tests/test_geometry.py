@@ -22,6 +22,7 @@ from objslam.geometry import (
     quaternion,
     skew,
     split_se2,
+    twist_lengths,
     widest_angle,
 )
 
@@ -83,6 +84,14 @@ def test_exponential_and_logarithm_hold_where_their_series_take_over(angle):
     twist = np.array([[0.6 * angle, 0.0, 0.8 * angle, 1.0, -2.0, 3.0]])
     np.testing.assert_allclose(exp_se3(twist)[0], expm(hat(twist[0])), atol=1e-11)
     np.testing.assert_allclose(log_se3(exp_se3(twist)), twist, atol=1e-8)
+
+
+@given(seeds, st.sampled_from([0.0, 1e-9, 1e-4, 0.1, 1.8]))
+def test_lengths_of_a_twist_are_those_of_the_logarithm(seed, size):
+    twist = size * np.random.default_rng(seed).uniform(-1, 1, (20, 6))
+    turn, way = twist_lengths(exp_se3(twist))
+    np.testing.assert_allclose(turn, np.linalg.norm(twist[:, :3], axis=1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(way, np.linalg.norm(twist[:, 3:], axis=1), rtol=1e-9, atol=1e-12)
 
 
 @given(seeds)

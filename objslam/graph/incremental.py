@@ -6,57 +6,22 @@ good estimate, which damps what nothing holds yet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import gtsam
 import numpy as np
 
 from objslam.config import Settings
 from objslam.errors import SolveError
 from objslam.graph import factors
-from objslam.graph.factors import l_key, x_key
+from objslam.graph.factors import L0, X0, l_key, x_key
+from objslam.graph.kept import Bearings, Kept, KeptRay, ray_groups
 from objslam.graph.optimise import levenberg_marquardt, read_points, read_poses
+from objslam.graph.turns import Turns, new_isam
 from objslam.types import Floats, Ints
 
-_RELINEARISE = (0.02, 0.05)  # rad, m; a variable that moved by more is linearised anew
-_EVERY = 1_000_000  # updates, where nobody asks for it: the caller knows when there is time
+_AT_ONCE = 400  # keyframes; a larger graph is built anew in turns,
+_TURN = 100  # keyframes each
 _HELD = 1.0  # m; a prior on every landmark for a graph that is indeterminate without
 _HELD_POSE = (0.5, 2.0)  # rad, m; and on every pose, for one that is even then
-_EQ1_SIGMA, _L1_RADIANS = 0.05, 1e-4  # as `grow` has them
-
-
-@dataclass(frozen=True)
-class Bearings:
-    """Rays for the graph: number (n,) of their own, keyframe (n,), landmark (n,), direction (n, 3) in the camera, sigma (n,)
-    rad, range (n,) m or NaN, range_sigma (n,) m."""
-
-    number: Ints
-    keyframe: Ints
-    landmark: Ints
-    direction: Floats
-    sigma: Floats
-    range: Floats
-    range_sigma: Floats
-
-
-@dataclass
-class _Kept:
-    """Every factor that is to be in the graph, by what it belongs to."""
-
-    chain: dict[int, gtsam.NonlinearFactor] = field(default_factory=dict)
-    absolute: dict[int, gtsam.NonlinearFactor] = field(default_factory=dict)
-    rays: dict[int, list[gtsam.NonlinearFactor]] = field(default_factory=dict)
-    landmarks: dict[int, gtsam.NonlinearFactor] = field(default_factory=dict)
-
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        for group in (self.chain, self.absolute, self.landmarks):
-            for factor in group.values():
-                graph.push_back(factor)
-        for ray in self.rays.values():
-            for factor in ray:
-                graph.push_back(factor)
-        return graph
 
 
 class IncrementalGraph:
@@ -67,19 +32,22 @@ class IncrementalGraph:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._isam = self._empty()
-        self._kept = _Kept()
+        self._isam = new_isam()
+        self._kept = Kept()
+        self._turns: Turns | None = None
         self._poses: dict[int, Floats] = {}
         self._points: dict[int, Floats] = {}
         self._new = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
-        self._stale = False
+        self._stale = self._unfinished = False
         self.rebuilds = 0
 
     def add_keyframe(self, k: int, map_T_camera: Floats) -> None:
         """X(k) at its first guess (4, 4). Something must hold it before the next update: a motion or an absolute pose."""
         self._poses[k] = map_T_camera
         self._values.insert(x_key(k), gtsam.Pose3(map_T_camera))
+        if self._turns is not None:
+            self._turns.add_keyframe(k)
 
     def add_motion(self, before: int, after: int, motion: Floats, covariance: Floats) -> None:
         """The camera motion (4, 4) with covariance (6, 6) from X(before) to X(after), by odometry."""
@@ -97,15 +65,19 @@ class IncrementalGraph:
         """L(j) at its first place (3,), under a weak prior there. Rays must follow before the next update."""
         self._points[j] = position
         self._values.insert(l_key(j), position)
+        if self._turns is not None:
+            self._turns.add_landmark(j)
         weak = _isotropic(3, self._settings.joint.prior_sigma)
         self._add(self._kept.landmarks, j, gtsam.PriorFactorPoint3(l_key(j), position, weak))
 
     def add_rays(self, rays: Bearings) -> None:
         """The factors of some rays, with Huber's loss, and of their ranges, with Cauchy's."""
-        for number, group in zip(rays.number.tolist(), ray_groups(rays, self._settings), strict=True):
-            self._kept.rays[number] = group
+        groups = ray_groups(rays, self._settings)
+        ids = (rays.number.tolist(), rays.keyframe.tolist(), rays.landmark.tolist())
+        for number, k, j, group in zip(*ids, groups, strict=True):
+            self._kept.rays[number] = KeptRay(k, j, group)
             for factor in group:
-                self._new.push_back(factor)
+                self._push(factor)
 
     def update(self, relinearise: bool = False) -> None:
         """Work in what was added. relinearise: look for variables that moved, now rather than some time."""
@@ -153,10 +125,7 @@ class IncrementalGraph:
     def save(self) -> tuple[object, ...]:
         """What `restore` goes back to."""
         self.refresh()
-        k = self._kept
-        rays = {number: list(group) for number, group in k.rays.items()}
-        kept = _Kept(dict(k.chain), dict(k.absolute), rays, dict(k.landmarks))
-        return kept, dict(self._poses), dict(self._points)
+        return self._kept.copy(), dict(self._poses), dict(self._points)
 
     def restore(self, saved: tuple[object, ...]) -> None:
         """The graph as it was when it was saved."""
@@ -171,14 +140,15 @@ class IncrementalGraph:
         self._poses.update(zip(ids.tolist(), poses, strict=True))
         self._points.update(zip(landmarks.tolist(), points, strict=True))
 
-    def solve(self, iterations: int) -> None:
-        """All variables by Levenberg-Marquardt from where they are, for so many iterations, and iSAM2 anew from there.
+    def solve(self, iterations: int, tolerance: float = 1e-5) -> None:
+        """All variables by Levenberg-Marquardt from where they are, and iSAM2 anew from there.
 
+        iterations: at the most. tolerance: share of the cost below which a step gains no more.
         SolveError, and nothing changed, where the cost runs away or nothing holds some variable.
         """
         self.refresh()
         graph = self._kept.graph()
-        self._read(levenberg_marquardt(graph, self._start(), iterations, 1e-5).values)
+        self._read(levenberg_marquardt(graph, self._start(), iterations, tolerance).values)
         self.rebuild()
 
     def rebuild(self) -> None:
@@ -191,14 +161,47 @@ class IncrementalGraph:
             self._rescue()
         self._clear()
 
+    def rebuild_in_turns(self, order: Ints) -> None:
+        """As `rebuild`, but of a large graph in as many calls of `take_turn` as it takes; the old one goes on until then.
+
+        order: all keyframes (K,), each after the one that its motion comes from. Asked for once more before it is done, it
+        is done at once: changes that come so often must not keep it from ever being done.
+        """
+        if self._unfinished or len(order) <= _AT_ONCE:
+            self.rebuild()
+            return
+        self.refresh()
+        self._clear()
+        self._turns = Turns(self._kept.copy(), order.tolist(), dict(self._poses), dict(self._points))
+        self._unfinished = True
+
+    def take_turn(self) -> None:
+        """Go on with what `rebuild_in_turns` began, if it did."""
+        if self._turns is None:
+            return
+        try:
+            if not self._turns.last:
+                self._turns.turn(_TURN)
+                return
+            self.refresh()
+            self._turns.finish(self._poses, self._points)
+        except RuntimeError:  # all at once, which knows what to do then
+            self.rebuild()
+            return
+        self._isam, self._stale = self._turns.isam, True
+        self._turns, self._unfinished = None, False
+
     def drop_rays(self, numbers: Ints) -> None:
         """Rays that are to go; `rebuild` makes it so."""
+        if len(numbers):
+            self._turns = None
         for number in numbers.tolist():
             self._kept.rays.pop(number, None)
 
     def drop_landmarks(self, landmarks: Ints) -> None:
         """Landmarks that are to go; their rays must go too, and `rebuild` makes it so."""
         self.refresh()
+        self._turns = None
         for j in landmarks.tolist():
             self._kept.landmarks.pop(j, None)
             self._points.pop(j, None)
@@ -206,6 +209,7 @@ class IncrementalGraph:
     def drop_keyframes(self, keyframes: Ints) -> None:
         """Keyframes that are to go; their rays and the motions from them must go too, and `rebuild` makes it so."""
         self.refresh()
+        self._turns = None
         for k in keyframes.tolist():
             self._kept.chain.pop(k, None)
             self._kept.absolute.pop(k, None)
@@ -228,6 +232,7 @@ class IncrementalGraph:
     def place(self, j: int, position: Floats) -> None:
         """L(j) somewhere else (3,); `rebuild` makes it so."""
         self.refresh()
+        self._turns = None
         self._points[j] = position
 
     def _update(self, relinearise: bool) -> None:
@@ -235,27 +240,23 @@ class IncrementalGraph:
 
     def _add(self, kept: dict[int, gtsam.NonlinearFactor], key: int, factor: gtsam.NonlinearFactor) -> None:
         kept[key] = factor
+        self._push(factor)
+
+    def _push(self, factor: gtsam.NonlinearFactor) -> None:
         self._new.push_back(factor)
+        if self._turns is not None:
+            self._turns.add_factor(factor)
 
     def _clear(self) -> None:
         self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
-    def _empty(self) -> gtsam.ISAM2:
-        parameters = gtsam.ISAM2Params()
-        turn, way = _RELINEARISE
-        limits = gtsam.ISAM2ThresholdMap()
-        limits.insert(("x", np.array([turn] * 3 + [way] * 3)))
-        limits.insert(("l", np.array([way] * 3)))
-        parameters.setRelinearizeThreshold(limits)
-        parameters.relinearizeSkip = _EVERY
-        return gtsam.ISAM2(parameters)
-
     def _fill(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        isam = self._empty()
+        isam = new_isam()
         isam.update(graph, self._start())
         isam.calculateEstimate()  # throws now, if it does
         self._isam = isam
         self._stale = True
+        self._turns, self._unfinished = None, False
 
     def _start(self) -> gtsam.Values:
         values = gtsam.Values()
@@ -266,8 +267,11 @@ class IncrementalGraph:
         return values
 
     def _read(self, values: gtsam.Values) -> None:
-        self._poses = dict(zip(sorted(self._poses), read_poses(values), strict=True))
-        self._points = dict(zip(sorted(self._points), read_points(values), strict=True))
+        keys = np.array(values.keys())  # some may have gone from what is kept, and the graph built in turns not be done
+        poses = dict(zip((keys[keys >= X0] - X0).tolist(), read_poses(values), strict=True))
+        points = dict(zip((keys[keys < X0] - L0).tolist(), read_points(values), strict=True))
+        self._poses = {k: poses.get(k, pose) for k, pose in self._poses.items()}
+        self._points = {j: points.get(j, point) for j, point in self._points.items()}
 
     def _rescue(self) -> None:
         """iSAM2 anew after it threw, with priors on what nothing holds, as strong as it takes."""
@@ -295,23 +299,6 @@ class IncrementalGraph:
             return np.asarray(self._isam.marginalCovariance(key))
         except RuntimeError:
             return np.full((dimension, dimension), np.nan)
-
-
-def ray_groups(rays: Bearings, settings: Settings) -> list[list[gtsam.NonlinearFactor]]:
-    """The factors of each ray: bearing or point-to-line as set, and its range where it has one."""
-    if settings.joint.factor == "bearing":
-        noise = factors.robust("huber", rays.sigma, 2, _L1_RADIANS)
-        groups = [[f] for f in factors.bearing(rays.keyframe, rays.direction, rays.landmark, noise)]
-    else:
-        noise = factors.robust("huber", np.full(len(rays.number), _EQ1_SIGMA), 2)
-        groups = [[f] for f in factors.point_to_line(rays.keyframe, rays.direction, rays.landmark, noise)]
-    ranged = np.flatnonzero(np.isfinite(rays.range))
-    if len(ranged):
-        noise = factors.robust("cauchy", rays.range_sigma[ranged], 1)
-        found = factors.ranges(rays.keyframe[ranged], rays.range[ranged], rays.landmark[ranged], noise)
-        for i, factor in zip(ranged.tolist(), found, strict=True):
-            groups[i].append(factor)
-    return groups
 
 
 def _isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Base:

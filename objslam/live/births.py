@@ -62,12 +62,18 @@ def new_candidate(m: Mapper, rays: FrameRays, i: int, number: int, k: int, stamp
             if candidate.label == label:
                 extend(m, candidate, rays, i, number, k, stamp, doubt)
                 return
-    elif len(m.candidates) >= _CANDIDATES:
-        m.candidates.remove(min(m.candidates, key=lambda c: (len(c) >= m.settings.live.min_rays, c.last)))
     candidate = Candidate(m.next_candidate, label, m.by_label, stamp, stamp, doubt.drift)
     m.next_candidate += 1
     m.candidates.append(candidate)
     extend(m, candidate, rays, i, number, k, stamp, doubt)
+
+
+def leave_out_the_least(m: Mapper) -> None:
+    """Of very many candidates the short ones are given up, those first that were not seen for longest."""
+    if len(m.candidates) > _CANDIDATES:
+        worth = sorted(m.candidates, key=lambda c: (len(c) >= m.settings.live.min_rays, c.last))
+        least = set(worth[: len(m.candidates) - _CANDIDATES])
+        m.candidates = [c for c in m.candidates if c not in least]
 
 
 def extend(

@@ -23,7 +23,7 @@ _RECENT = 30  # rays that a first guess is made of
 _LONGEST = 200  # rays that a candidate keeps: the older ones of a longer one are thinned
 
 
-@dataclass
+@dataclass(eq=False)
 class Candidate:
     """Rays of one thing: number of each ray, its keyframe, direction (3,) in the camera, sigma, range, range_sigma.
 
@@ -90,7 +90,7 @@ def place(candidates: list[Candidate]) -> None:
         return
     number = np.array([len(c._lines) for c in candidates])
     lines = np.concatenate([np.array(c._lines) for c in candidates])
-    index = np.repeat(np.arange(len(candidates)), number)
+    index, begin = np.repeat(np.arange(len(candidates)), number), np.cumsum(number) - number
     s = sightings(lines[:, :3], lines[:, 3:6], lines[:, 6], lines[:, 7], lines[:, 8])
     points = np.array([c.position for c in candidates])
     away = s.direction[np.cumsum(number) - 1]
@@ -102,12 +102,9 @@ def place(candidates: list[Candidate]) -> None:
         along = np.einsum("ri,ri->r", to, s.direction)
         beyond = np.where(np.isfinite(s.range), s.range - along, 0.0)
         target = (along + beyond)[:, None] * s.direction - to
-        total, pull = hold.copy(), np.zeros((len(candidates), 3, 1))
-        np.add.at(total, index, gain)
-        np.add.at(pull, index, gain @ target[:, :, None])
-        points = points + np.linalg.solve(total, pull)[:, :, 0]
-    total = hold
-    np.add.at(total, index, information(s, points[index]))
+        pull = np.add.reduceat(gain @ target[:, :, None], begin)
+        points = points + np.linalg.solve(hold + np.add.reduceat(gain, begin), pull)[:, :, 0]
+    total = hold + np.add.reduceat(information(s, points[index]), begin)
     for candidate, point, covariance in zip(candidates, points, np.linalg.inv(total), strict=True):
         candidate.position, candidate.covariance = point, covariance
 

@@ -38,5 +38,5 @@ def without(m: Mapper, rows: Ints, rebuild: bool = True) -> None:
     m.apart = {pair: n for pair, n in m.apart.items() if not ids & set(pair)}
     if not rebuild:
         return
-    m.graph.rebuild()
+    m.graph.rebuild_in_turns(m.in_order())
     m.known.position[:] = m.graph.points(m.known.id)

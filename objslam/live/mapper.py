@@ -7,6 +7,7 @@ the same map.
 from __future__ import annotations
 
 import bisect
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +15,11 @@ from objslam.association.sightings import Sightings
 from objslam.config import Settings
 from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
-from objslam.graph.incremental import Bearings, IncrementalGraph
+from objslam.graph.incremental import IncrementalGraph
+from objslam.graph.kept import Bearings
 from objslam.live import known as landmarks
 from objslam.live import upkeep
-from objslam.live.births import extend, give_birth, new_candidate
+from objslam.live.births import extend, give_birth, leave_out_the_least, new_candidate
 from objslam.live.candidates import Candidate, place
 from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
@@ -34,6 +36,18 @@ _SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop t
 _STANDING = 10  # keyframes from one place
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
 _TRACKS = 4096  # of the detector, that are remembered
+
+
+class _Lesson(NamedTuple):
+    """A frame that is in the map: which of its rays matched which rows of the landmarks, and its camera as of then."""
+
+    rays: FrameRays
+    matched: Ints
+    rows: Ints
+    camera: int
+    drift: Floats
+    stamp: float
+    map_T_camera: Floats
 
 
 class Mapper:
@@ -57,7 +71,7 @@ class Mapper:
         self.odometry = PathBuffer(settings.odometry, seconds)
         self.localization = PathBuffer(settings.odometry, seconds)
         self.polished = self.frames = 0
-        self.unsettled = False
+        self.unsettled, self.unrest = False, 0
         self.tracks: dict[int, int] = {}
         self._frame_number: dict[int, int] = {}
         self._last: dict[int, Floats] = {}
@@ -67,6 +81,7 @@ class Mapper:
         self.localizations = 0
         self.flat = True
         self._doubts: dict[int, Floats] = {}
+        self._lesson: _Lesson | None = None
         self.doubt = np.full((6, 6), np.nan)
         self._next_ray = self._next_keyframe = self._count = 0
         self.next_object = self.next_candidate = 0
@@ -177,7 +192,10 @@ class Mapper:
         return True
 
     def look_after(self) -> None:
-        """What is due now and then, after a frame that became a keyframe."""
+        """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
+        if self._lesson is not None:
+            self._learn(self._lesson)
+            self._lesson = None
         upkeep.after_keyframe(self)
 
     def leave_out(self, frame: FrameMessage, reason: str) -> None:
@@ -227,17 +245,19 @@ class Mapper:
         )
         for i in free.tolist():
             new_candidate(self, rays, i, numbers[i], k, stamp, doubt)
+        if not self.by_label:
+            leave_out_the_least(self)
         place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == k])
         if len(matched):
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
         give_birth(self, k)
         self.graph.update()
-        self._seen(rays, matched, rows, k, camera, doubt, stamp)
+        self._lesson = _Lesson(rays, matched, rows, camera, doubt.drift, stamp, self.graph.pose(k))
 
-    def _seen(self, rays: FrameRays, matched: Ints, rows: Ints, k: int, camera: int, doubt: Doubt, stamp: float) -> None:
+    def _learn(self, lesson: _Lesson) -> None:
         """What the landmarks of a frame learn from it."""
         known = self.known
-        pose = self.graph.pose(k)
+        rays, matched, rows, camera, drift, stamp, pose = lesson
         seen = landmarks.in_view(known, self.cameras[camera], pose)
         seen[rows] = True
         known.expected[seen] += 1
@@ -250,7 +270,7 @@ class Mapper:
         known.information[rows] += information(s, known.position[rows])
         known.squared[rows] += np.minimum(off, 6.0) ** 2
         known.seen[rows] += 1
-        known.drift[rows] = doubt.drift
+        known.drift[rows] = drift
         known.last[rows] = np.maximum(known.last[rows], stamp)
         known.far[rows] = np.maximum(known.far[rows], np.linalg.norm(known.position[rows] - pose[:3, 3], axis=1))
         for i, row in zip(matched.tolist(), rows.tolist(), strict=True):
@@ -303,6 +323,10 @@ class Mapper:
     def rows_of(self, ids: Ints) -> Ints:
         """The rows of landmarks by their ids, which must be there."""
         return np.searchsorted(self.known.id, ids)
+
+    def in_order(self) -> Ints:
+        """The keyframes (K,) by their stamps."""
+        return np.asarray(self.keyframes.id[np.argsort(self.keyframes.stamp, kind="stable")])
 
     def _predict(self, before: int | None, row: dict[str, object]) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
         """The first guess (4, 4) of a keyframe's camera, the covariance (6, 6) of that, and its motion by odometry."""

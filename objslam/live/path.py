@@ -47,7 +47,9 @@ class PathBuffer:
         stamps = self._stamps
         if not len(stamps) or not stamps[0] <= stamp <= stamps[-1]:
             return None
-        after = int(np.clip(np.searchsorted(stamps, stamp), 1, max(len(stamps) - 1, 1)))
+        after = int(np.searchsorted(stamps, stamp))
+        if stamps[after] == stamp:
+            return self._poses[after], self._drift[after]
         pair = slice(after - 1, after + 1)
         poses, valid = interpolate(stamps[pair], self._poses[pair], np.array([stamp]), max_gap)
         if not valid[0]:

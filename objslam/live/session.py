@@ -24,7 +24,7 @@ from objslam.results import RunResult
 from objslam.types import Camera, Floats, ObjectMap, Trajectory
 
 _MOST_POSES = 20_000  # messages besides frames that may wait: 100 s of odometry at 200 Hz
-_IDLE = 0.05  # s; how often the worker looks up where nothing comes
+_IDLE = 0.05  # s; how often the worker looks up where nothing comes, and how long a snapshot waits for the next frame
 _PATIENCE = 5.0  # s; how long a snapshot is waited for
 
 
@@ -63,10 +63,13 @@ class Session:
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._describer = Describer()
         self._lag = 0.0
+        self._worked = -np.inf
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:
         """Work in what the journal holds, then begin to take messages."""
+        import cv2  # noqa: F401 - now, for the first frame should not wait for it
+
         past = messages(self._journal_file, self.counters.ledger) if self._journal_file and self._resume else ()
         for message in past:
             self._intake.recall(message)
@@ -197,16 +200,14 @@ class Session:
                         self._changed.notify_all()
                         if self._stopping:
                             break
-                        if self._wanted == self._given:
-                            self._changed.wait(_IDLE)
+                        self._changed.wait(self._idle())
                     taken = list(self._queue)
                     self._queue.clear()
                     self._frames = self._others = 0
                     self._busy = bool(taken)
-                for message, arrival in taken:
-                    self._mapper.feed(message, arrival)
-                    self._work_off(limit=True)
-                self._answer()
+                worked = [self._take(message, arrival) for message, arrival in taken]
+                if any(worked) or time.perf_counter() - self._worked > _IDLE:
+                    self._answer()  # right after a frame: the next one is furthest away
         except Exception as error:  # noqa: BLE001 - kept for whoever stops the session: a thread has nobody to tell
             self._failure = error
         finally:
@@ -216,9 +217,20 @@ class Session:
                 self._stopping = True
                 self._changed.notify_all()
 
-    def _work_off(self, limit: bool) -> None:
+    def _idle(self) -> float:
+        """How long nothing needs to be done where nothing comes, s."""
+        return _IDLE if self._wanted == self._given else max(0.0, self._worked + _IDLE - time.perf_counter())
+
+    def _take(self, message: Message, arrival: float) -> bool:
+        """Feed a message; whether it was a frame's turn."""
+        self._mapper.feed(message, arrival)
+        return self._work_off(limit=True)
+
+    def _work_off(self, limit: bool) -> bool:
+        """Work in the frames that are ready; whether there was one."""
+        worked = False
         while (found := self._mapper.ready()) is not None:
-            frame, arrival = found
+            worked, (frame, arrival) = True, found
             if limit and not self._patient and time.perf_counter() - arrival > self._settings.live.max_lag:
                 self._mapper.leave_out(frame, "frames that waited too long (live.max_lag)")
                 continue
@@ -227,6 +239,9 @@ class Session:
                 if limit:
                     self.counters.updated(self._lag)
                 self._mapper.look_after()
+        if worked:
+            self._worked = time.perf_counter()
+        return worked
 
     def _answer(self) -> None:
         """A new snapshot, where one is wanted, or the session ends."""

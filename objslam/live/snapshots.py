@@ -25,6 +25,7 @@ class Describer:
 
     def __init__(self) -> None:
         self._said: dict[int, tuple[tuple[int, float], MapObject]] = {}
+        self._waiting: dict[int, tuple[int, MapObject]] = {}
 
     def map(self, m: Mapper, whole: bool = False) -> ObjectMap:
         """Objects with covariance and status, by their ids; candidates with enough boxes come after them, unresolved.
@@ -55,8 +56,16 @@ class Describer:
         objects.sort(key=lambda o: o.id)
         first = int(known.id.max(initial=-1)) + 1
         waiting = [c for c in m.candidates if len(c) >= m.settings.live.min_rays]
-        objects += [_waiting(m, c, first + i) for i, c in enumerate(waiting)]
+        self._waiting = {c.id: self._wait(m, c, whole) for c in waiting}
+        objects += [replace(self._waiting[c.id][1], id=first + i) for i, c in enumerate(waiting)]
         return ObjectMap(tuple(objects))
+
+    def _wait(self, m: Mapper, candidate: Candidate, whole: bool) -> tuple[int, MapObject]:
+        """A candidate, and with how many rays; one that was not seen since is as it was."""
+        before = self._waiting.get(candidate.id)
+        if before is not None and before[0] == len(candidate) and not whole:
+            return before
+        return len(candidate), _waiting(m, candidate)
 
     def _describe(self, m: Mapper, row: int, j: int, position: Floats, covariance: Floats) -> MapObject:
         known, rays = m.known, m.rays
@@ -99,12 +108,12 @@ def path(m: Mapper) -> Trajectory:
     return Trajectory(stamps, poses)
 
 
-def _waiting(m: Mapper, candidate: Candidate, number: int) -> MapObject:
+def _waiting(m: Mapper, candidate: Candidate) -> MapObject:
     s = candidate.sight(m.graph)
     position = candidate.position if not candidate.by_label else s.origin[-1] + 1.0 * s.direction[-1]
     off = np.minimum(misses(s, position) * s.sigma, np.pi)
     return MapObject(
-        id=number,
+        id=-1,
         label=m.labels[candidate.label],
         position=position,
         covariance=None,

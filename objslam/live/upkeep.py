@@ -21,11 +21,8 @@ if TYPE_CHECKING:
 
 _EVERY = 10  # keyframes
 _TURNS = 3  # updates that the graph is given when a loop has closed
-_FIRST, _GROWTH = (
-    20,
-    1.5,
-)  # keyframes; the graph is solved as a whole when there are so many, and each time so many times more
-_ITERATIONS, _FEW, _LARGE = 8, 2, 800  # iterations, and those from so many keyframes on: no frame may wait for long
+_FIRST, _GROWTH = 20, 1.5  # keyframes; the graph is solved as a whole when there are so many, then so many times more
+_ITERATIONS, _LARGE = 8, 400  # iterations, for so many keyframes at the most: no frame may wait for long
 _MISS = 4.0  # standard deviations by which a ray may miss its landmark
 _WIDEST = 5.0  # times the noise that was promised
 _RAYLEIGH_MEDIAN = 1.1774
@@ -45,11 +42,15 @@ _SLACK = 0.02  # m
 
 def after_keyframe(m: Mapper) -> None:
     """Every few keyframes, whatever is due."""
-    if m.keyframes_so_far % _EVERY:
-        return
-    for _ in range(_TURNS if m.unsettled else 1):
+    m.graph.take_turn()
+    due = m.keyframes_so_far % _EVERY == 0
+    if m.unsettled:
+        m.unsettled, m.unrest = False, _TURNS
+    if due or m.unrest:
         m.graph.update(relinearise=True)
-    m.unsettled = False
+        m.unrest = max(0, m.unrest - 1)
+    if not due:
+        return
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
     if not m.by_label:
@@ -64,13 +65,18 @@ def after_keyframe(m: Mapper) -> None:
 
 
 def polish(m: Mapper) -> None:
-    """The whole graph solved by Levenberg-Marquardt, then every ray asked again whether it fits its landmark."""
+    """The whole graph solved by Levenberg-Marquardt, then every ray asked again whether it fits its landmark.
+
+    A large graph is linearised anew instead, in turns.
+    """
+    large = len(m.keyframes) > _LARGE
     try:
-        m.graph.solve(_ITERATIONS if len(m.keyframes) < _LARGE else _FEW)
+        if not large:
+            m.graph.solve(_ITERATIONS)
     except SolveError:
         m.counters.accept("solves given up")
-    if _reconsider(m):
-        m.graph.rebuild()
+    if _reconsider(m) or large:
+        m.graph.rebuild_in_turns(m.in_order())
     m.known.position[:] = m.graph.points(m.known.id)
 
 
@@ -229,7 +235,7 @@ def thin(m: Mapper) -> None:
     m.candidates = [candidate for candidate in m.candidates if candidate.rays]
     _chain(m)
     m.counters.accept("keyframes left out", len(leaving))
-    m.graph.rebuild()
+    m.graph.rebuild_in_turns(m.in_order())
     m.known.position[:] = m.graph.points(m.known.id)
 
 

@@ -8,7 +8,8 @@ from drives import ODOMETRY_ALONE, make_drive
 
 from objslam.geometry import exp_se3, inverse
 from objslam.graph import factors
-from objslam.graph.incremental import Bearings, IncrementalGraph
+from objslam.graph.incremental import IncrementalGraph
+from objslam.graph.kept import Bearings
 from objslam.graph.marginals import marginal_covariances
 from objslam.graph.optimise import levenberg_marquardt, make_values, read_points, read_poses
 from objslam.ledger import Ledger
@@ -132,3 +133,40 @@ def test_moved_as_a_whole(drive):
     np.testing.assert_allclose(graph.points(landmarks), points @ moved[:3, :3].T + moved[:3, 3], atol=0.02)
     step = inverse(moved @ last) @ graph.pose(len(drive.keyframes) - 1)
     np.testing.assert_allclose(step, np.eye(4), atol=0.02)
+
+
+def test_built_anew_in_turns_is_built_anew(drive, monkeypatch):
+    monkeypatch.setattr("objslam.graph.incremental._AT_ONCE", 50)
+    monkeypatch.setattr("objslam.graph.incremental._TURN", 20)
+    graph, landmarks = grown(drive)
+    last = len(drive.keyframes) - 1
+    gone, rest = np.flatnonzero(drive.association.object == landmarks[0]), landmarks[1:]
+    graph.drop_rays(gone)
+    graph.drop_landmarks(landmarks[:1])
+    whole = IncrementalGraph(drive.settings)
+    whole.restore(graph.save())
+    whole.rebuild()
+    old = graph._isam
+    graph.rebuild_in_turns(np.arange(last + 1))
+    motion, covariance = factors.motions(drive.keyframes, drive.settings)
+    for turn in range(-(-(last + 1) // 20)):  # as the drive goes on, with a keyframe and a ray in the middle of it
+        assert graph._isam is old
+        if turn == 2:
+            step = motion[-1], covariance[-1]
+            one = bearings(drive, np.flatnonzero(drive.association.object == rest[0])[-1:])
+            for g in (graph, whole):
+                g.add_keyframe(last + 1, g.pose(last) @ step[0])
+                g.add_motion(last, last + 1, *step)
+                g.add_rays(replace(one, number=np.array([10_000])))
+                g.update()
+        graph.take_turn()
+    graph.take_turn()
+    assert graph._isam is not old
+    assert graph._isam.getFactorsUnsafe().size() == whole._kept.graph().size()
+    for g in (graph, whole):
+        for _ in range(3):
+            g.update(relinearise=True)
+        g.refresh()
+    np.testing.assert_allclose(graph.points(rest), whole.points(rest), atol=2e-3)
+    every = np.arange(last + 2)
+    np.testing.assert_allclose(graph.poses(every), whole.poses(every), atol=2e-3)
