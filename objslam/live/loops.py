@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.association.constellation import Constellation, Recognition, recognise
+from objslam.association.constellation import FEWEST, LEAST, Recognition, densities, neighbourhood, recognise
 from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
 from objslam.graph.closure import bend
@@ -18,14 +18,9 @@ from objslam.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
-_EVIDENCE, _LEAD = 7.0, 3.0  # log odds against new landmarks, and against another place
 _HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
-_FEWEST = 2  # landmarks on either side
-_PLACE, _DISTORTION = 0.07, 0.02  # m, and m per m from the robot: by how much a neighbourhood is bent in itself
-_MARGIN = 2.0  # m around all landmarks that could hold some too
-_LEAST = (0.02, 0.02, 0.01)  # m, m, rad; no pose is known better than that to another
 _ANCHORS = 3
-_ITERATIONS = 15
+_ITERATIONS, _TOLERANCE = 15, 1e-3  # the graph settles the rest in its updates: no frame may wait for it
 _HOLDS, _FITS = 0.7, 4.0  # share of a closed loop's rays that must still fit, to so many standard deviations
 _BENT = 0.02  # m
 
@@ -43,7 +38,7 @@ def close_loop(m: Mapper) -> None:
     m.looked_at = state
     possible = here[:, None] & there & (known.label[:, None] == known.label) & ~_together(m)
     one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
-    if len(one) < _FEWEST or len(two) < _FEWEST:
+    if len(one) < FEWEST or len(two) < FEWEST:
         return
     found = _recognise(m, one, two, possible[np.ix_(one, two)], newest)
     if found is not None:
@@ -53,9 +48,10 @@ def close_loop(m: Mapper) -> None:
 def _recognise(m: Mapper, one: Ints, two: Ints, possible: Bools, newest: int) -> Recognition | None:
     known, k = m.known, m.keyframes
     pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
-    low, high = known.position[:, :2].min(axis=0) - _MARGIN, known.position[:, :2].max(axis=0) + _MARGIN
-    density = np.bincount(known.label)[known.label[one]] / float(np.prod(high - low))
-    a, b = (_constellation(m, which, pivot) for which in (one, two))
+    density = densities(known.position, known.label)[one]
+    a, b = (
+        neighbourhood(known.position[which], covariances(known, which), known.label[which], pivot) for which in (one, two)
+    )
     lately = np.unique(known.last[two])[::-1]
     best: Recognition | None = None
     for stamp in lately[np.linspace(0, len(lately) - 1, min(_ANCHORS, len(lately))).astype(np.int64)]:
@@ -64,9 +60,7 @@ def _recognise(m: Mapper, one: Ints, two: Ints, possible: Bools, newest: int) ->
             continue
         prior = _planar(m, anchor, newest)
         found = recognise(a, b, pivot, prior, density, possible)
-        if found is None or found.evidence < _EVIDENCE or found.lead < _LEAD or len(found.pairs) < _FEWEST:
-            continue
-        if best is None or found.evidence > best.evidence:
+        if found is not None and found.sure and (best is None or found.evidence > best.evidence):
             best = found
     return best
 
@@ -83,14 +77,7 @@ def _planar(m: Mapper, before: int, now: int) -> Floats:
     drift = to_camera @ (k.drift[now] - k.drift[before]) @ to_camera.T
     spreads = [turn @ spread @ turn.T for spread in (drift, m.doubt) if np.isfinite(spread).all()]
     least = min(spreads, key=lambda spread: float(np.trace(spread[3:, 3:])))
-    return np.asarray(least[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(_LEAST) ** 2)
-
-
-def _constellation(m: Mapper, which: Ints, pivot: Floats) -> Constellation:
-    known = m.known
-    bent = _PLACE**2 + _DISTORTION**2 * ((known.position[which, :2] - pivot) ** 2).sum(axis=1)
-    spread = covariances(known, which) + bent[:, None, None] * np.eye(3)
-    return Constellation(known.position[which], spread, known.label[which])
+    return np.asarray(least[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(LEAST) ** 2)
 
 
 def _together(m: Mapper) -> Bools:
@@ -128,7 +115,7 @@ def _close(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
         join(m, i, j)
     without(m, np.unique(now), rebuild=False)
     try:
-        m.graph.solve(_ITERATIONS)
+        m.graph.solve(_ITERATIONS, _TOLERANCE)
     except SolveError:
         held = False
     else:
