@@ -63,9 +63,10 @@ def solve(
 
     start: what is known already of the keyframes with a ray, where the joint mode need not explore nor trust labels.
 
-    Where no frame has two boxes of one label, and the rays bear it out, every label is one object: in joint mode the graph
-    grows with that knowledge. Else the association is global: in fixed mode once, at the poses as they are; in joint mode
-    the poses are explored first, then association and solve take turns until no ray changes its object.
+    Where the settings say so, every label is one object; in joint mode also where no frame has two boxes of one label, and
+    the rays bear it out: the graph grows with that knowledge. Else the association is global: in fixed mode once, at the
+    poses as they are; in joint mode the poses are explored first, then association and solve take turns until no ray changes
+    its object.
     SolveError where joint mode has neither odometry nor localisation.
     """
     from objslam.graph import batch
@@ -76,9 +77,11 @@ def solve(
         if not frames.localized_every:
             ledger.warn("the poses are odometry, taken as they are: the map drifts as they do (--mode joint corrects both)")
         progress("association", 0, 0)
-        association = _associate(
-            frames, rays, cameras, settings, frames.map_T_camera, batch.pose_noise(rays, frames, settings)
-        )
+        if settings.association.method == "by_label":
+            association = associate_by_label(rays_of_keyframes)
+        else:
+            noise = batch.pose_noise(rays, frames, settings)
+            association = _associate(frames, rays, cameras, settings, frames.map_T_camera, noise)
         progress("solve", 0, 0)
         placed = batch.triangulate_at(keyframes.map_T_camera, keyframes, rays_of_keyframes, association, settings)
         estimate = batch.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)

@@ -12,7 +12,7 @@ from objslam.config import load_settings
 from objslam.errors import SolveError
 from objslam.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.ledger import Ledger
-from objslam.simulation import DepthNoise, make_camera
+from objslam.simulation import DepthNoise, make_camera, pair, simulate
 from objslam.simulation.motion import START
 from objslam.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 
@@ -335,3 +335,13 @@ def test_far_from_where_the_map_begins_an_object_is_still_known():
     sigma = [np.sqrt(np.linalg.eigvalsh(by_label[true.label].covariance)[-1]) for true in log.truth.objects]
     assert sigma[-1] > 0.5 * 3.0 > 5 * sigma[0]
     assert (np.diff(sigma) > 0).all()
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+def test_every_label_is_one_object_where_that_is_said(mode):
+    """Two cups: one object of that label, whatever the rays say; by default they are two."""
+    log = simulate(pair(1.0, pixel_sigma=1.0), 0)
+    said = offline.run(log, load_settings(None, (f"mode={mode}", "association.method=by_label")), Ledger())
+    assert [o.label for o in said.map.objects] == ["cup"]
+    found = offline.run(log, load_settings(None, (f"mode={mode}",)), Ledger())
+    assert [o.label for o in found.map.objects] == ["cup", "cup"]
