@@ -163,7 +163,7 @@ def drift(seeds: int, picture: Path | None) -> None:
 
 def mrclam() -> None:
     """Print what is found of the 15 landmarks of MRCLAM 6 when all are called the same."""
-    folder = Path(os.environ.get("OBJSLAM_DATA", "../shared/data")) / "mrclam_ds6"
+    folder = Path(os.environ.get("OBJSLAM_DATA", "")) / "mrclam_ds6"
     if not folder.is_dir():
         print(f"mrclam: {folder} is not there (OBJSLAM_DATA)")
         return
