@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +9,12 @@ import numpy as np
 from objslam.association.landmarks import Landmarks, range_costs, variance
 from objslam.association.sightings import MIN_DEPTH, Sightings
 from objslam.geometry import skew
-from objslam.types import Bools, Floats, Ints
+from objslam.types import Floats, Ints
 
 TRACK_GAIN = 2.0
 """What a match to the landmark of the other boxes of its track takes off the cost."""
 _CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
-_FEW = 1 << 13  # pairs that are not worth sorting by label
+_FEW = 1 << 12  # pairs that are not worth a bound
 
 
 @dataclass(frozen=True)
@@ -83,13 +82,18 @@ def _near(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None) 
     found: list[Ints] = [np.zeros(0, dtype=np.int64)]
     if len(s) == 0 or len(landmarks) == 0:
         return rays[0], found[0]
+    if len(s) * len(landmarks) <= _FEW:
+        ray, index = np.nonzero(landmarks.accepts[:, s.label].T)
+        ahead = np.einsum("ei,ei->e", landmarks.position[index] - s.origin[ray], s.direction[ray]) > MIN_DEPTH
+        return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn: Floats = np.zeros(len(s))
     move: Floats = np.zeros(len(s))
     if pose is not None:  # twice each part bounds the two together with their correlation
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     centre = s.origin.mean(axis=0)
-    for mine, which, fits in _by_label(s, landmarks):
+    for label in np.unique(s.label):
+        mine, which = np.flatnonzero(s.label == label), np.flatnonzero(landmarks.accepts[:, label])
         p, noise2 = landmarks.position[which] - centre, landmarks.noise[which] ** 2
         p2 = (p * p).sum(axis=1)
         step = max(1, _CHUNK // max(len(which), 1))
@@ -100,21 +104,10 @@ def _near(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None) 
             distance2 = (m * m).sum(axis=1)[:, None] + p2 - 2 * m @ p.T
             limit = distance2 * ((s.sigma[r] ** 2)[:, None] * noise2 + turn[r, None]) + s.place**2 * noise2
             limit += spread[which] + move[r, None] + 1e-9  # rounding of the products
-            near = (distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH)
-            a, b = np.nonzero(near if fits is None else near & fits)
+            a, b = np.nonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
             rays.append(r[a])
             found.append(which[b])
     return np.concatenate(rays), np.concatenate(found)
-
-
-def _by_label(s: Sightings, landmarks: Landmarks) -> Iterator[tuple[Ints, Ints, Bools | None]]:
-    """Rays (M,) and landmarks (N,) that may belong together, label by label; so few that it does not pay, all at once,
-    with which pairs (M, N) fit."""
-    if len(s) * len(landmarks) <= _FEW:
-        yield np.arange(len(s)), np.arange(len(landmarks)), landmarks.accepts[:, s.label].T
-        return
-    for label in np.unique(s.label):
-        yield np.flatnonzero(s.label == label), np.flatnonzero(landmarks.accepts[:, label]), None
 
 
 def choose(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:

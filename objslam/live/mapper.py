@@ -7,7 +7,6 @@ the same map.
 from __future__ import annotations
 
 import bisect
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,30 +23,17 @@ from objslam.live.candidates import Candidate, place
 from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
 from objslam.live.frame_reader import FrameReader
+from objslam.live.learning import Lesson, learn
 from objslam.live.localizing import localize
-from objslam.live.matching import Doubt, FrameRays, best_of_label, in_map, match, match_by_label
-from objslam.live.meeting import information, misses, sightings
+from objslam.live.matching import Doubt, FrameRays, best_of_label, match, match_by_label
+from objslam.live.meeting import sightings
 from objslam.live.messages import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
 from objslam.live.path import PathBuffer
 from objslam.types import Camera, Floats, Ints, Keyframes
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
-_SETTLE = np.radians(2.0)  # rays that miss their landmarks by more are a loop that closes: the graph is given more time
 _STANDING = 10  # keyframes from one place
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
-_TRACKS = 4096  # of the detector, that are remembered
-
-
-class _Lesson(NamedTuple):
-    """A frame that is in the map: which of its rays matched which rows of the landmarks, and its camera as of then."""
-
-    rays: FrameRays
-    matched: Ints
-    rows: Ints
-    camera: int
-    drift: Floats
-    stamp: float
-    map_T_camera: Floats
 
 
 class Mapper:
@@ -81,7 +67,7 @@ class Mapper:
         self.localizations = 0
         self.flat = True
         self._doubts: dict[int, Floats] = {}
-        self._lesson: _Lesson | None = None
+        self._lesson: Lesson | None = None
         self.doubt = np.full((6, 6), np.nan)
         self._next_ray = self._next_keyframe = self._count = 0
         self.next_object = self.next_candidate = 0
@@ -194,7 +180,7 @@ class Mapper:
     def look_after(self) -> None:
         """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
         if self._lesson is not None:
-            self._learn(self._lesson)
+            learn(self, self._lesson)
             self._lesson = None
         upkeep.after_keyframe(self)
 
@@ -252,40 +238,7 @@ class Mapper:
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
         give_birth(self, k)
         self.graph.update()
-        self._lesson = _Lesson(rays, matched, rows, camera, doubt.drift, stamp, self.graph.pose(k))
-
-    def _learn(self, lesson: _Lesson) -> None:
-        """What the landmarks of a frame learn from it."""
-        known = self.known
-        rays, matched, rows, camera, drift, stamp, pose = lesson
-        seen = landmarks.in_view(known, self.cameras[camera], pose)
-        seen[rows] = True
-        known.expected[seen] += 1
-        if not len(rows):
-            return
-        s = in_map(rays.take(matched), pose)
-        known.position[rows] = self.graph.points(known.id[rows])
-        off = misses(s, known.position[rows])
-        self.unsettled |= bool((off * s.sigma).max() > _SETTLE)
-        known.information[rows] += information(s, known.position[rows])
-        known.squared[rows] += np.minimum(off, 6.0) ** 2
-        known.seen[rows] += 1
-        known.drift[rows] = drift
-        known.last[rows] = np.maximum(known.last[rows], stamp)
-        known.far[rows] = np.maximum(known.far[rows], np.linalg.norm(known.position[rows] - pose[:3, 3], axis=1))
-        for i, row in zip(matched.tolist(), rows.tolist(), strict=True):
-            if rays.track[i] >= 0:
-                self.tracks[int(rays.track[i])] = int(known.id[row])
-                if len(self.tracks) > _TRACKS:
-                    del self.tracks[next(iter(self.tracks))]
-        if not self.by_label and len(rows) > 1:
-            ids = np.sort(known.id[rows])
-            same = {int(j): int(label) for j, label in zip(known.id[rows], known.label[rows], strict=True)}
-            for a in range(len(ids)):
-                for b in range(a + 1, len(ids)):
-                    pair = (int(ids[a]), int(ids[b]))
-                    if same[pair[0]] == same[pair[1]]:
-                        self.together[pair] = self.together.get(pair, 0) + 1
+        self._lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, self.graph.pose(k))
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""

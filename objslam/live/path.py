@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from objslam.config import Odometry
-from objslam.geometry import interpolate, inverse, is_planar
+from objslam.geometry import interpolate, inverse
 from objslam.keyframes import step_drift
 from objslam.types import Floats
 
+_UPRIGHT = np.array([0.0, 0.0, 1.0, 0.0])  # the third row of a pose in the plane of the first one,
+_PLANAR = 1e-6  # to so much, as `geometry.is_planar` has it
 _CHUNK = 512  # poses that may wait until they are worked in
 
 
@@ -74,7 +76,7 @@ class PathBuffer:
             total = self._drift[-1]
         else:
             joined, total = self._from_start @ poses, np.zeros((6, 6))
-        self._planar = self._planar and is_planar(np.concatenate([np.eye(4)[None], joined]))
+        self._planar = self._planar and float(np.abs(joined[:, 2] - _UPRIGHT).max()) <= _PLANAR
         drift = total + np.cumsum(step_drift(joined, self._settings, self._planar), axis=0)
         if not len(self._stamps):
             drift = np.concatenate([total[None], drift])

@@ -25,6 +25,8 @@ from objslam.types import Camera, Floats, ObjectMap, Trajectory
 
 _MOST_POSES = 20_000  # messages besides frames that may wait: 100 s of odometry at 200 Hz
 _IDLE = 0.05  # s; how often the worker looks up where nothing comes, and how long a snapshot waits for the next frame
+_SHORT = 0.015  # s; a frame that took longer had better not be followed by a snapshot,
+_LONG = 0.5  # s; unless that has been waited for for so long
 _PATIENCE = 5.0  # s; how long a snapshot is waited for
 
 
@@ -63,7 +65,7 @@ class Session:
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._describer = Describer()
         self._lag = 0.0
-        self._worked = -np.inf
+        self._worked = self._asked = -np.inf
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:
@@ -112,6 +114,8 @@ class Session:
         with self._changed:
             if not self._thread.is_alive():
                 return self._snapshot
+            if self._wanted == self._given:
+                self._asked = time.perf_counter()
             self._wanted += 1
             number = self._wanted
             self._changed.notify_all()
@@ -205,9 +209,10 @@ class Session:
                     self._queue.clear()
                     self._frames = self._others = 0
                     self._busy = bool(taken)
+                begin = time.perf_counter()
                 worked = [self._take(message, arrival) for message, arrival in taken]
-                if any(worked) or time.perf_counter() - self._worked > _IDLE:
-                    self._answer()  # right after a frame: the next one is furthest away
+                if self._has_time(any(worked), begin):
+                    self._answer()
         except Exception as error:  # noqa: BLE001 - kept for whoever stops the session: a thread has nobody to tell
             self._failure = error
         finally:
@@ -220,6 +225,11 @@ class Session:
     def _idle(self) -> float:
         """How long nothing needs to be done where nothing comes, s."""
         return _IDLE if self._wanted == self._given else max(0.0, self._worked + _IDLE - time.perf_counter())
+
+    def _has_time(self, worked: bool, begin: float) -> bool:
+        """Whether to answer now: right after a frame that took little, for then the next one is furthest away."""
+        now = time.perf_counter()
+        return now - self._worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
     def _take(self, message: Message, arrival: float) -> bool:
         """Feed a message; whether it was a frame's turn."""

@@ -56,14 +56,15 @@ class Describer:
         objects.sort(key=lambda o: o.id)
         first = int(known.id.max(initial=-1)) + 1
         waiting = [c for c in m.candidates if len(c) >= m.settings.live.min_rays]
-        self._waiting = {c.id: self._wait(m, c, whole) for c in waiting}
-        objects += [replace(self._waiting[c.id][1], id=first + i) for i, c in enumerate(waiting)]
+        now = {c.id: self._wait(m, c, whole, end) for c in waiting}
+        self._waiting = {number: said for number, said in now.items() if said is not None}
+        objects += [replace(o, id=first + i) for i, (_, o) in enumerate(self._waiting.values())]
         return ObjectMap(tuple(objects))
 
-    def _wait(self, m: Mapper, candidate: Candidate, whole: bool) -> tuple[int, MapObject]:
-        """A candidate, and with how many rays; one that was not seen since is as it was."""
+    def _wait(self, m: Mapper, candidate: Candidate, whole: bool, end: float) -> tuple[int, MapObject] | None:
+        """A candidate, and with how many rays; one that was not seen since is as it was, a new one may have to wait."""
         before = self._waiting.get(candidate.id)
-        if before is not None and before[0] == len(candidate) and not whole:
+        if not whole and ((before is not None and before[0] == len(candidate)) or time.perf_counter() > end):
             return before
         return len(candidate), _waiting(m, candidate)
 
