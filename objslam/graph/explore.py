@@ -64,6 +64,7 @@ def explore(
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
     owner = np.full(len(rays), -1, dtype=np.int64)
     known = Known.nothing()
+    refused: set[tuple[tuple[int, ...], tuple[int, ...]] | None] = set()
     graph = build_graph([anchor(map_T_camera[0])])
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
@@ -94,20 +95,14 @@ def explore(
             known.position = read_points(values)
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
             found = find_closure(known, _active(known, heading, end - 1), rays, owner, graph, values, map_T_camera, end - 1)
-            if found is not None:
-                closed = _close(
-                    found,
-                    known,
-                    rays,
-                    owner,
-                    map_T_camera[:end],
-                    heading,
-                    motion,
-                    covariance,
-                    settings,
-                )
-                if closed is not None:
+            pairs = None if found is None else (tuple(found.now), tuple(found.before))
+            if found is not None and pairs not in refused:
+                closed = _close(found, known, rays, owner, map_T_camera[:end], heading, motion, covariance, settings)
+                if closed is None:
+                    refused.add(pairs)
+                else:
                     graph, known, owner, map_T_camera[:end] = closed
+                    refused.clear()  # the landmarks have other numbers now
         progress(end, len(keyframes))
     return Explored(map_T_camera, Association(owner, known.label), known.position)
 
