@@ -8,16 +8,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from objslam.config import Settings
 from objslam.description import describe, summarise
 from objslam.errors import LogError, SolveError
+from objslam.geometry import interpolate
 from objslam.keyframes import build_keyframes, correct_path
 from objslam.ledger import Ledger
 from objslam.rays import build_rays
 from objslam.reconstruction import has_depth, reconstruct
 from objslam.results import RunResult
 from objslam.rounds import Progress, Solution, solve
-from objslam.types import Log, ObjectMap
+from objslam.types import Floats, Keyframes, Log, ObjectMap, Trajectory
 
 
 def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
@@ -43,7 +46,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     path = log.localization or log.odometry
     assert path is not None  # build_keyframes has refused such a log
-    path_after = correct_path(path, keyframes.stamps, keyframes.map_T_base, estimate.map_T_base)
+    path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     surface, before = None, None
     if settings.reconstruction.use and has_depth(log):
         with _stage("reconstruction", seconds, progress):
@@ -70,6 +73,21 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         surface=surface,
         surface_before=before,
     )
+
+
+def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
+    """The path through the solved poses (K, 4, 4) of the keyframes.
+
+    Between two of them the odometry tells the way, in joint mode: a localisation's jitter is what the solve has taken out.
+    """
+    after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
+    way = log.odometry
+    if settings.mode == "fixed" or way is None or way is path:
+        return after
+    before, _ = interpolate(way.stamps, way.poses, keyframes.stamps, float("inf"))
+    smooth = correct_path(way, keyframes.stamps, before, map_T_base)
+    poses, inside = interpolate(way.stamps, smooth.poses, path.stamps, settings.poses.max_gap)
+    return Trajectory(path.stamps, np.where(inside[:, None, None], poses, after.poses))
 
 
 def _chosen_poses(log: Log, settings: Settings) -> Log:

@@ -12,7 +12,7 @@ from objslam.config import load_settings
 from objslam.errors import SolveError
 from objslam.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.ledger import Ledger
-from objslam.simulation import DepthNoise, make_camera, pair, simulate
+from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
 from objslam.simulation.motion import START
 from objslam.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 
@@ -345,3 +345,18 @@ def test_every_label_is_one_object_where_that_is_said(mode):
     assert [o.label for o in said.map.objects] == ["cup"]
     found = offline.run(log, load_settings(None, (f"mode={mode}",)), Ledger())
     assert [o.label for o in found.map.objects] == ["cup", "cup"]
+
+
+def test_the_path_after_is_as_smooth_as_the_odometry_where_the_localisation_jitters():
+    log = simulate(preset("demo"), 0)
+    result = offline.run(log, load_settings(None, ("mode=joint", "rays.pixel_sigma=2")), Ledger())
+    after, true = result.path_after, log.truth.trajectory
+    where, _ = interpolate(true.stamps, true.poses, after.stamps, np.inf)
+    error = np.linalg.norm((after.poses - where)[:, :2, 3], axis=1)
+    jitter = np.linalg.norm(np.diff(after.poses[:, :2, 3], n=2, axis=0), axis=1)
+    raw = np.linalg.norm(np.diff(result.path.poses[:, :2, 3], n=2, axis=0), axis=1)
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert np.median(jitter) < 0.5 * np.median(raw)
+    # and it goes through the poses that were solved
+    at, _ = interpolate(after.stamps, after.poses, result.keyframes.stamps, np.inf)
+    np.testing.assert_allclose(at[:, :3, 3], result.map_T_base[:, :3, 3], atol=0.01)
