@@ -19,8 +19,7 @@ from objslam.types import Bools, Floats, Ints
 if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
-_EVERY = 10  # keyframes, after the first of which the graph is linearised anew,
-_LOOP, _TIDY, _THIN, _POLISH = 2, 4, 6, 8  # and after these the rest is done
+_EVERY = 10  # keyframes
 _TURNS = 3  # updates that the graph is given when a loop has closed
 _FIRST, _GROWTH = 20, 1.5  # keyframes; the graph is solved as a whole when there are so many, then so many times more
 _ITERATIONS, _LARGE = 8, 400  # iterations, for so many keyframes at the most: no frame may wait for long
@@ -42,25 +41,25 @@ _SLACK = 0.02  # m
 
 
 def after_keyframe(m: Mapper) -> None:
-    """Every few keyframes, whatever is due; not all after the same one, for the next frame comes soon."""
+    """Every few keyframes, whatever is due."""
     m.graph.take_turn()
-    at = m.keyframes_so_far % _EVERY
+    due = m.keyframes_so_far % _EVERY == 0
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    if at == 0 or m.unrest:
+    if due or m.unrest:
         m.graph.update(relinearise=True)
         m.unrest = max(0, m.unrest - 1)
-    if at == 0:
-        m.known.position[:] = m.graph.points(m.known.id)
-        _forget(m)
-    elif at == _LOOP and not m.by_label:
+    if not due:
+        return
+    m.known.position[:] = m.graph.points(m.known.id)
+    _forget(m)
+    if not m.by_label:
         close_loop(m)
-    elif at == _TIDY and not m.by_label:
         _merge(m)
         _drop_ghosts(m)
-    elif at == _THIN and len(m.keyframes) > m.settings.live.max_keyframes:
+    if len(m.keyframes) > m.settings.live.max_keyframes:
         thin(m)
-    elif at == _POLISH and m.keyframes_so_far >= max(_FIRST, _GROWTH * m.polished) and len(m.known):
+    if m.keyframes_so_far >= max(_FIRST, _GROWTH * m.polished) and len(m.known):
         m.polished = m.keyframes_so_far
         polish(m)
 
