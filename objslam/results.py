@@ -192,11 +192,20 @@ def load_truth(path: Path) -> Truth | None:
     return None
 
 
+def hint_below(folder: Path) -> str | None:
+    """Which folders in a folder are results, as a hint to name one of them; None where none is."""
+    below = sorted(str(file.parent) for file in folder.glob(f"*/{SUMMARY}"))
+    if not below:
+        return None
+    more = f" and {len(below) - 5} more" if len(below) > 5 else ""
+    return f"its results lie in folders of their own: {', '.join(below[:5])}{more}"
+
+
 def _existing(out: Path, name: str) -> Path:
     if not out.is_dir():
         raise OutputError("there is no such result folder", where=str(out))
     if not (out / name).is_file():
-        hint = "was its run killed? run again" if (out / _STAGING).exists() else None
+        hint = "was its run killed? run again" if (out / _STAGING).exists() else hint_below(out)
         raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
     return out / name
 

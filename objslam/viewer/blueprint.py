@@ -57,10 +57,10 @@ def _curves(solver: bool) -> Any:
     import rerun.blueprint as rrb
 
     # a view shows what the timeline at hand has: residuals and boxes of the drive, cost and objects of the solver
-    pairs = {"residual": "cost", "boxes": "rounds"}
+    pairs = {"residual": ("residual, deg", "cost"), "boxes": ("boxes", "rounds")}
     views = [
-        _curve([f"plots/{drive}", *([f"plots/{step}"] if solver else [])], f"{drive}, {step}" if solver else drive)
-        for drive, step in pairs.items()
+        _curve([f"plots/{drive}", *([f"plots/{step}"] if solver else [])], f"{name}; {step}" if solver else name)
+        for drive, (name, step) in pairs.items()
     ]
     seconds = rrb.BarChartView(origin="plots/seconds", name="seconds")
     return rrb.Tabs(*views, seconds, rrb.TextDocumentView(origin="summary", name="summary"), active_tab=0)

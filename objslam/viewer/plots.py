@@ -8,29 +8,40 @@ import numpy as np
 
 from objslam.association.extent import grouped_quantile
 from objslam.scene import ray_kinds
+from objslam.types import Floats
 from objslam.viewer.rays import RAY_COLOURS
 from objslam.viewer.times import iteration_column, stamp_column
 
 if TYPE_CHECKING:
     from objslam.results import RunResult
 
+_GAP, _GAP_STEPS = 1.0, 5.0  # s, and the usual steps between stamps: a longer pause is one without boxes
 _CURVES = ((62, 128, 214), (240, 150, 50), (90, 170, 90), (170, 110, 200), (200, 90, 90), (120, 120, 120))
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
-    """`plots/residual/median` and `.../worst`, deg, of the used rays of a stamp; `plots/boxes/KIND`, how many there are."""
+    """`plots/residual/median` and `.../worst`, deg, of the used rays of a stamp, broken where there are none;
+    `plots/boxes/KIND`, how many there are.
+    """
     stamps, moment = np.unique(result.keyframes.stamps, return_inverse=True)
     of = moment[result.rays.keyframe]
     kinds = ray_kinds(result)
     used = kinds["used"]
     degrees = np.degrees(result.residual[used])
     for name, share, colour in (("median", 0.5, _CURVES[0]), ("worst", 1.0, _CURVES[1])):
-        curve = grouped_quantile(degrees, of[used], len(stamps), share)
-        some = np.isfinite(curve)
-        _send(recording, f"plots/residual/{name}", stamp_column(stamps[some]), curve[some], colour, f"{name} ray, deg")
+        at, curve = broken(stamps, grouped_quantile(degrees, of[used], len(stamps), share))
+        if np.isfinite(curve).any():
+            _send(recording, f"plots/residual/{name}", stamp_column(at), curve, colour, f"{name} residual, deg")
     for kind, mask in kinds.items():
         counts = np.bincount(of[mask], minlength=len(stamps)).astype(np.float64)
         _send(recording, f"plots/boxes/{kind}", stamp_column(stamps), counts, RAY_COLOURS[kind], kind)
+
+
+def broken(stamps: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """A curve (N,) at ascending stamps (N,), s, with a NaN in the middle of each gap, so that no line crosses it."""
+    step = np.diff(stamps)
+    gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
+    return np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2), np.insert(values, gap + 1, np.nan)
 
 
 def log_costs(recording: Any, result: RunResult) -> None:

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.errors import OutputError
-from objslam.results import RECORDING
+from objslam.errors import ConfigError, OutputError
+from objslam.results import RECORDING, hint_below
 from objslam.viewer.times import STAMP
 
 if TYPE_CHECKING:
@@ -41,11 +42,35 @@ def program() -> Path:
 
 
 def find_recording(out: Path) -> Path:
-    """The recording of a result folder, or the file itself; OutputError where there is none."""
+    """The recording of a result folder, or the file itself; OutputError where there is none, or it is damaged."""
     file = out if out.is_file() else out / RECORDING
+    if not out.exists():
+        raise OutputError("there is no such result folder", where=str(out))
     if not file.is_file():
-        raise OutputError("no recording here", where=str(out), hint="run with output.recording=true, and name its result")
+        hint = hint_below(out) or "run with output.recording=true, and name its result"
+        raise OutputError("no recording here", where=str(out), hint=hint)
+    check_recording(file)
     return file
+
+
+def check_recording(file: Path) -> None:
+    """Read a recording through; OutputError where it is none, cut off or damaged: the viewer would wait for the rest."""
+    from rerun.chunk import RrdReader
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore"
+            )  # no footer: a session still writes it, or was killed; what is there can be shown
+            reader = RrdReader(file)
+            for store in [*reader.recordings(), *reader.blueprints()]:
+                for _ in reader.stream(store=store).to_chunks():
+                    pass
+        if not reader.recordings():
+            raise ValueError("it is empty")
+    except (RuntimeError, ValueError, OSError) as error:
+        why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {file}: ")
+        raise OutputError(f"the recording is damaged or cut off ({why})", where=str(file), hint="run again") from error
 
 
 def free_port() -> int:
@@ -107,8 +132,11 @@ def screenshot(
     """A picture of the recordings as they look at first opening, without a screen.
 
     size: points, two pixels each. at: share of the timeline's length where the time stands.
-    OutputError, in one line, where there is no Vulkan driver, or the picture cannot be written.
+    OutputError, in one line, where there is no Vulkan driver, or the picture cannot be written; ConfigError where its name
+    does not end in .png.
     """
+    if picture.suffix.lower() != ".png":
+        raise ConfigError("a picture is a PNG", where=str(picture), hint="name it FILE.png")
     if not picture.parent.is_dir():
         raise OutputError("no such folder for the picture", where=str(picture.parent))
     temporary = picture.with_name(f".{picture.stem}.{os.getpid()}.png")
@@ -116,7 +144,7 @@ def screenshot(
     window = f"{size[0]}x{size[1]}"
     viewer = start("--headless", "--hide-welcome-screen", "--port", str(port), "--window-size", window, *map(str, files))
     try:
-        with _talking(viewer, port) as client:
+        with _talking(viewer, port, files) as client:
             _stand(client, at, timeline)
             time.sleep(_SETTLE)
             client.save_screenshot(str(temporary.resolve()))
@@ -131,7 +159,7 @@ def screenshot(
 
 
 @contextmanager
-def _talking(viewer: subprocess.Popen[bytes], port: int) -> Iterator[ViewerClient]:
+def _talking(viewer: subprocess.Popen[bytes], port: int, files: list[Path]) -> Iterator[ViewerClient]:
     """A connection to a viewer that has loaded what it was given."""
     from rerun.experimental import ViewerClient
 
@@ -150,7 +178,8 @@ def _talking(viewer: subprocess.Popen[bytes], port: int) -> Iterator[ViewerClien
             if time.monotonic() > end:
                 raise
         if time.monotonic() > end:
-            raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s")
+            where = ", ".join(map(str, files))
+            raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
         time.sleep(0.1)
 
 
@@ -183,7 +212,9 @@ def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputEr
     if any(sign in text for sign in _NO_SCREEN):
         return OutputError("the viewer finds no screen", hint=hint)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    reason = next((line for line in lines if "error" in line.lower() or "panicked" in line), lines[0] if lines else "")
+    lines = [line for line in lines if "XDG_RUNTIME_DIR" not in line]  # said on every machine without a desktop
+    panic = next((" ".join(lines[i : i + 2]) for i, line in enumerate(lines) if "panicked" in line), None)
+    reason = panic or next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
     return OutputError(f"the viewer ended with code {code}" + (f": {reason[:200]}" if reason else ""), hint=hint)
 
 

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from objslam.cli import app
 from objslam.errors import OutputError
+from objslam.results import load_map
 from objslam.viewer import program, write_recording
 
 
@@ -45,6 +46,62 @@ def test_a_picture_without_a_screen(out: Path, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
 
 
+def test_a_run_that_found_nothing_can_be_seen(tmp_path: Path) -> None:
+    result, _ = synthetic_result(np.zeros((0, 3)), [], keyframes=2)
+    write_recording(result, tmp_path / "a.rrd")
+    try:
+        program.screenshot([tmp_path / "a.rrd"], tmp_path / "a.png", (800, 500))
+    except OutputError as error:
+        if "Vulkan" in str(error):
+            pytest.skip(str(error))
+        raise
+    assert cv2.imread(str(tmp_path / "a.png")).shape[:2] == (500, 800)
+
+
+def test_a_panic_is_said_before_what_is_harmless() -> None:
+    said = (
+        b"error: XDG_RUNTIME_DIR is invalid or not set\n\nthread 'main' panicked at src/a.rs:81:\nno range\nstack backtrace:"
+    )
+    text = str(program._failure(102, said, None))
+    assert "panicked at src/a.rs:81: no range" in text
+    assert "XDG" not in text
+
+
+@pytest.mark.parametrize("damage", ["cut off", "overwritten", "header", "empty", "other"])
+def test_a_damaged_recording_is_said_with_its_path(out: Path, tmp_path: Path, damage: str) -> None:
+    whole = (out / "recording.rrd").read_bytes()
+    half = len(whole) // 2
+    data = {
+        "cut off": whole[:half],
+        "overwritten": whole[:half] + bytes(200) + whole[half + 200 :],
+        "header": whole[:12],
+        "empty": b"",
+        "other": b"not a recording at all" * 100,
+    }[damage]
+    file = tmp_path / "recording.rrd"
+    file.write_bytes(data)
+    with pytest.raises(OutputError) as caught:
+        program.find_recording(tmp_path)
+    assert str(file) in str(caught.value)
+    assert "damaged or cut off" in str(caught.value)
+    assert "run again" in str(caught.value)
+    file.write_bytes(whole)
+    assert program.find_recording(tmp_path) == file
+
+
+def test_results_in_folders_below_are_named(out: Path, tmp_path: Path) -> None:
+    for name in ("fixed", "joint"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "summary.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(OutputError) as caught:
+        program.find_recording(tmp_path)
+    with pytest.raises(OutputError) as loading:
+        load_map(tmp_path)
+    for error in (caught, loading):
+        assert str(tmp_path / "fixed") in str(error.value)
+        assert str(tmp_path / "joint") in str(error.value)
+
+
 def test_no_driver_is_one_line(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "VK_ADD_DRIVER_FILES"):
         monkeypatch.setenv(name, str(tmp_path / "none.json"))
@@ -69,7 +126,8 @@ def test_no_screen_is_one_line(out: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["nowhere"], 1, "no recording here"),
+        (["nowhere"], 1, "there is no such result folder"),
+        (["{out}", "--screenshot", "a.bmp"], 2, "a picture is a PNG"),
         (["{out}", "--object", "3"], 1, "no result here"),
         (["{out}", "--web", "--screenshot", "a.png"], 2, "--web and --screenshot"),
         (["{out}", "--screenshot", "no/such/a.png"], 1, "no such folder"),

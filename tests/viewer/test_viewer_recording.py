@@ -264,6 +264,15 @@ def test_the_curves_are_the_residuals_of_each_frame(record: Any) -> None:
         assert [v[0] for v in r.get(f"/plots/boxes/{kind}", "Scalars:scalars")] == counts.tolist()
 
 
+def test_the_curves_break_where_a_while_has_no_boxes(record: Any) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=12)
+    stamps = result.keyframes.stamps + np.where(np.arange(12) < 6, 0.0, 20.0)
+    r = record(dataclasses.replace(result, keyframes=dataclasses.replace(result.keyframes, stamps=stamps)))
+    curve = np.array(r.get("/plots/residual/median", "Scalars:scalars"))[:, 0]
+    assert np.flatnonzero(np.isnan(curve)).tolist() == [6]
+    assert len(curve) == 13
+
+
 def test_two_cameras_at_one_stamp_show_their_rays_together(record: Any) -> None:
     result, _ = synthetic_result(*clusters(), keyframes=10)
     stamps = result.keyframes.stamps.copy()
