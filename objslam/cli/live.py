@@ -34,11 +34,12 @@ from objslam.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from objslam.ledger import Ledger
     from objslam.live.adapters import Feed
     from objslam.live.interface import Snapshot
     from objslam.live.session import Session
     from objslam.sources import SourceOptions
-    from objslam.types import Truth
+    from objslam.types import Log, Truth
 
 _HAND_OVER = 5e-4  # s; a message does not wait Python's 5 ms, several times over, for the thread that makes the map
 _POLL = 0.1  # s; how soon the end of a source is seen
@@ -105,16 +106,17 @@ def live(
 
     settings = settings_of("joint", config, set_)
     options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
+    recording = None if source in ADAPTERS else _read(Path(source), options)  # first, for it may be the journal in OUT
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume)
         session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=speed == 0)
         stack.callback(session.abort)
         truth = None
-        if source in ADAPTERS:
+        if recording is None:
             feed = ADAPTERS[source](session, LiveOptions(settings, detector, options, domain, interface))
         else:
-            feed, truth = _replay(Path(source), options, session, speed or None, resume)
+            feed, truth = _replay(recording, session, speed or None)
         for close in feed.close:
             stack.callback(close)
         if publish:
@@ -131,33 +133,33 @@ def live(
         _finish(session, feed, out, truth)
 
 
-def _look_for_journal(file: Path, resume: bool) -> None:
-    from objslam.errors import OutputError
+def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
     from objslam.ledger import Ledger
-    from objslam.live.journal import is_journal, messages
-    from objslam.results import SUMMARY
-
-    if resume and not file.is_file():
-        raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
-    unfinished = is_journal(file) and not (file.parent / SUMMARY).is_file()
-    if not resume and unfinished and next(messages(file, Ledger()), None) is not None:
-        raise OutputError(
-            "the journal of a session that did not end",
-            where=str(file),
-            hint="--resume goes on with it, -o names another folder, `objslam run` maps it",
-        )
-
-
-def _replay(
-    path: Path, options: SourceOptions, session: Session, speed: float | None, resume: bool
-) -> tuple[Feed, Truth | None]:
-    from objslam.ledger import Ledger
-    from objslam.live.adapters import Feed
-    from objslam.live.adapters.replay import ReplayAdapter
     from objslam.sources import read
 
     ledger = Ledger()
-    log = read(path, ledger, options)
+    return read(path, ledger, options), ledger
+
+
+def _look_for_journal(file: Path, resume: bool) -> None:
+    """Nothing that a session kept is lost: what is there is gone on with, or set aside."""
+    from objslam.errors import OutputError
+    from objslam.live.journal import set_aside
+
+    if resume:
+        if not file.is_file():
+            raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
+        return
+    aside = set_aside(file)
+    if aside is not None:
+        say(f"warning: kept the journal of an earlier session as {aside} (--resume goes on with a journal)", stderr=True)
+
+
+def _replay(recording: tuple[Log, Ledger], session: Session, speed: float | None) -> tuple[Feed, Truth | None]:
+    from objslam.live.adapters import Feed
+    from objslam.live.adapters.replay import ReplayAdapter
+
+    log, ledger = recording
     adapter = ReplayAdapter(session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger)
     return Feed(adapter), log.truth
 

@@ -8,6 +8,7 @@ later at the most, so that a power failure loses no more than that.
 from __future__ import annotations
 
 import fcntl
+import itertools
 import os
 import struct
 import threading
@@ -38,8 +39,13 @@ class Journal:
     """
 
     def __init__(self, file: Path, resume: bool = False) -> None:
-        """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use."""
+        """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use.
+
+        Without `resume`, a journal with messages is kept under another name (`set_aside`).
+        """
         self.file = file
+        if not resume:
+            set_aside(file)
         try:
             self._stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
@@ -100,6 +106,24 @@ class Journal:
             os.lseek(self._stream, 0, os.SEEK_END)
             raise OutputError(f"cannot write the journal: {error.strerror}", where=str(self.file)) from error
         self._end += len(data)
+
+
+def set_aside(file: Path) -> Path | None:
+    """Rename a journal that holds anything to NAME.1.objslam or the next free number; what it is called now, else None.
+
+    OutputError where a session writes it, or the disk refuses.
+    """
+    try:
+        if not file.is_file() or file.stat().st_size <= len(MAGIC):
+            return None
+        with file.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
+            return file.rename(next(other for other in others if not other.exists()))
+    except BlockingIOError as error:
+        raise OutputError("another session writes this journal", where=str(file)) from error
+    except OSError as error:
+        raise OutputError(f"cannot set the journal aside: {error.strerror}", where=str(file)) from error
 
 
 def is_journal(path: Path) -> bool:

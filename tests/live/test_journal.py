@@ -119,6 +119,22 @@ def test_two_sessions_do_not_share_a_journal(tmp_path):
     first.close()
 
 
+def test_a_journal_with_messages_is_never_overwritten(tmp_path):
+    file = tmp_path / "journal.objslam"
+    for i in range(3):
+        write(file, [pose(float(i), 1.0)])
+        write(tmp_path / "empty", [])
+    held = [[m.stamp for m in messages(f, Ledger())] for f in sorted(tmp_path.glob("journal*"))]
+    assert held == [[0.0], [1.0], [2.0]]  # journal.1, journal.2, and the newest, journal
+    assert [f.name for f in tmp_path.glob("empty*")] == ["empty"]
+    used = Journal(tmp_path / "used")
+    used.write(pose(0.0, 1.0))
+    with pytest.raises(OutputError, match="another session"):
+        Journal(tmp_path / "used")
+    used.close()
+    assert len(list(messages(tmp_path / "used", Ledger()))) == 1
+
+
 def test_what_is_no_journal(tmp_path):
     (tmp_path / "j").write_bytes(b"something else")
     assert not is_journal(tmp_path / "j")

@@ -7,11 +7,13 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
-from objslam.config import Odometry
+from objslam.config import Odometry, load_settings
 from objslam.ledger import Ledger
 from objslam.live.journal import messages
+from objslam.live.session import Session
 from objslam.results import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources import read
@@ -48,9 +50,6 @@ def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
     accepted = sum(1 for _ in messages(out, Ledger()))
     json.loads((out / "objects.json").read_text())  # whole, whenever it was killed
 
-    again = subprocess.run(command(log, out), capture_output=True, text=True, timeout=60)
-    assert again.returncode == 1
-    assert "--resume" in again.stderr
     done = subprocess.run(command(log, out, "--speed", "0", "--resume"), capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert sum(1 for _ in messages(out, Ledger())) >= accepted
@@ -77,6 +76,25 @@ def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
     assert "wrote" in out
     assert (tmp_path / "out" / "summary.json").exists()
     assert not (tmp_path / "out" / "journal.objslam").exists()
+
+
+def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    session = Session(load_settings(None, ()), out / "journal.objslam")
+    assert session.push_odometry(1.0, np.eye(4))
+    session.abort()
+    kept = (out / "journal.objslam").read_bytes()
+    done = subprocess.run(command(log, out, "--speed", "0"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "--resume" in done.stderr
+    assert (out / "journal.1.objslam").read_bytes() == kept
+    newest = (out / "journal.objslam").read_bytes()
+    assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
+    done = subprocess.run(command(out, out, "--speed", "0"), capture_output=True, text=True, timeout=60)  # its own journal
+    assert done.returncode == 0, done.stderr
+    assert (out / "journal.2.objslam").read_bytes() == newest
+    assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
 
 
 def test_nothing_to_go_on_with(log, tmp_path):
