@@ -10,6 +10,9 @@ _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)
 _RADII = (9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0)  # px, from the dot to the label's nearest edge
 _DOT = 6.0  # px, half the side of the square that a dot keeps free
 _PAD = 2.0
+_FAR = 14.0  # px
+_MISTAKEN = 2.0  # px; nearer to its own dot than to another by less than this, a label is read as the other's
+_STRANGE = 60.0  # px of way that a label takes to stand nearer to its own dot than to any other
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
@@ -17,7 +20,7 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
 
     Greedy, the most crowded dots first: each label takes the cheapest of a fan of places around its dot that stays in the
     frame (2, 2) (lower left, upper right corner) and covers no dot and no label set before; near is cheaper than far, and
-    off the points to avoid (P, 2) cheaper than on them.
+    off the points to avoid (P, 2) cheaper than on them; nearer to another's dot than to its own is dear.
     """
     corners, found = np.zeros((len(anchors), 2)), np.zeros(len(anchors), dtype=bool)
     if len(anchors) == 0:
@@ -41,7 +44,9 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
         outward = ((boxes[:, :2] + boxes[:, 2:]) / 2 - anchors[j]) @ _unit(anchors[j] - centre)
         others = np.delete(dots, j, axis=0)
         crossings = _cross(lines, leaders).sum(axis=1) + _hits(lines, taken).sum(axis=1) + _hits(lines, others).sum(axis=1)
-        cost = reach + 1.5 * np.minimum(covered, 20) + 60.0 * crossings - 0.05 * outward
+        own = np.linalg.norm(near - anchors[j], axis=1)
+        strange = own >= _nearest(boxes, np.delete(anchors, j, axis=0)) - _MISTAKEN
+        cost = reach + _STRANGE * strange + 1.5 * np.minimum(covered, 20) + 60.0 * crossings - 0.05 * outward
         best = int(np.argmin(np.where(free, cost, np.inf)))
         corners[j], found[j] = boxes[best, :2], True
         taken = np.concatenate([taken, boxes[best : best + 1]])
@@ -59,6 +64,20 @@ def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
         boxes.append(np.concatenate([centre - size / 2, centre + size / 2], axis=1))
         reach.append(radius + 2.0 * np.abs(direction[:, 1]) + 1.0 * (direction[:, 0] < -0.1))
     return np.concatenate(boxes), np.concatenate(reach)
+
+
+def needs_leader(anchors: Floats, corners: Floats, sizes: Floats) -> Bools:
+    """Which labels (N,) are so far from their dot, or so near to another's, that a line has to say whose they are."""
+    boxes = np.concatenate([corners, corners + sizes], axis=1)
+    own = np.linalg.norm(np.clip(anchors, corners, corners + sizes) - anchors, axis=1)
+    others = np.array([_nearest(boxes[j : j + 1], np.delete(anchors, j, axis=0))[0] for j in range(len(anchors))])
+    return (own > _FAR) | (own >= others.reshape(-1) - _MISTAKEN)
+
+
+def _nearest(boxes: Floats, points: Floats) -> Floats:
+    """How far each box (A, 4) is from the nearest of points (P, 2): (A,), infinite without any."""
+    near = np.clip(points[None], boxes[:, None, :2], boxes[:, None, 2:])
+    return np.linalg.norm(near - points[None], axis=2).min(axis=1, initial=np.inf)
 
 
 def _unit(v: Floats) -> Floats:

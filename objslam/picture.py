@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from objslam.label_layout import place_labels
+from objslam.label_layout import needs_leader, place_labels
 from objslam.scene import captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
 from objslam.types import Bools, Floats, Truth
 
@@ -86,8 +86,20 @@ def _frame(result: RunResult, points: Floats, crosses: Floats) -> tuple[Bools, F
     shown, low, high = frame_objects(np.concatenate([points, crosses]), path)
     room = 0.15 * (high - low).max()  # for the path before, which may have drifted anywhere
     before = np.clip(result.path.poses[:, :2, 3], low - room, high + room)
-    both = np.concatenate([before, [low, high]])
+    side = (high - low).max()  # for the ellipses: one of an object hardly placed must not squeeze the map
+    ellipses = np.clip(_ellipse_corners(result, points, shown[: len(points)]), low - side, high + side)
+    both = np.concatenate([before, ellipses, [low, high]])
     return shown[: len(points)], both.min(axis=0), both.max(axis=0)
+
+
+def _ellipse_corners(result: RunResult, points: Floats, shown: Bools) -> Floats:
+    """The lower left and upper right corners (2 E, 2) of the shown objects' 2-sigma ellipses."""
+    half = np.full_like(points, np.nan)
+    for j, o in enumerate(result.map.objects):
+        if o.status == "ok" and o.covariance is not None and shown[j]:
+            half[j] = 2 * np.sqrt(np.maximum(np.diag(o.covariance)[:2], 0.0))
+    drawn = np.isfinite(half).all(axis=1)
+    return np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
 
 
 def _size(extent: Floats) -> tuple[float, float]:
@@ -200,15 +212,18 @@ def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, sh
     edges = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
     corners, found = place_labels(anchors, sizes, edges, avoid)
     inverse = to_pixels.inverted()
-    for j, text, anchor, corner, size, has_room in zip(chosen, texts, anchors, corners, sizes, found, strict=True):
+    led = needs_leader(anchors, corners, sizes)
+    for j, text, anchor, corner, size, has_room, line in zip(
+        chosen, texts, anchors, corners, sizes, found, led, strict=True
+    ):
         if not has_room:
             text.remove()
             continue
         colour = colours[result.map.objects[j].label]
         text.set_position(inverse.transform(corner))
         text.set_color(colour)
-        near = np.clip(anchor, corner, corner + size)
-        if np.linalg.norm(near - anchor) > 14:
+        if line:
+            near = np.clip(anchor, corner, corner + size)
             ends = inverse.transform(np.stack([anchor, near]))
             axes.plot(*ends.T, "-", color=colour, linewidth=0.6, alpha=0.8, zorder=8)
     return int(shown.sum() - found.sum())

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from objslam.label_layout import place_labels
+from objslam.label_layout import needs_leader, place_labels
 
 FRAME = np.array([[100.0, 50.0], [1000.0, 900.0]])
 NO_POINTS = np.zeros((0, 2))
@@ -67,3 +67,26 @@ def test_what_finds_no_room_is_said() -> None:
     corners, found = place_labels(NO_POINTS, NO_POINTS, tight, NO_POINTS)
     assert corners.shape == (0, 2)
     assert found.shape == (0,)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12))
+def test_a_label_nearer_to_anothers_dot_has_a_line(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    anchors = rng.normal([500, 450], 25.0, size=(count, 2))
+    sizes = np.tile([70.0, 14.0], (count, 1))
+    corners, _ = place_labels(anchors, sizes, FRAME, NO_POINTS)
+    led = needs_leader(anchors, corners, sizes)
+    for j in range(count):
+        off = np.linalg.norm(np.clip(anchors, corners[j], corners[j] + sizes[j]) - anchors, axis=1)
+        assert led[j] or off[j] < np.delete(off, j).min()
+
+
+def test_two_close_dots_have_their_labels_on_their_own_sides() -> None:
+    anchors = np.array([[500.0, 400.0], [510.0, 418.0]])
+    sizes = np.tile([80.0, 14.0], (2, 1))
+    corners, found = place_labels(anchors, sizes, FRAME, NO_POINTS)
+    assert found.all()
+    for j in range(2):
+        off = np.linalg.norm(np.clip(anchors, corners[j], corners[j] + sizes[j]) - anchors, axis=1)
+        assert off[j] < off[1 - j]

@@ -73,6 +73,24 @@ def test_the_room(drawn: Any) -> None:
     assert ((y[0] < positions[:, 1]) & (positions[:, 1] < y[1])).all()
 
 
+@pytest.mark.parametrize(("sigma", "whole"), [(0.6, True), (500.0, False)])
+def test_an_ellipse_is_in_the_picture_as_long_as_it_leaves_room_for_the_map(drawn: Any, sigma: float, whole: bool) -> None:
+    positions, labels = clusters()
+    result, _ = synthetic_result(positions, labels, keyframes=50)
+    objects = list(result.map.objects)
+    for j, axis in ((0, 0), (int(positions[:, 1].argmax()), 1)):
+        covariance = 1e-4 * np.eye(3)
+        covariance[axis, axis] = sigma**2
+        objects[j] = dataclasses.replace(objects[j], covariance=covariance)
+    plain = drawn(result).axes[0]
+    before = [np.ptp(plain.get_xlim()), np.ptp(plain.get_ylim())]
+    axes = drawn(dataclasses.replace(result, map=dataclasses.replace(result.map, objects=tuple(objects)))).axes[0]
+    top = int(positions[:, 1].argmax())
+    end = objects[top].position[1] + 2 * sigma
+    assert (end < axes.get_ylim()[1]) == whole
+    assert max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())) < 3.2 * max(before)
+
+
 def test_labels_do_not_overlap_in_the_saved_picture(drawn: Any) -> None:
     rng = np.random.default_rng(3)
     positions = np.column_stack([rng.uniform(0.8, 2.2, 25), rng.uniform(1.6, 2.4, 25), np.full(25, 0.8)])
