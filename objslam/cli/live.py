@@ -34,6 +34,7 @@ from objslam.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from objslam.config import Settings
     from objslam.ledger import Ledger
     from objslam.live.adapters import Feed
     from objslam.live.interface import Snapshot
@@ -116,7 +117,7 @@ def live(
         if recording is None:
             feed = ADAPTERS[source](session, LiveOptions(settings, detector, options, domain, interface))
         else:
-            feed, truth = _replay(recording, session, speed or None)
+            feed, truth = _replay(recording, session, settings, speed or None)
         for close in feed.close:
             stack.callback(close)
         if publish:
@@ -155,12 +156,16 @@ def _look_for_journal(file: Path, resume: bool) -> None:
         say(f"warning: kept the journal of an earlier session as {aside} (--resume goes on with a journal)", stderr=True)
 
 
-def _replay(recording: tuple[Log, Ledger], session: Session, speed: float | None) -> tuple[Feed, Truth | None]:
+def _replay(
+    recording: tuple[Log, Ledger], session: Session, settings: Settings, speed: float | None
+) -> tuple[Feed, Truth | None]:
     from objslam.live.adapters import Feed
     from objslam.live.adapters.replay import ReplayAdapter
 
     log, ledger = recording
-    adapter = ReplayAdapter(session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger)
+    adapter = ReplayAdapter(
+        session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger, settings=settings
+    )
     return Feed(adapter), log.truth
 
 

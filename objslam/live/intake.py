@@ -155,6 +155,8 @@ class Intake:
         if use not in ("auto", path):
             return self._refuse(f"{path} that is not used (poses.use)")
         with self._lock:
+            if self._leads == "localization" and path == "odometry":
+                self._clock.newest = -math.inf  # the path begins where the odometry does, be that before the localization
             if self._leads is None or path == "odometry":
                 self._leads = path
             if path == self._leads:

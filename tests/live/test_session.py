@@ -5,15 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot import Recorder
 
 from objslam.config import Odometry, load_settings
 from objslam.errors import SolveError
 from objslam.geometry import inverse, lift_se2
 from objslam.graph.incremental import IncrementalGraph
+from objslam.keyframes import build_keyframes
+from objslam.ledger import Ledger
 from objslam.live.adapters.replay import ReplayAdapter, events
 from objslam.live.interface import Sink
 from objslam.live.session import Session
-from objslam.simulation import preset, simulate
+from objslam.rays import build_rays
+from objslam.simulation import PoseNoise, preset, simulate
+from objslam.sources import read
+from objslam.types import Trajectory
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
 
@@ -253,6 +259,43 @@ def test_the_same_messages_make_the_same_map_and_a_killed_session_goes_on(log, t
     for one, other in zip(again.objects, unbroken.objects, strict=True):
         np.testing.assert_allclose(one.position, other.position, atol=1e-6)
     session.abort()
+
+
+def test_a_recording_waits_for_its_rare_poses(log):
+    rare = Trajectory(log.odometry.stamps[::25], log.odometry.poses[::25])
+    slow = replace(log, odometry=rare)
+    newest, seen = -np.inf, 0
+    for at, frame, push in events(slow):
+        sink = Recorder()
+        push(sink)
+        newest = max([newest, *(stamp for stamp, *_ in sink.odometry)])
+        if frame and sink.detections[0][0] <= rare.stamps[-1]:
+            seen += 1
+            assert sink.detections[0][0] <= newest == at
+    assert seen > 100
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.3])
+def test_the_journal_gives_the_same_rays_as_the_log(tmp_path, ahead):
+    """The localisation is heard before the odometry of the same stamp, or is already further."""
+    log = make_log(localization=PoseNoise(xy=0.02, yaw=0.005))
+    first = log.localization
+    session = Session(SETTINGS, tmp_path / "journal.objslam").start()
+    session.push_camera(log.cameras[0].camera)
+    early = np.flatnonzero(first.stamps <= first.stamps[0] + ahead)
+    for i in early.tolist():
+        session.push_localization(float(first.stamps[i]), first.poses[i])
+    for _, _, push in events(log):
+        push(session)
+    session.abort()
+    kept = read(tmp_path, Ledger())
+    np.testing.assert_array_equal(kept.odometry.stamps, log.odometry.stamps)
+    one, other = (
+        build_rays(found, build_keyframes(found, SETTINGS, Ledger()), SETTINGS, Ledger())
+        for found in (replace(kept, localization=None), replace(log, localization=None))
+    )
+    np.testing.assert_array_equal(one.keyframe, other.keyframe)
+    np.testing.assert_array_equal(one.direction, other.direction)
 
 
 def test_replay_at_a_speed_and_stopped(log):

@@ -9,16 +9,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.ledger import Ledger
 from objslam.live.interface import Sink
-from objslam.types import Detections, Log, Trajectory
+from objslam.types import Detections, Floats, Log, Trajectory
 
 _BEHIND = 1.0  # s; a replay that fell behind by more is told
 
 
 @dataclass
 class ReplayAdapter:
-    """Pushes what a log holds in the order of its stamps, poses before the frames that they may be needed for.
+    """Pushes what a log holds in the order of `events`.
 
     speed: 2 is twice as fast as it was driven; None as fast as possible, then `wait` is called after each frame and returns
     once that is in the map. after: what has a smaller stamp is left out, when a session that took it before goes on.
@@ -29,6 +30,7 @@ class ReplayAdapter:
     speed: float | None = 1.0
     wait: Callable[[], object] | None = None
     after: Callable[[], float] = lambda: -np.inf
+    settings: Settings = field(default_factory=Settings)
     name: str = "replay"
     ledger: Ledger = field(default_factory=Ledger)
 
@@ -38,7 +40,7 @@ class ReplayAdapter:
             self.sink.push_camera(camera_log.camera)
         begin, first = time.perf_counter(), None
         late, after = 0.0, self.after()
-        for stamp, frame, push in events(self.log):
+        for stamp, frame, push in events(self.log, self.settings):
             if stop.is_set():
                 return
             if stamp < after:
@@ -59,8 +61,13 @@ class ReplayAdapter:
 Push = Callable[[Sink], bool]
 
 
-def events(log: Log) -> Iterator[tuple[float, bool, Push]]:
-    """The log as pushes in the order of their stamps: stamp, whether it is a frame, and the push."""
+def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
+    """The log as pushes in the order of their stamps: stamp, whether it is a frame, and the push.
+
+    A frame comes right after the first pose that is not before it, at that pose's stamp: a recording can wait for its poses,
+    however rare they are, and no frame has to (`live.max_lag`).
+    """
+    settings = settings or Settings()
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []
     for path, which in ((log.localization, "push_localization"), (log.odometry, "push_odometry")):
         if path is not None:
@@ -70,13 +77,23 @@ def events(log: Log) -> Iterator[tuple[float, bool, Push]]:
         if mount is not None:
             kinds.append((mount.stamps, 1, _mounts(mount, name)))
         if camera_log.detections is not None:
-            kinds.append((camera_log.detections.frame_stamps, 2, _frames(camera_log.detections, name)))
+            kinds.append((_covered(log, settings, camera_log.detections), 2, _frames(camera_log.detections, name)))
     stamps = np.concatenate([k[0] for k in kinds])
     rank = np.concatenate([np.full(len(k[0]), k[1]) for k in kinds])
     kind = np.concatenate([np.full(len(k[0]), i) for i, k in enumerate(kinds)])
     index = np.concatenate([np.arange(len(k[0])) for k in kinds])
     for at in np.lexsort((rank, stamps)).tolist():
         yield float(stamps[at]), bool(rank[at] == 2), kinds[kind[at]][2](int(index[at]))
+
+
+def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
+    """The stamps (F,) of the poses that the frames must wait for; their own where that is longer than a session bears."""
+    path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
+    own = detections.frame_stamps
+    if path is None:
+        return own
+    later = np.append(path.stamps, np.inf)[np.searchsorted(path.stamps, own)]
+    return np.asarray(np.where(later - own <= settings.live.max_late, later, own))
 
 
 def _poses(path: Trajectory, which: str) -> Callable[[int], Push]:
