@@ -27,6 +27,7 @@ from objslam.motions_file import Motions, dump_motions, motions_of, read_motions
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.ply_file import write_cloud, write_mesh
 from objslam.sources.detections_file import write_detections
+from objslam.sources.folder import resembles_log
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
 from objslam.trace import Round
 from objslam.types import (
@@ -58,6 +59,8 @@ _OWN = (
 )
 """Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
 _STAGING = ".objslam-staging"
+_SWAPPING = "swapping"
+"""In the staging folder from before the first old file goes: what a killed swap left beside it is no one's but ours."""
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
 """What network file systems answer that can neither lock nor sync a folder: there we go on without."""
 
@@ -95,10 +98,15 @@ class RunResult:
 
 
 def prepare_output(out: Path) -> None:
-    """Make the folder for a result and try it, before the long work; OutputError when no result could be written there."""
+    """Make the folder for a result and try it, before the long work.
+
+    OutputError when no result could be written there, or only in the place of files that no run wrote: those of a log, a
+    ground truth, or others that are called as ours are.
+    """
     with _disk(out):
         if out.exists() and not out.is_dir():
             raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
+        _check_foreign(out)
         out.mkdir(parents=True, exist_ok=True)
         for name in _OWN:
             if (out / name).is_dir() and not (out / name).is_symlink():
@@ -115,8 +123,12 @@ def output_folder(out: Path) -> Iterator[None]:
         yield
 
 
-def write_result(result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()) -> None:
+def write_result(
+    result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()
+) -> tuple[str, ...]:
     """Write the whole result into the folder `out`, in place of an older one; other files there stay.
+
+    Returns the names of the older one's files that went and have no successor, such as what was exported or reported of it.
 
     Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
     summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
@@ -130,7 +142,7 @@ def write_result(result: RunResult, out: Path, truth: Truth | None = None, *, de
             write(staging / name)
             _sync(staging / name)
         _sync(staging)
-        _swap(staging, out)
+        return _swap(staging, out)
 
 
 def write_file(file: Path, data: bytes) -> None:
@@ -301,8 +313,35 @@ def _own(folder: Path) -> tuple[str, ...]:
     return _OWN + tuple(sorted(file.name for file in folder.glob(f"*.{DETECTIONS}")))
 
 
-def _swap(staging: Path, out: Path) -> None:
+def _check_foreign(out: Path) -> None:
+    """OutputError where the folder holds files that a result would replace and that no run wrote."""
+    if resembles_log(out):
+        raise OutputError("this is a log, not a place for its result", where=str(out), hint="name another folder with -o")
+    names = [name for name in _own(out) if (out / name).is_file()]
+    if names and not _is_cut_short(out) and not _is_result(out, names):
+        raise OutputError(
+            f"in the way of a result, and not written by a run: {', '.join(names)}",
+            where=str(out),
+            hint="name another folder with -o, or move them",
+        )
+
+
+def _is_result(out: Path, names: list[str]) -> bool:
+    """Whether our files in the folder, by name, are of a result, or of a live session that has not ended."""
+    if out.resolve().name == GROUNDTRUTH:
+        return False
+    try:
+        load_map(out)
+        return names == [OBJECTS] or isinstance(json.loads((out / SUMMARY).read_bytes()), dict)
+    except (OutputError, OSError, ValueError):
+        return False
+
+
+def _swap(staging: Path, out: Path) -> tuple[str, ...]:
     """Put the staged files in the place of the old ones; the order is what keeps a killed run from a mix."""
+    removed = tuple(name for name in _own(out) if (out / name).exists() and not (staging / name).exists())
+    _write(staging / _SWAPPING, b"")
+    _sync(staging)
     for name in _own(out):
         (out / name).unlink(missing_ok=True)
         if name == SUMMARY:
@@ -314,6 +353,7 @@ def _swap(staging: Path, out: Path) -> None:
                 _sync(out)
             (staging / name).replace(out / name)
     _sync(out)
+    return removed
 
 
 def _write(file: Path, data: bytes) -> None:
@@ -342,11 +382,17 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
+def _is_cut_short(out: Path) -> bool:
+    """Whether a swap began in the folder and did not end: then it holds parts of a result."""
+    return (out / _STAGING / _SWAPPING).exists() and not (out / SUMMARY).exists()
+
+
 @contextmanager
 def _staged(out: Path) -> Iterator[Path]:
     """An empty staging folder in `out`, and `out` to ourselves as long as the process lives; gone afterwards.
 
-    OutputError when another run has it.
+    A swap that was cut short leaves it, as the sign of whose the rest is; here that rest goes too. OutputError when another
+    run has it.
     """
     staging = out / _STAGING
     handle = os.open(out, os.O_RDONLY)
@@ -359,12 +405,16 @@ def _staged(out: Path) -> Iterator[Path]:
             if error.errno not in _UNSUPPORTED:
                 raise
         if staging.exists():  # a killed run left it: the lock says that nobody is at it
+            if _is_cut_short(out):
+                for name in _own(out):
+                    (out / name).unlink(missing_ok=True)
             shutil.rmtree(staging)
         staging.mkdir()
         try:
             yield staging
         finally:
-            shutil.rmtree(staging, ignore_errors=True)
+            if not _is_cut_short(out):
+                shutil.rmtree(staging, ignore_errors=True)
     finally:
         os.close(handle)
 

@@ -8,6 +8,7 @@ import fcntl
 import json
 import math
 import os
+import re
 import resource
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from small_log import small_log
 from synthetic_result import clusters, synthetic_result
 
 from objslam import results
@@ -25,6 +27,8 @@ from objslam.config import Output, Settings, load_settings
 from objslam.errors import LogError, ObjslamError, OutputError
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.results import RunResult, load_map, load_trajectory, load_truth, prepare_output, write_file, write_result
+from objslam.simulation import make_camera
+from objslam.sources.folder import write_log_folder
 from objslam.sources.trajectory_file import write_trajectory
 from objslam.types import Association, MapObject, ObjectMap, Truth
 
@@ -372,7 +376,8 @@ def test_killed_at_any_moment_no_half_file_and_no_mix(tmp_path: Path) -> None:
         if "summary.json" in found:
             assert found in (was, will_be), f"an incomplete result claims to be whole after step {step}"
         seen.add("old" if found == was else "new" if found == will_be else "none")
-        write_result(new, out)  # what the kill left is no obstacle
+        prepare_output(out)  # what the kill left is no obstacle
+        write_result(new, out)
         assert {p.name for p in out.iterdir()} == PLAIN_FILES
         if code == 0:
             break
@@ -412,6 +417,45 @@ def test_places_where_no_result_can_go(tmp_path: Path) -> None:
     (tmp_path / "out" / "objects.json").mkdir(parents=True)
     with pytest.raises(OutputError, match="a folder stands where a file of the result goes"):
         prepare_output(tmp_path / "out")
+
+
+@pytest.mark.parametrize("inner", [".", "groundtruth", "cameras/left"])
+def test_a_result_does_not_go_into_a_log(tmp_path: Path, inner: str) -> None:
+    log = small_log(cameras=tuple(make_camera(name) for name in (("left", "right") if "left" in inner else ("left",))))
+    write_log_folder(dataclasses.replace(log, truth=Truth(log.truth.objects) if log.truth else None), tmp_path / "log")
+    out = tmp_path / "log" / inner
+    before = {p: p.read_bytes() for p in (tmp_path / "log").rglob("*") if p.is_file()}
+    assert any(p.name in ("detections.jsonl", "objects.json") for p in out.iterdir())
+    for write in (lambda: prepare_output(out), lambda: write_result(small(), out)):
+        with pytest.raises(OutputError, match=r"this is a log|not written by a run: objects\.json"):
+            write()
+    assert {p: p.read_bytes() for p in (tmp_path / "log").rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "summary.json", "objects.json", "front.detections.jsonl", "report.html"])
+def test_a_file_that_no_run_wrote_stays(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text('{"mine": true}')
+    (tmp_path / "notes.txt").write_text("mine")
+    for write in (lambda: prepare_output(tmp_path), lambda: write_result(small(), tmp_path)):
+        with pytest.raises(OutputError, match=f"not written by a run: {re.escape(name)}") as caught:
+            write()
+        assert "\n" not in str(caught.value)
+    assert contents(tmp_path) == {name: b'{"mine": true}', "notes.txt": b"mine"}
+
+
+def test_what_a_killed_run_left_beside_is_still_not_taken_for_a_result(tmp_path: Path) -> None:
+    assert in_child(killed_at(4, lambda: write_result(small(), tmp_path))) == 9
+    assert (tmp_path / ".objslam-staging").is_dir()
+    (tmp_path / "config.yaml").write_text("mode: joint")
+    with pytest.raises(OutputError, match=r"config\.yaml"):
+        prepare_output(tmp_path)
+
+
+def test_the_objects_of_a_live_session_may_be_replaced(tmp_path: Path) -> None:
+    (tmp_path / "objects.json").write_text(dump_objects(small().map))
+    prepare_output(tmp_path)
+    write_result(small(), tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == PLAIN_FILES
 
 
 def test_prepare_leaves_only_the_folder(tmp_path: Path) -> None:
