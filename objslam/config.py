@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -375,7 +376,22 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            message = f"there is no setting {key}"
+            message = f"there is no setting {key}{_meant(key)}"
         else:
             message = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, got {first['input']!r}"
         raise ConfigError(message, where=where, hint="`objslam config dump` shows every setting") from error
+
+
+def _meant(key: str) -> str:
+    """The setting that a mistyped key may stand for, as a question; nothing where none is like it."""
+    import difflib
+
+    def names(section: type[BaseModel], prefix: str) -> Iterator[str]:
+        for name, of in section.model_fields.items():
+            if isinstance(of.annotation, type) and issubclass(of.annotation, BaseModel):
+                yield from names(of.annotation, f"{prefix}{name}.")
+            else:
+                yield f"{prefix}{name}"
+
+    near = difflib.get_close_matches(key, list(names(Settings, "")), 1, 0.75)
+    return f" (did you mean {near[0]}?)" if near else ""

@@ -30,6 +30,8 @@ _TOGETHER = 0.03  # share of frames with both that a wrong box may account for
 _MANY, _SECOND = 5, 0.25  # rays, and share of a label's rays, that disagree with its one object if there is a second
 _FIRST = 2.0  # times that, before the first solve
 
+_USUAL = 0.12  # share of boxes that are false, or of moving things, in any log
+
 Progress = Callable[[str, int, int], None]
 """Called with the stage's name, what is done and the total (0 when it is not known)."""
 
@@ -87,7 +89,7 @@ def solve(
         estimate = batch.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
         if trace is not None:
             trace.end_round("fixed", association, estimate)
-        _count_unexplained(association, ledger)
+        _count_unexplained(rays_of_keyframes, association, ledger)
         return Solution(keyframes, rays_of_keyframes, association, estimate, (), tuple(trace.rounds if trace else ()))
     if not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation")
@@ -129,7 +131,7 @@ def _joint(
         by_label = associate_by_label(rays)
         solved = solve_round("labels", by_label)
         if _labels_tell(settings, by_label, solved.weight):
-            _count_unexplained(by_label, ledger)
+            _count_unexplained(rays, by_label, ledger)
             return Solution(keyframes, rays, by_label, solved, (), tuple(trace.rounds if trace else ()))
 
     map_T_camera = keyframes.map_T_camera
@@ -166,7 +168,7 @@ def _joint(
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
     assert estimate is not None
-    _count_unexplained(association, ledger)
+    _count_unexplained(rays, association, ledger)
     return Solution(keyframes, rays, association, estimate, tuple(rounds), tuple(trace.rounds if trace else ()))
 
 
@@ -263,9 +265,12 @@ def _labels_tell(settings: Settings, association: Association, weight: Floats) -
     return not ((rejected >= _MANY) & (rejected > _SECOND * number)).any()
 
 
-def _count_unexplained(association: Association, ledger: Ledger) -> None:
-    left = int((association.object < 0).sum())
-    if left:
-        ledger.warn(
-            f"{left} of {len(association.object)} boxes are explained by no object at rest (unexplained_share, by label)"
-        )
+def _count_unexplained(rays: Rays, association: Association, ledger: Ledger) -> None:
+    """Say how many boxes no object explains, where it is more than the usual false boxes, or all of them."""
+    left = association.object < 0
+    number = np.bincount(rays.label[left], minlength=len(rays.label_names))
+    if association.count and left.mean() <= _USUAL:
+        return
+    worst = ", ".join(f"{rays.label_names[i]} {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
+    why = "" if association.count else "; an object takes three boxes from three places at least"
+    ledger.warn(f"{left.sum()} of {len(left)} boxes are explained by no object at rest ({worst}){why}")

@@ -143,3 +143,10 @@ def test_errors_say_where_what_and_what_to_do():
     assert str(error) == "log.txt:3: no pose (check the stamps)"
     assert str(ObjslamError("no pose")) == "no pose"
     assert error.exit_code == 1
+
+
+def test_a_mistyped_setting_is_guessed():
+    with pytest.raises(ConfigError, match=r"rays\.pixel_sgima \(did you mean rays\.pixel_sigma\?\)"):
+        load_settings(None, ("rays.pixel_sgima=2",))
+    with pytest.raises(ConfigError, match=r"no setting nonsense \(`objslam"):
+        load_settings(None, ("nonsense=2",))

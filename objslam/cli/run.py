@@ -80,16 +80,24 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
         result = offline.run(log, settings, ledger, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
-        write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
+        removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
         writing = time.perf_counter() - begin
     report(ledger)
     counts, seconds = result.summary["counts"], {**result.summary["seconds"], "write": writing}
     console().print(objects_table(result.map))
+    resolved = counts["objects"] - counts["unresolved"]
     say(
-        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"in {counts['keyframes']} keyframes, {settings.mode} mode; "
+        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes, {settings.mode} mode; "
         + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
     )
+    say_written(out, removed)
+
+
+def say_written(out: Path, removed: tuple[str, ...]) -> None:
+    """Where the result is, and what of an older one there went without a successor."""
+    if removed:
+        say(f"removed from {out}, for it was of the older result: {', '.join(removed)}")
     say(f"wrote {out}")
 
 

@@ -165,5 +165,7 @@ def choose(path: Path, name: str | None = None) -> Source:
             return SOURCES[0]
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
+    if (path / "objects.json").is_file() and (path / "summary.json").is_file():
+        raise LogError("this is a result, not a log", where=str(path), hint="log_path in its summary.json names the log")
     looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)
     raise LogError("nothing here that objslam reads", where=str(path), hint=f"looked for {looked_for}")

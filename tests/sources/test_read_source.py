@@ -114,3 +114,10 @@ def test_a_format_that_does_not_fit(tmp_path):
         for path in (tmp_path, tmp_path / "file"):
             with pytest.raises(LogError):
                 read(path, Ledger(), SourceOptions(format=source.name, robot=1))
+
+
+def test_a_result_is_no_log(tmp_path):
+    for name in ("objects.json", "summary.json"):
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(LogError, match="this is a result, not a log"):
+        read(tmp_path, Ledger())
