@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,17 @@ from objslam.errors import ConfigError, LogError
 from objslam.geometry import align as align_points
 from objslam.geometry import interpolate
 from objslam.matching import IDENTITY, Alignment, Transform, align_objects, match
-from objslam.results import dump_json, write_file
+from objslam.results import (
+    EVALUATION,
+    GROUNDTRUTH,
+    OBJECTS,
+    TRAJECTORY,
+    dump_json,
+    load_map,
+    load_trajectory,
+    load_truth,
+    write_file,
+)
 from objslam.types import Floats, MapObject, ObjectMap, Trajectory, Truth, TruthObject
 
 MAX_TRUTH_GAP = 1.0
@@ -85,10 +95,13 @@ class Evaluation:
     align: Alignment
     radius: float
     warnings: tuple[str, ...] = ()
+    truth: str | None = None
+    """What it was compared with, where that is not the truth that the log brought: a path."""
 
     def to_dict(self) -> dict[str, Any]:
         """What evaluation.json holds: counts, m and s; null where there is no value."""
         return {
+            "truth": self.truth,
             "align": self.align,
             "radius": self.radius,
             **_object_dict(self.objects),
@@ -112,8 +125,7 @@ def evaluate(
     matches, the path by itself. radius: m, the farthest that a match may be off; only objects of one label are matched.
     LogError without any truth to compare with, ConfigError for a radius that is not positive.
     """
-    if not radius > 0:
-        raise ConfigError(f"the radius must be positive, got {radius}")
+    _check_radius(radius)
     pairs = None
     if trajectory is not None and truth is not None and truth.trajectory is not None:
         pairs = _path_pairs(trajectory, truth.trajectory)
@@ -130,9 +142,34 @@ def evaluate(
     return Evaluation(objects, path, align, radius, tuple(_warnings(objects, path, align)))
 
 
+def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
+    """Compare the result in the folder `out` with the truth in `truth` (as `load_truth` finds it), else with its log's.
+
+    Raises what `evaluate` and the readers do; LogError names where no truth was found.
+    """
+    _check_radius(radius)
+    map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
+    if known is None:
+        names = f"{GROUNDTRUTH}/{OBJECTS} or {GROUNDTRUTH}/{TRAJECTORY}"
+        if truth is None:
+            message, hint = "the log of this result brought no ground truth", "give --truth FILE"
+        else:
+            message, hint = f"no ground truth here: looked for {names}", "give an objects file or a folder that holds one"
+        raise LogError(message, where=str(truth or out), hint=hint)
+    if not known.objects and known.trajectory is None:
+        raise LogError("the ground truth is empty", where=str(truth or out), hint="give --truth FILE")
+    evaluation = evaluate(map_, known, path, align=align, radius=radius)
+    return evaluation if truth is None else replace(evaluation, truth=str(truth))
+
+
 def write_evaluation(evaluation: Evaluation, out: Path) -> None:
     """Write evaluation.json into the result folder `out`; OutputError when the disk refuses."""
-    write_file(out / "evaluation.json", dump_json(evaluation.to_dict()).encode())
+    write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())
+
+
+def _check_radius(radius: float) -> None:
+    if not radius > 0:
+        raise ConfigError(f"the radius must be positive, got {radius}")
 
 
 def _score_objects(

@@ -38,7 +38,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
     data = evaluation.to_dict()
     scores = Table(title=f"align {evaluation.align}, radius {evaluation.radius:g} m")
-    scores.add_column("against the ground truth")
+    scores.add_column("against the ground truth" if evaluation.truth is None else f"against {escape(evaluation.truth)}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
     for key, name, unit in rows:

@@ -587,12 +587,31 @@ def test_a_folder_that_may_not_be_written(objslam, log_folder, tmp_path):
         tmp_path.chmod(0o700)
 
 
+def test_a_log_is_never_taken_for_the_place_of_its_result(objslam, variant, monkeypatch):
+    before = {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()}
+    for out in (str(variant), "."):
+        monkeypatch.chdir(variant)
+        failed = objslam("run", variant, "-o", out, *LEAN)
+        assert failed.code == 1
+        failed.says("this is a log", "-o")
+        assert {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()} == before
+
+
+def test_what_went_with_the_older_result_is_told(objslam, variant, tmp_path):
+    out = tmp_path / "out"
+    assert "removed" not in objslam("run", variant, "-o", out, *LEAN).out
+    assert objslam("export", out, "--to", "csv").code == 0
+    assert objslam("eval", out).code == 0
+    told = objslam("run", variant, "-o", out, *LEAN).out
+    assert f"removed from {out}, for it was of the older result: evaluation.json, objects.csv" in told
+
+
 def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
     shutil.rmtree(variant / "groundtruth")
     assert objslam("run", variant, "-o", tmp_path / "out", *LEAN).code == 0
     failed = objslam("eval", tmp_path / "out")
     assert failed.code == 1
-    failed.says("no ground truth", "--truth")
+    failed.says(str(tmp_path / "out"), "no ground truth", "--truth")
     for truth in (tmp_path / "nowhere.json", variant):
         failed = objslam("eval", tmp_path / "out", "--truth", truth)
         assert failed.code == 1

@@ -14,12 +14,16 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
+from synthetic_result import clusters, synthetic_result
 
+from objslam.config import Output, Settings
 from objslam.errors import ConfigError, LogError
-from objslam.evaluation import Evaluation, evaluate, write_evaluation
+from objslam.evaluation import Evaluation, evaluate, evaluate_folder, write_evaluation
 from objslam.evaluation_table import evaluation_table
 from objslam.geometry import lift_se2
 from objslam.matching import match
+from objslam.objects_file import dump_truth_objects
+from objslam.results import write_result
 from objslam.types import Floats, MapObject, ObjectMap, Trajectory, Truth, TruthObject
 
 
@@ -324,3 +328,33 @@ def test_the_table_shows_scores_and_the_worst_object_first() -> None:
     alone = show(evaluate(found, dataclasses.replace(truth, trajectory=None)))
     assert "ATE" not in alone
     assert "matched" not in show(evaluate(found, Truth((), a_path()), a_path()))
+
+
+def test_what_was_compared_with_is_named(tmp_path: Path) -> None:
+    result, truth = synthetic_result(
+        *clusters(), keyframes=5, settings=Settings(output=Output(recording=False, picture=False))
+    )
+    out, other = tmp_path / "mine", tmp_path / "other"
+    write_result(result, out, truth)
+    write_result(result, other)
+    for path, kept, title in ((None, None, "against the ground truth"), (other / "objects.json",) * 3):
+        write_evaluation(evaluation := evaluate_folder(out, path), out)
+        assert json.loads((out / "evaluation.json").read_text())["truth"] == (kept and str(kept))
+        console = Console(width=500, record=True, quiet=False)
+        console.print(evaluation_table(evaluation))
+        assert str(title) in console.export_text()
+
+
+def test_where_no_truth_was_found_is_named(tmp_path: Path) -> None:
+    settings = Settings(output=Output(recording=False, picture=False))
+    write_result(synthetic_result(*clusters(), keyframes=5, settings=settings)[0], tmp_path / "out")
+    (tmp_path / "log").mkdir()
+    with pytest.raises(LogError, match=r"looked for groundtruth/objects\.json or groundtruth/trajectory\.txt") as caught:
+        evaluate_folder(tmp_path / "out", tmp_path / "log")
+    assert caught.value.where == str(tmp_path / "log")
+    with pytest.raises(LogError, match="brought no ground truth") as caught:
+        evaluate_folder(tmp_path / "out")
+    assert caught.value.where == str(tmp_path / "out")
+    (tmp_path / "empty.json").write_text(dump_truth_objects(()))
+    with pytest.raises(LogError, match=r"empty\.json: the ground truth is empty"):
+        evaluate_folder(tmp_path / "out", tmp_path / "empty.json")

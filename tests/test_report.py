@@ -19,7 +19,7 @@ from objslam import config, offline
 from objslam.cli import main
 from objslam.config import Settings
 from objslam.errors import OutputError
-from objslam.evaluation import evaluate, write_evaluation
+from objslam.evaluation import evaluate, evaluate_folder, write_evaluation
 from objslam.ledger import Ledger
 from objslam.rays_file import read_rays
 from objslam.report import write_report
@@ -147,6 +147,22 @@ def test_errors_come_from_the_evaluation_or_the_truth(tmp_path: Path, evaluated:
     errors = {str(m.object.id): f"{m.error:.3f}" for m in evaluation.objects.matches}
     assert {row[0]: row[10] for row in page.rows if row} == errors
     assert f"{evaluation.to_dict()['position_rmse']:.3f} m" in page.text["td"]
+
+
+def test_a_comparison_of_two_maps_is_not_called_the_truth(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=10, settings=QUICK)
+    write_result(result, tmp_path / "mine", truth)
+    write_result(result, tmp_path / EVIL[0].replace("/", "") / "other")
+    other = tmp_path / EVIL[0].replace("/", "") / "other" / "objects.json"
+    told = {}
+    for given in (None, other):
+        write_evaluation(evaluate_folder(tmp_path / "mine", given), tmp_path / "mine")
+        told[given] = Page(write_report(tmp_path / "mine"))
+    assert "Against the ground truth, as the two stand" in told[None].all_text
+    assert "ground truth" not in told[other].all_text
+    assert f"Against {other}, as the two stand" in told[other].all_text
+    assert "objects' RMSE, against other/objects.json" in told[other].text["span"]
+    assert len(told[other].of("script")) == 1
 
 
 def test_without_a_truth_there_is_no_error(tmp_path: Path) -> None:

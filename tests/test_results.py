@@ -312,7 +312,8 @@ def test_an_older_result_goes_as_a_whole_and_foreign_files_stay(tmp_path: Path) 
     assert {p.name for p in tmp_path.iterdir()} == PLAIN_FILES | {"map.png", "recording.rrd"}
     (tmp_path / "evaluation.json").write_text("{}")
     (tmp_path / "notes.txt").write_text("mine")
-    write_result(small(seed=1), tmp_path)
+    removed = write_result(small(seed=1), tmp_path)
+    assert set(removed) == {"map.png", "recording.rrd", "evaluation.json"}
     assert {p.name for p in tmp_path.iterdir()} == PLAIN_FILES | {"notes.txt"}
     assert (tmp_path / "notes.txt").read_text() == "mine"
 

@@ -29,10 +29,9 @@ def evaluate_result(
 
 def evaluate_folder(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
     """Evaluate a result folder, write evaluation.json into it and print the table."""
-    from objslam.evaluation import evaluate, write_evaluation
+    from objslam import evaluation
     from objslam.evaluation_table import evaluation_table
-    from objslam.results import load_map, load_trajectory, load_truth
 
-    evaluation = evaluate(load_map(out), load_truth(truth or out), load_trajectory(out), align=align, radius=radius)
-    write_evaluation(evaluation, out)
-    console().print(evaluation_table(evaluation))
+    found = evaluation.evaluate_folder(out, truth, align=align, radius=radius)
+    evaluation.write_evaluation(found, out)
+    console().print(evaluation_table(found))

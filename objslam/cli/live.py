@@ -207,7 +207,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
 
 
 def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> None:
-    from objslam.cli.run import objects_table
+    from objslam.cli.run import objects_table, say_written
     from objslam.results import write_result
 
     session.counters.ledger.add(feed.adapter.ledger)
@@ -215,7 +215,7 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
     last = session.snapshot()
     for view in feed.views:
         view(last)
-    write_result(result, out, truth)
+    removed = write_result(result, out, truth)
     ledger = session.counters.ledger
     report(ledger)
     console().print(objects_table(result.map))
@@ -225,7 +225,7 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
         f"in {counts['keyframes']} keyframes; update p50 {1e3 * last.update[0]:.1f} ms, p99 {1e3 * last.update[1]:.1f} ms, "
         f"{last.rebuilds} rebuilds"
     )
-    say(f"wrote {out}")
+    say_written(out, removed)
 
 
 @contextmanager
