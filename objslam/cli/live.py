@@ -222,10 +222,15 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
     counts = result.summary["counts"]
     say(
         f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"in {counts['keyframes']} keyframes; update p50 {1e3 * last.update[0]:.1f} ms, p99 {1e3 * last.update[1]:.1f} ms, "
-        f"{last.rebuilds} rebuilds"
+        f"in {counts['keyframes']} keyframes; {_times(last, ', ')}{last.rebuilds} rebuilds"
     )
     say_written(out, removed)
+
+
+def _times(snapshot: Snapshot, then: str) -> str:
+    """How long updates took, and what stands between that and the rest; nothing where none was measured."""
+    median, most = snapshot.update
+    return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""
 
 
 @contextmanager
@@ -285,6 +290,6 @@ class _Rates:
         resolved = len(snapshot.map.resolved())
         return (
             f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
-            f"{snapshot.keyframes} keyframes | {resolved} objects, {len(snapshot.map) - resolved} unresolved | "
-            f"update p50 {1e3 * snapshot.update[0]:.1f} p99 {1e3 * snapshot.update[1]:.1f} ms"
+            f"{snapshot.keyframes} keyframes | {_times(snapshot, ' | ')}"
+            f"{resolved} objects, {len(snapshot.map) - resolved} unresolved"
         )

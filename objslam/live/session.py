@@ -28,6 +28,8 @@ _IDLE = 0.05  # s; how often the worker looks up where nothing comes, and how lo
 _SHORT = 0.015  # s; a frame that took longer had better not be followed by a snapshot,
 _LONG = 0.5  # s; unless that has been waited for for so long
 _PATIENCE = 5.0  # s; how long a snapshot is waited for
+_TOO_SLOW = "frames that waited too long (live.max_lag)"
+_RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or it is too short"
 
 
 class Session:
@@ -76,7 +78,7 @@ class Session:
         for message in past:
             self._intake.recall(message)
             self._mapper.feed(message, time.perf_counter())
-            self._work_off(limit=False)
+            self._work_off()
         self._thread.start()
         return self
 
@@ -192,7 +194,7 @@ class Session:
             if isinstance(message, FrameMessage):
                 del self._queue[i]
                 self._frames -= 1
-                self._mapper.leave_out(message, "frames that waited too long (live.max_lag)")
+                self._mapper.leave_out(message, _TOO_SLOW)
                 return
 
     def _work(self) -> None:
@@ -234,19 +236,23 @@ class Session:
     def _take(self, message: Message, arrival: float) -> bool:
         """Feed a message; whether it was a frame's turn."""
         self._mapper.feed(message, arrival)
-        return self._work_off(limit=True)
+        return self._work_off(arrival)
 
-    def _work_off(self, limit: bool) -> bool:
-        """Work in the frames that are ready; whether there was one."""
+    def _work_off(self, newest: float | None = None) -> bool:
+        """Work in the frames that are ready; whether there was one.
+
+        newest: when the message arrived that made them ready; without it they are not measured, and none is too old.
+        """
         worked = False
         while (found := self._mapper.ready()) is not None:
             worked, (frame, arrival) = True, found
-            if limit and not self._patient and time.perf_counter() - arrival > self._settings.live.max_lag:
-                self._mapper.leave_out(frame, "frames that waited too long (live.max_lag)")
+            limit = self._settings.live.max_lag
+            if newest is not None and not self._patient and time.perf_counter() - arrival > limit:
+                self._mapper.leave_out(frame, _RARE_POSES if newest - arrival > limit else _TOO_SLOW)
                 continue
             if self._mapper.take(frame):
                 self._lag = time.perf_counter() - arrival
-                if limit:
+                if newest is not None:
                     self.counters.updated(self._lag)
                 self._mapper.look_after()
         if worked:

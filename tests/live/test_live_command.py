@@ -89,6 +89,10 @@ def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path)
     assert done.returncode == 0, done.stderr
     assert "--resume" in done.stderr
     assert (out / "journal.1.objslam").read_bytes() == kept
+    assert "update p50" in done.stdout
+    done = subprocess.run(command(log, out, "--speed", "0", "--resume"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "update p50" not in done.stdout  # all was in the journal: nothing was measured
     newest = (out / "journal.objslam").read_bytes()
     assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
     done = subprocess.run(command(out, out, "--speed", "0"), capture_output=True, text=True, timeout=60)  # its own journal

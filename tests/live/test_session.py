@@ -1,6 +1,7 @@
 """A session against the truth of simulated drives, and against what robots do to it."""
 
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -259,6 +260,23 @@ def test_the_same_messages_make_the_same_map_and_a_killed_session_goes_on(log, t
     for one, other in zip(again.objects, unbroken.objects, strict=True):
         np.testing.assert_allclose(one.position, other.position, atol=1e-6)
     session.abort()
+
+
+def test_poses_that_are_rarer_than_frames_may_wait_are_named_as_the_cause(log):
+    session = Session(load_settings(None, ("mode=joint", "live.max_lag=0.05"))).start()
+    camera = log.cameras[0].camera
+    session.push_camera(camera)
+    for stamp in (0.0, 1.0):
+        assert session.push_odometry(stamp, np.eye(4))
+        assert session.push_detections(stamp + 0.5, camera.name, [[10, 10, 90, 90]], ["cup"], [1.0])
+        time.sleep(0.1)
+    assert session.push_odometry(2.0, np.eye(4))
+    assert session.wait(30)
+    session.abort()
+    dropped = {reason: count for reason, count in session.counters.dropped().items() if reason.startswith("frames")}
+    assert list(dropped.values()) == [2]
+    assert "poses are too rare" in next(iter(dropped))
+    assert "live.max_lag" in next(iter(dropped))
 
 
 def test_a_recording_waits_for_its_rare_poses(log):
