@@ -55,6 +55,7 @@ class Camera:
     """A calibrated camera (ROS camera_info keys) and its place on the robot.
 
     matrix: (3, 3) px. distortion: (D,). base_T_camera: (4, 4), the optical frame in base. depth_scale: units per metre.
+    sees_size: whether its boxes are as large as what they hold, and not drawn around bearings, which have no size.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Camera:
     distortion: Floats = field(default_factory=lambda: np.zeros(5))
     base_T_camera: Floats = field(default_factory=lambda: np.eye(4))
     depth_scale: float = 1000.0
+    sees_size: bool = True
 
     @property
     def focal(self) -> float:

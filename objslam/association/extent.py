@@ -18,12 +18,14 @@ def extents(
 ) -> Floats:
     """Width and height (N, 2), m, of the objects at positions (N, 3): the median over their rays.
 
-    NaN where there is no ray or no position. map_T_camera: (K, 4, 4) of the keyframes.
+    NaN where there is no ray, no position, or half of the rays are of a camera that sees no sizes.
+    map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)
     index = association.object[held]
     distance = np.linalg.norm(positions[index] - map_T_camera[rays.keyframe[held], :3, 3], axis=1)
     size = size_per_metre(rays.take(held), keyframes, cameras) * distance[:, None]
+    size[~np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[held]]]] = np.nan
     return np.stack([grouped_median(column, index, association.count) for column in size.T], axis=1)
 
 

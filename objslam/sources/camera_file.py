@@ -85,9 +85,11 @@ def _read(
         depth_scale = _number(path, top["depth_scale"], "depth_scale")
         if depth_scale <= 0:
             raise _error(path, top["depth_scale"], "depth_scale must be above zero", "units per metre, such as 1000 for mm")
+    sees_size = "sees_size" not in top or _flag(path, top["sees_size"], "sees_size")
     if name is None:
         name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
-    return Calibration(Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale), placed)
+    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size)
+    return Calibration(camera, placed)
 
 
 def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
@@ -109,6 +111,8 @@ def write_camera(camera: Camera, path: Path) -> None:
         "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
         "depth_scale": float(camera.depth_scale),
     }
+    if not camera.sees_size:
+        data["sees_size"] = False
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
     path.write_text(text, encoding="utf-8")
 
@@ -161,6 +165,13 @@ def _text(path: Path, node: yaml.Node, what: str) -> str:
     if not isinstance(node, yaml.ScalarNode):
         raise _error(path, node, f"{what} must be one value")
     return str(node.value)
+
+
+def _flag(path: Path, node: yaml.Node, what: str) -> bool:
+    text = _text(path, node, what)
+    if text not in ("true", "false"):
+        raise _error(path, node, f"{what} must be true or false, not {text[:40]!r}")
+    return text == "true"
 
 
 def _number(path: Path, node: yaml.Node, what: str) -> float:

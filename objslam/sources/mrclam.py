@@ -53,7 +53,7 @@ def read_mrclam(folder: Path, robot: int | None, *, with_range: bool = True, ano
             what = "no robot is chosen" if robot is None else f"there is no robot {robot}"
             raise LogError(f"{what}, the folder has: {there}", where=str(folder), hint="--robot chooses one of them")
         prefix = f"Robot{robot}"
-        camera = Camera("camera", _WIDTH, _HEIGHT, _matrix(), base_T_camera=_FORWARD)
+        camera = Camera("camera", _WIDTH, _HEIGHT, _matrix(), base_T_camera=_FORWARD, sees_size=False)
         return Log(
             name=f"{folder.resolve().name}_robot{robot}",
             cameras=(CameraLog(camera, _read_measurements(folder, prefix, with_range, anonymous, ledger)),),

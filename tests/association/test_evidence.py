@@ -217,6 +217,8 @@ def test_extents_are_those_of_the_things():
     torn[some, 2:] += rng.uniform(50, 300, (int(some.sum()), 2))
     again = extents(replace(scene.rays, box=torn), association, positions, poses, scene.keyframes, scene.cameras)
     np.testing.assert_allclose(again, true, rtol=0.02)
+    blind = tuple(replace(camera, sees_size=False) for camera in scene.cameras)
+    assert np.isnan(extents(scene.rays, association, positions, poses, scene.keyframes, blind)).all()
     nobody = Association(np.full(len(scene.rays), -1), np.zeros(1, dtype=np.int64))
     assert np.isnan(extents(scene.rays, nobody, np.zeros((1, 3)), poses, scene.keyframes, scene.cameras)).all()
 

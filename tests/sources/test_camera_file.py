@@ -100,6 +100,16 @@ def test_distortion_models(tmp_path, model, coefficients, expected):
     assert (camera.distortion_model, camera.distortion.tolist()) == expected
 
 
+def test_a_camera_that_sees_no_sizes_is_kept(tmp_path):
+    camera, _, file = _read(tmp_path, _TEXT + "sees_size: false\n")
+    assert not camera.sees_size
+    write_camera(camera, file)
+    assert not read_camera(file, Ledger()).sees_size
+    assert _read(tmp_path, _TEXT)[0].sees_size
+    with pytest.raises(LogError, match=r"camera.yaml:15: sees_size must be true or false, not 'maybe'"):
+        _read(tmp_path, _TEXT + "sees_size: maybe\n")
+
+
 def test_optional_keys(tmp_path):
     lines = [line for i, line in enumerate(_TEXT.splitlines()) if i not in (2, 9, 10, 11, 12)]
     camera, _, _ = _read(tmp_path, "\n".join(lines), place_needed=False, depth_scale=7.0)

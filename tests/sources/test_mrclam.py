@@ -79,6 +79,7 @@ def test_a_robot_is_read(dataset):
     np.testing.assert_allclose(log.odometry.poses[0], np.eye(4))
 
     (camera_log,) = log.cameras
+    assert not camera_log.camera.sees_size  # bearings: the boxes are made up
     detections, camera = camera_log.detections, camera_log.camera
     assert detections.frame_stamps.tolist() == [100.1, 100.6, 101.0, 101.5, 101.6]
     assert [detections.label_names[i] for i in detections.label] == [
