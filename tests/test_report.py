@@ -145,7 +145,7 @@ def test_errors_come_from_the_evaluation_or_the_truth(tmp_path: Path, evaluated:
     page = Page(write_report(tmp_path))
     assert evaluation.objects is not None
     errors = {str(m.object.id): f"{m.error:.3f}" for m in evaluation.objects.matches}
-    assert {row[0]: row[10] for row in page.rows if row} == errors
+    assert {row[0]: row[9] for row in page.rows if row} == errors
     assert f"{evaluation.to_dict()['position_rmse']:.3f} m" in page.text["td"]
 
 
@@ -160,16 +160,41 @@ def test_a_comparison_of_two_maps_is_not_called_the_truth(tmp_path: Path) -> Non
         told[given] = Page(write_report(tmp_path / "mine"))
     assert "Against the ground truth, as the two stand" in told[None].all_text
     assert "ground truth" not in told[other].all_text
+    assert "truth id" not in told[other].all_text
     assert f"Against {other}, as the two stand" in told[other].all_text
     assert "objects' RMSE, against other/objects.json" in told[other].text["span"]
     assert len(told[other].of("script")) == 1
+
+
+def test_an_error_names_the_id_of_its_truth(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=40, settings=QUICK)
+    write_result(result, tmp_path, truth)
+    page = Page(write_report(tmp_path))
+    assert "(truth id 3)" in page.all_text
+
+
+def test_labels_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    positions, labels = clusters()
+    result, _ = synthetic_result(positions, labels[::-1], keyframes=20, settings=QUICK)
+    write_result(result, tmp_path)
+    page = Page(write_report(tmp_path))
+    assert [row[1] for row in page.rows if row] == [f"landmark_{i}" for i in range(6, 21)]
+
+
+def test_existence_has_a_column_where_it_was_judged(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    objects = tuple(dataclasses.replace(o, existence=0.75 if o.id == 1 else None) for o in result.map.objects)
+    write_result(dataclasses.replace(result, map=ObjectMap(objects)), tmp_path)
+    page = Page(write_report(tmp_path))
+    rows = [row for row in page.rows if row]
+    assert [row[9] for row in rows] == ["0.750"] + [""] * 14
 
 
 def test_without_a_truth_there_is_no_error(tmp_path: Path) -> None:
     result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
     write_result(result, tmp_path)
     page = Page(write_report(tmp_path))
-    assert len(next(row for row in page.rows if row)) == 11
+    assert len(next(row for row in page.rows if row)) == 10
     assert "Evaluation" not in page.text["h2"]
 
 
@@ -192,6 +217,13 @@ def test_the_histogram_counts_every_ray() -> None:
     assert round(used / unit) == (known & (weight > 0)).sum()
     assert round(rejected / unit) == (known & (weight == 0)).sum()
     assert max(bar.used + bar.rejected for bar in chart.bars) == pytest.approx(HEIGHT)
+    assert chart.counts[0] == (0.0, "0")
+    for height, text in chart.counts:
+        assert height == pytest.approx(int(text) * unit)
+    assert 2 <= int(chart.highest / int(chart.counts[1][1])) <= 5
+    few = histogram(np.array([0.1]), np.ones(1), 5)
+    assert few is not None
+    assert [text for _, text in few.counts] == ["0", "1"]
     assert chart.beyond == (residual[known] > 2.0).sum()
     assert histogram(np.array([np.nan]), np.ones(1), 5) is None
     assert [axis_end(np.full(9, x)) for x in (0.013, 0.1, 0.3, 2.0, 7.0)] == pytest.approx([0.02, 0.1, 0.5, 2.0, 10.0])

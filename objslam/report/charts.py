@@ -27,10 +27,14 @@ class Bar:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Bars, ticks below them (place, text), the rays in the highest bar, and those beyond the axis (in the last bar)."""
+    """Bars, ticks below them and beside them (place, text), the rays in the highest bar, and those beyond the axis.
+
+    The last bar takes those beyond the axis too.
+    """
 
     bars: tuple[Bar, ...]
     ticks: tuple[tuple[float, str], ...]
+    counts: tuple[tuple[float, str], ...]
     highest: int
     beyond: int
 
@@ -57,7 +61,14 @@ def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = N
         scale = HEIGHT / total.max()
         bars.append(Bar(i * step, step, of * scale, out * scale, text))
     ticks = tuple((WIDTH * share, f"{edge * share:.3g}") for share in (0.0, 0.5, 1.0))
-    return Histogram(tuple(bars), ticks, int(total.max()), int((residual > edge).sum()))
+    return Histogram(tuple(bars), ticks, _counts(int(total.max())), int(total.max()), int((residual > edge).sum()))
+
+
+def _counts(highest: int) -> tuple[tuple[float, str], ...]:
+    """Two to five round numbers of rays from 0 to the highest bar, and how high they are."""
+    power = 10.0 ** np.floor(np.log10(highest))
+    step = max(1, next(int(power * s) for s in (5.0, 2.0, 1.0, 0.5, 0.2) if highest >= 2 * power * s))
+    return tuple((HEIGHT * n / highest, f"{n}") for n in range(0, highest + 1, step))
 
 
 def axis_end(residual: Floats) -> float:

@@ -9,7 +9,7 @@ for (const head of document.querySelectorAll("table.sortable th")) {
     const rows = [...body.rows].sort((a, b) => {
       const x = value(a), y = value(b);
       if (x === "" || y === "") return (x === "") - (y === "");
-      const order = numeric ? Number(x) - Number(y) : x.localeCompare(y);
+      const order = numeric ? Number(x) - Number(y) : x.localeCompare(y, undefined, {numeric: true});
       return down ? -order : order;
     });
     for (const other of table.tHead.rows[0].cells) other.removeAttribute("aria-sort");

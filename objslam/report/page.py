@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -107,6 +108,7 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
         )
         for o, caption in zip(objects.objects, captions(objects), strict=True)
     ]
+    cards.sort(key=lambda card: (_natural(card.object.label), card.object.id))
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.report", ""),
         autoescape=True,
@@ -128,6 +130,7 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
         picture=picture.read_bytes() if picture.is_file() else None,
         cards=cards,
         with_errors=any(card.error is not None for card in cards),
+        with_existence=any(card.object.existence is not None for card in cards),
         histogram=histogram(rays.residual, rays.weight, _BINS),
         scores=scores,
         no_images=no_images,
@@ -187,7 +190,8 @@ def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, s
         evaluation: Evaluation = evaluate(objects, truth, load_trajectory(out), align=align)  # type: ignore[arg-type]
         scores = evaluation.to_dict()
     matched = scores.get("objects", [])
-    return {o["id"]: (float(o["error"]), f"{o['label']} {o['truth_id']}") for o in matched}, scores
+    whose = "to id {} there" if scores.get("truth") else "truth id {}"
+    return {o["id"]: (float(o["error"]), whose.format(o["truth_id"])) for o in matched}, scores
 
 
 def _json(file: Path) -> dict[str, Any]:
@@ -231,6 +235,12 @@ def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
     for key, value in data.items():
         flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
     return flat
+
+
+def _natural(text: str) -> tuple[str, int]:
+    """What to sort a text by, so that landmark_9 comes before landmark_10."""
+    head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    return head, int(number or -1)
 
 
 def _date(stamp: float) -> str:
