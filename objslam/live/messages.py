@@ -85,7 +85,7 @@ def encode(message: Message) -> bytes:
     if isinstance(message, CameraMessage):
         c = message.camera
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
-        return _CAMERA_KIND + json.dumps([*data, c.base_T_camera.ravel().tolist(), c.depth_scale]).encode()
+        return _CAMERA_KIND + json.dumps([*data, c.base_T_camera.ravel().tolist(), c.depth_scale, c.sees_size]).encode()
     known = np.where(np.isfinite(message.depths), message.depths, -1.0)
     columns = (message.boxes, list(message.labels), message.scores, known, message.track_ids)
     lists = [c if isinstance(c, list) else c.tolist() for c in columns]
@@ -109,9 +109,10 @@ def decode(data: bytes) -> Message:
             clock, odometry = json.loads(data[1:])
             return NoteMessage(float(clock), _array(odometry, (4, 4)))
         if kind == _CAMERA_KIND:
-            name, width, height, matrix, model, distortion, base_T_camera, scale = json.loads(data[1:])
+            name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
             lens = (_array(matrix, (3, 3)), model, _array(distortion, (-1,)))
-            return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale))
+            sees_size = bool(more[0]) if more else True  # older journals do not say
+            return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale, sees_size))
         if kind == _FRAME_KIND:
             stamp, camera, boxes, labels, scores, depths, tracks = json.loads(data[1:])
             known = _array(depths, (len(labels),))

@@ -1,5 +1,7 @@
 """Journals: what goes in comes out, and damage costs no more than what it hit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,6 +44,7 @@ MESSAGES = st.one_of(
     st.builds(MountMessage, FINITE, st.text(max_size=9), POSES),
     st.builds(NoteMessage, FINITE, POSES),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
+    st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
     frames(),
 )
 
