@@ -34,7 +34,7 @@ class Motions:
 
 
 def motions_of(result: RunResult) -> Motions | None:
-    """The odometry between the poses of trajectory.txt, None where the log has none."""
+    """The odometry between the poses of trajectory.txt, None where the run used none, as in fixed mode."""
     from objslam.graph.factors import motions
 
     keyframes = result.keyframes

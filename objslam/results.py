@@ -146,9 +146,9 @@ def write_result(
 
 
 def write_file(file: Path, data: bytes) -> None:
-    """Write one file under a temporary name and rename it; OutputError when the disk refuses."""
+    """Write one file under a temporary name and rename it; OutputError, with the file's own name, when the disk refuses."""
     temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    with _disk(file):
+    with _disk(file, only=True):
         try:
             _write(temporary, data)
             temporary.replace(file)
@@ -420,10 +420,10 @@ def _staged(out: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _disk(path: Path) -> Iterator[None]:
-    """What the disk refuses, as an OutputError of one line."""
+def _disk(path: Path, *, only: bool = False) -> Iterator[None]:
+    """What the disk refuses, as an OutputError of one line; it names the file in question, or (only) always the path."""
     try:
         yield
     except OSError as error:
-        where = str(error.filename) if error.filename is not None else str(path)
+        where = str(path if only or error.filename is None else error.filename)
         raise OutputError(f"cannot write or read: {error.strerror or error}", where=where) from error

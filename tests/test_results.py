@@ -506,8 +506,9 @@ def test_write_file_replaces_at_once(tmp_path: Path) -> None:
         if code == 0:
             break
     assert file.read_bytes() == b"new"
-    with pytest.raises(OutputError, match="No such file"):
+    with pytest.raises(OutputError, match="No such file") as caught:
         write_file(tmp_path / "none" / "x.json", b"")
+    assert caught.value.where == str(tmp_path / "none" / "x.json")  # not the temporary name
 
 
 def test_loading_what_is_not_there(tmp_path: Path) -> None:

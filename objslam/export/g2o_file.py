@@ -16,12 +16,16 @@ def dump(content: Content) -> bytes:
     """Vertices are map_T_base of trajectory.txt, edges what the odometry measured; the first pose is fixed.
 
     Information matrices are those of x, y, z (m) and the rotation about x, y, z (rad), in the frame of the edge's second
-    pose, as GTSAM reads them. OutputError where the run had no odometry, or its poses and motions do not fit together.
+    pose, as GTSAM reads them. OutputError where the run used no odometry, as in fixed mode, or its poses and motions do not
+    fit together.
     """
     motions, path = content.motions, content.path
     if motions is None:
-        hint = "a run with poses.use=localization leaves it out"
-        raise OutputError("the run had no odometry, so there are no edges", where=str(content.out), hint=hint)
+        raise OutputError(
+            "no edges: motions.parquet is missing, which only a joint run with odometry writes",
+            where=str(content.out),
+            hint="--mode joint, and a log with odometry that poses.use does not leave out",
+        )
     if not (np.array_equal(motions.before, path.stamps[:-1]) and np.array_equal(motions.after, path.stamps[1:])):
         raise OutputError("trajectory.txt and motions.parquet are not of one run", where=str(content.out))
     information = np.linalg.inv(motions.covariance)[:, *_UPPER]

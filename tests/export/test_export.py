@@ -11,14 +11,17 @@ import jsonschema
 import numpy as np
 import open3d as o3d
 import pytest
+from small_log import small_log
 
+from objslam import offline
 from objslam.cli import main
-from objslam.config import Settings
+from objslam.config import Output, Settings
 from objslam.errors import ConfigError, OutputError
 from objslam.export import FORMATS, export
 from objslam.export.datum import Datum
 from objslam.graph.factors import motions
-from objslam.results import EXPORTS, load_map, load_trajectory
+from objslam.ledger import Ledger
+from objslam.results import EXPORTS, load_map, load_trajectory, write_result
 
 SCHEMA = json.loads((Path(__file__).parent / "rfc7946.json").read_text())
 
@@ -134,7 +137,7 @@ def test_g2o_needs_odometry_of_the_same_run(result, tmp_path):
     with pytest.raises(OutputError, match=r"motions\.parquet: not what a run writes"):
         export(copy, "g2o")
     (copy / "motions.parquet").unlink()
-    with pytest.raises(OutputError, match="no odometry"):
+    with pytest.raises(OutputError, match="only a joint run with odometry writes"):
         export(copy, "g2o")
     shutil.copy(result / "motions.parquet", copy)
     lines = (copy / "trajectory.txt").read_text().splitlines()
@@ -143,9 +146,20 @@ def test_g2o_needs_odometry_of_the_same_run(result, tmp_path):
         export(copy, "g2o")
 
 
-def test_a_file_goes_into_the_result_and_leaves_with_it(mapped, result, tmp_path):
-    from objslam.results import write_result
+def test_a_fixed_run_says_why_it_has_no_edges(tmp_path):
+    poses = Settings().poses.model_copy(update={"use": "odometry"})
+    plain = Output(recording=False, picture=False)
+    log = small_log(frames=30)
+    for mode, edges in (("fixed", False), ("joint", True)):
+        settings = Settings(mode=mode, poses=poses, output=plain)
+        write_result(offline.run(log, settings, Ledger()), tmp_path / mode)
+        assert (tmp_path / mode / "motions.parquet").exists() == edges
+    assert export(tmp_path / "joint", "g2o").exists()
+    with pytest.raises(OutputError, match="only a joint run with odometry writes"):
+        export(tmp_path / "fixed", "g2o")
 
+
+def test_a_file_goes_into_the_result_and_leaves_with_it(mapped, result, tmp_path):
     copy = Path(shutil.copytree(result, tmp_path / "out"))
     written = [export(copy, to).name for to in FORMATS]
     assert sorted(written) == sorted(EXPORTS)
