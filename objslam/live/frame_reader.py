@@ -63,6 +63,7 @@ class FrameReader:
             depths=frame.depths,
             track_ids=frame.track_ids,
             label_names=names,
+            whole=frame.whole,
         )
         boxes, direction, sigma = box_rays(boxes, camera, self._settings, self._ledger)
         for name in names:

@@ -16,6 +16,7 @@ class Boxes:
     """The boxes of one image: stamp, s; frame: the camera's, as tf names it, "" where unknown; arrived: s, any clock.
 
     points: by the index of its box, a tag that comes without a box (see boxes2d). size: of the image, where known.
+    whole: as `types.Detections` has it.
     """
 
     topic: str
@@ -28,6 +29,7 @@ class Boxes:
     track_ids: Sequence[int] | None = None
     points: dict[int, Floats] = field(default_factory=dict)
     size: tuple[int, int] | None = None
+    whole: bool = False
 
     @property
     def place(self) -> str:

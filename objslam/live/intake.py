@@ -93,12 +93,13 @@ class Intake:
         scores: Floats,
         depths: Floats | None = None,
         track_ids: Sequence[int] | None = None,
+        whole: bool = False,
     ) -> bool:
         """As `Sink` says."""
         where = f"camera {camera}"
         if not _finite(stamp):
             return self._refuse("frame without a stamp", where)
-        frame = self._frame(float(stamp), camera, boxes, labels, scores, depths, track_ids)
+        frame = self._frame(float(stamp), camera, boxes, labels, scores, depths, track_ids, whole)
         if frame is None:
             return self._refuse("frame that is malformed", f"{where}, stamp {stamp:.3f}")
         with self._lock:
@@ -212,6 +213,7 @@ class Intake:
         scores: Floats,
         depths: Floats | None,
         track_ids: Sequence[int] | None,
+        whole: bool,
     ) -> FrameMessage | None:
         """The frame without boxes that cannot be right, which are counted; None where it is malformed as a whole."""
         try:
@@ -242,9 +244,8 @@ class Intake:
         with np.errstate(invalid="ignore"):
             depth = np.where((depth > 0) & np.isfinite(depth), depth, np.nan)
         kept = np.flatnonzero(good)
-        return FrameMessage(
-            stamp, camera, corners[kept], tuple(labels[i] for i in kept.tolist()), score[kept], depth[kept], track[kept]
-        )
+        names_kept = tuple(labels[i] for i in kept.tolist())
+        return FrameMessage(stamp, camera, corners[kept], names_kept, score[kept], depth[kept], track[kept], bool(whole))
 
     def _remember(self, camera: str, at: float) -> None:
         order, seen = self._stamps.setdefault(camera, (deque(), set()))

@@ -41,10 +41,12 @@ class Sink(Protocol):
         scores: Floats,
         depths: Floats | None = None,
         track_ids: Sequence[int] | None = None,
+        whole: bool = False,
     ) -> bool:
         """All boxes of one image: (B, 4) raw px, labels B, scores (B,), depths (B,) z in m or NaN, track_ids B or -1.
 
-        An image without a box is pushed too: what was not seen is evidence.
+        An image without a box is pushed too: what was not seen is evidence. whole: as `types.Detections` has it, for
+        fiducials, which are used up to the image's edge.
         """
         ...
 

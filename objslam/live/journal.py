@@ -230,6 +230,7 @@ def _camera_log(camera: Camera, frames: list[FrameMessage], mounts: list[MountMe
         depths=np.concatenate([np.zeros(0), *(frame.depths for frame in frames)]),
         track_ids=np.concatenate([np.zeros(0, dtype=np.int64), *(frame.track_ids for frame in frames)]),
         label_names=names,
+        whole=bool(frames) and all(frame.whole for frame in frames),
     )
     return CameraLog(camera, detections, mount=Trajectory(stamps, held_mounts(camera, mounts, stamps)) if mounts else None)
 

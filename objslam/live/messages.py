@@ -57,6 +57,7 @@ class FrameMessage:
     scores: Floats
     depths: Floats
     track_ids: Ints
+    whole: bool = False
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -89,7 +90,7 @@ def encode(message: Message) -> bytes:
     known = np.where(np.isfinite(message.depths), message.depths, -1.0)
     columns = (message.boxes, list(message.labels), message.scores, known, message.track_ids)
     lists = [c if isinstance(c, list) else c.tolist() for c in columns]
-    return _FRAME_KIND + json.dumps([message.stamp, message.camera, *lists]).encode()
+    return _FRAME_KIND + json.dumps([message.stamp, message.camera, *lists, *[True] * message.whole]).encode()
 
 
 def decode(data: bytes) -> Message:
@@ -114,7 +115,9 @@ def decode(data: bytes) -> Message:
             sees_size = bool(more[0]) if more else True  # older journals do not say
             return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale, sees_size))
         if kind == _FRAME_KIND:
-            stamp, camera, boxes, labels, scores, depths, tracks = json.loads(data[1:])
+            stamp, camera, boxes, labels, scores, depths, tracks, *whole = json.loads(data[1:])
+            if whole not in ([], [True]):
+                raise ValueError("a frame with more than a frame has")
             known = _array(depths, (len(labels),))
             return FrameMessage(
                 float(stamp),
@@ -124,6 +127,7 @@ def decode(data: bytes) -> Message:
                 _array(scores, (len(labels),)),
                 np.where(known > 0, known, np.nan),
                 np.array(tracks, dtype=np.int64).reshape(len(labels)),
+                bool(whole),
             )
     except (ValueError, TypeError, struct.error) as error:
         raise LogError(f"a record that cannot be read: {error}") from error

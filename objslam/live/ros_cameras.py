@@ -134,7 +134,8 @@ class Cameras:
         if boxes.points:
             boxes.boxes[list(boxes.points)] = boxes_of_points(camera, np.array(list(boxes.points.values())))
         depths = self._depths.at(boxes, camera)
-        self._sink.push_detections(boxes.stamp, name, boxes.boxes, boxes.labels, boxes.scores, depths, boxes.track_ids)
+        found = boxes.boxes, boxes.labels, boxes.scores, depths, boxes.track_ids, boxes.whole
+        self._sink.push_detections(boxes.stamp, name, *found)
         return ""
 
     def _place(self, known: _Known, stamp: float) -> Floats:

@@ -284,7 +284,8 @@ class RosMessages:
         tracks = [track_number(track, self._tracks) for _, _, _, track, _ in found]
         points = {index: place for index, (*_, place) in enumerate(found) if place is not None}
         known = tracks if any(track >= 0 for track in tracks) else None
-        self._cameras.add(Boxes(topic, stamp, frame_name(frame), self._clock(), rows, labels, scores, known, points))
+        place = topic, stamp, frame_name(frame), self._clock()
+        self._cameras.add(Boxes(*place, rows, labels, scores, known, points, whole=is_tags(type_)))
 
 
 def _stamp(header: Any, received: float) -> float:

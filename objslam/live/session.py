@@ -107,9 +107,10 @@ class Session:
         scores: Floats,
         depths: Floats | None = None,
         track_ids: Sequence[int] | None = None,
+        whole: bool = False,
     ) -> bool:
         """As `Sink` says."""
-        return self._intake.push_detections(stamp, camera, boxes, labels, scores, depths, track_ids)
+        return self._intake.push_detections(stamp, camera, boxes, labels, scores, depths, track_ids, whole)
 
     def snapshot(self) -> Snapshot:
         """The map as of now; the last one where the session has stopped, or is too busy to answer within seconds."""

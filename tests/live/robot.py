@@ -61,6 +61,7 @@ class Recorder:
     mounts: list = field(default_factory=list)
     detections: list = field(default_factory=list)
     depths: list = field(default_factory=list)
+    whole: list = field(default_factory=list)
     lock: Any = field(default_factory=threading.Lock)
 
     def push_camera(self, camera):
@@ -79,8 +80,9 @@ class Recorder:
         self.mounts.append((stamp, camera, base_T_camera))
         return True
 
-    def push_detections(self, stamp, camera, boxes, labels, scores, depths=None, track_ids=None):
+    def push_detections(self, stamp, camera, boxes, labels, scores, depths=None, track_ids=None, whole=False):
         self.depths.append(depths)
+        self.whole.append(whole)
         self.detections.append((stamp, camera, np.array(boxes), list(labels), np.array(scores), track_ids, time.time()))
         return True
 

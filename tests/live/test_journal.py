@@ -36,6 +36,7 @@ def frames(draw):
         draw(npst.arrays(np.float64, count, elements=st.floats(0, 1))),
         draw(npst.arrays(np.float64, count, elements=st.one_of(st.just(np.nan), st.floats(0.1, 10)))),
         draw(npst.arrays(np.int64, count, elements=st.integers(-1, 9))),
+        draw(st.booleans()),
     )
 
 

@@ -293,6 +293,29 @@ def test_a_recording_waits_for_its_rare_poses(log):
     assert seen > 100
 
 
+def test_fiducials_are_used_up_to_the_edge_as_offline(log, tmp_path):
+    """A drive on which some boxes are at the image's edge: with `whole`, all of them are rays, live and from the journal."""
+    front = log.cameras[0]
+    corner = front.detections.boxes.copy()
+    corner[::3] += [-1, 0, -1, 0] * corner[::3, :1]  # every third box begins at the left edge
+    settings, used = load_settings(None, ("mode=joint", "live.keyframe_distance=0")), {}
+    for whole in (False, True):
+        (tmp_path / str(whole)).mkdir()
+        cut = replace(log, cameras=(replace(front, detections=replace(front.detections, boxes=corner, whole=whole)),))
+        session = drive(cut, settings, journal=tmp_path / str(whole) / "journal.objslam")
+        session.abort()
+        kept = read(tmp_path / str(whole), Ledger())
+        assert kept.cameras[0].detections.whole == whole
+        reason = "boxes cut off by the image's edge (rays.border)"
+        used[whole] = session.counters.dropped().get(reason, 0)
+        for found in (cut, kept):
+            offline = Ledger()
+            build_rays(found, build_keyframes(found, settings, Ledger()), settings, offline)
+            assert (offline.dropped.get(reason, 0) > 0) == (not whole)
+    assert used[True] == 0
+    assert used[False] >= len(corner[::3]) // 2
+
+
 @pytest.mark.parametrize("ahead", [0.0, 0.3])
 def test_the_journal_gives_the_same_rays_as_the_log(tmp_path, ahead):
     """The localisation is heard before the odometry of the same stamp, or is already further."""

@@ -124,6 +124,7 @@ def _frames(detections: Detections, camera: str) -> Callable[[int], Push]:
             detections.scores[boxes],
             detections.depths[boxes],
             detections.track_ids[boxes].tolist(),
+            detections.whole,
         )
 
     return push
