@@ -100,11 +100,14 @@ def live(
     view: View = None,
 ) -> None:
     """Map objects while the robot drives: objects.json follows, and at the end (Ctrl-C) there is a whole result folder."""
+    from objslam.errors import OutputError
     from objslam.live.adapters import ADAPTERS, LiveOptions
     from objslam.live.journal import NAME
     from objslam.live.session import Session
-    from objslam.results import output_folder
+    from objslam.results import RECORDING, output_folder
 
+    if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
+        raise OutputError("the recording of the result goes there", where=view, hint="name another file with --view")
     settings = settings_of("joint", config, set_)
     options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
     recording = None if source in ADAPTERS else _read(Path(source), options)  # first, for it may be the journal in OUT

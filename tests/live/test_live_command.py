@@ -101,6 +101,17 @@ def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path)
     assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
 
 
+def test_a_live_recording_is_not_where_the_result_puts_its_own(log, tmp_path):
+    out = tmp_path / "out"
+    failed = subprocess.run(
+        command(log, out, "--view", str(out / "recording.rrd")), capture_output=True, text=True, timeout=60
+    )
+    assert failed.returncode == 1
+    assert "the recording of the result goes there" in failed.stderr
+    assert len(failed.stderr.strip().splitlines()) == 1
+    assert not out.exists()
+
+
 def test_nothing_to_go_on_with(log, tmp_path):
     done = subprocess.run(command(log, tmp_path / "out", "--resume"), capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
