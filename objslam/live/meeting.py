@@ -133,5 +133,5 @@ def _midpoints(s: Sightings, a: Ints, b: Ints) -> Floats:
         s_n = (along_n - cos * along_p) / sharp
         s_p = (cos * along_n - along_p) / sharp
     fine = (sharp > np.sin(_APART) ** 2) & (s_n > _NEAREST) & (s_p > _NEAREST)
-    middle = (m + s_n[:, None] * n + o + s_p[:, None] * p) / 2
-    return np.asarray(middle[fine])
+    ahead, on = s_n[fine, None] * n[fine], s_p[fine, None] * p[fine]
+    return np.asarray((m[fine] + ahead + o[fine] + on) / 2)
