@@ -213,6 +213,14 @@ def test_demo(objslam, tmp_path):
     assert objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1).code == 0  # over the demo before
 
 
+def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
+    shutil.copytree(log_folder, tmp_path / "log")
+    demo = objslam("demo", "-o", tmp_path, "--boxes")
+    assert demo.code == 1
+    demo.says("no demo made", "-o")
+    assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
+
+
 def test_demo_from_images(objslam, tmp_path):
     """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
     demo = objslam("demo", "-o", tmp_path / "demo")

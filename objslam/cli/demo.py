@@ -25,6 +25,7 @@ def demo(
 
     The drive is rendered: a furnished room, RGB-D images, seven objects that the detector shipped with objslam knows.
     """
+    from objslam.errors import OutputError
     from objslam.ledger import Ledger
     from objslam.results import prepare_output
     from objslam.simulation import preset, simulate
@@ -33,6 +34,10 @@ def demo(
 
     prepare_output(out)
     log, model = out / "log", None
+    mark = out / ".objslam-demo"  # whoever finds it may replace the log
+    if log.exists() and not mark.exists():
+        raise OutputError("there is a log that no demo made", where=str(log), hint="name another folder with -o")
+    mark.touch()
     if boxes:
         write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
     else:
