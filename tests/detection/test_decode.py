@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import expit, softmax
@@ -146,6 +146,7 @@ sides = st.integers(1, 3000)
 
 
 @given(sides, sides, st.sampled_from(["letterbox", "corner", "stretch"]), st.booleans(), st.booleans(), st.integers(0, 99))
+@example(33, 1828, "letterbox", False, False, 0)
 def test_boxes_go_in_and_come_back(width, height, resize, free_width, free_height, seed):
     size = InputSize(640, 416, free_width, free_height, 32)
     where = fit(recipe("yolov8", size=size, resize=resize), width, height)
@@ -159,10 +160,9 @@ def test_boxes_go_in_and_come_back(width, height, resize, free_width, free_heigh
     else:
         assert where.content_width == 640 or where.content_height == 416
         scale = where.content_width / width, where.content_height / height
-        assert (
-            abs(scale[0] / scale[1] - 1) <= 0.5 / where.content_width + 0.5 / where.content_height + 1e-3
-            or min(width, height) < 9
-        )
+        # each side is rounded: what it was lies within half a pixel, and may be smaller than it is now
+        rounded = 0.5 / (where.content_width - 0.5) + 0.5 / (where.content_height - 0.5)
+        assert abs(scale[0] / scale[1] - 1) <= rounded + 1e-3 or min(width, height) < 9
     if resize == "letterbox":
         assert abs(2 * where.left + where.content_width - where.input_width) <= 1
         assert abs(2 * where.top + where.content_height - where.input_height) <= 1
