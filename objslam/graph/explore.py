@@ -36,7 +36,7 @@ _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 _STRAY = 13.8  # squared deviations that a ray costs at the most
 _STRAIN = 200.0
 """Squared deviations by which a loop may raise the cost for each landmark that it joins: on MRCLAM right ones took up to
-110, wrong ones 250 and more."""
+110, wrong ones 240 and more."""
 _FLOOR = 0.02  # m; landmarks are never taken to be known better than that
 
 
@@ -194,7 +194,8 @@ def _recognise(
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)
     drift = _drifted(keyframes, begin - 1)
-    correction = lay(some, known.position[which], known.label[which], map_T_camera, drift[end - 1], begin)
+    centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
+    correction = lay(some, known.position[which], known.label[which], map_T_camera, centre, spread)
     poses = map_T_camera.copy()
     poses[begin:end] = correction @ poses[begin:end]
     left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
@@ -208,6 +209,13 @@ def _recognise(
         pose_covariance=left,
     )
     return np.where(_in_range(some, owner, known, poses), owner, -1), poses
+
+
+def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
+    """Standard deviations (3,) of x, y (m) and yaw (rad) in map, of a covariance (6, 6) in the camera's own frame."""
+    turn = map_T_camera[:3, :3]
+    place, rotation = (np.diag(turn @ block @ turn.T) for block in (covariance[3:, 3:], covariance[:3, :3]))
+    return np.sqrt(np.maximum([place[0], place[1], rotation[2]], 0.0))
 
 
 def _in_range(rays: Rays, owner: Ints, known: Known, map_T_camera: Floats) -> Bools:

@@ -8,6 +8,7 @@ from objslam.config import Settings
 from objslam.evaluation import evaluate
 from objslam.geometry import lift_se2
 from objslam.graph.closure import bend
+from objslam.graph.explore import _planar_sigmas
 from objslam.ledger import Ledger
 from objslam.rounds import rays_moved
 from objslam.simulation import preset, simulate
@@ -54,3 +55,13 @@ def test_rays_moved_counts_rays_and_not_numbers():
     after[moved] = np.where(before[moved] < 0, 0, -1)
     assert rays_moved(before, number[after]) == 17
     assert rays_moved(np.full(5, -1), np.zeros(5, dtype=np.int64)) == 5
+
+
+def test_the_drift_of_any_camera_is_told_in_the_map():
+    """The same robot's drift, as a camera that looks ahead and one that looks left have it."""
+    ahead = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
+    left = lift_se2(np.array([0.0, 0.0, np.pi / 2])) @ ahead
+    of_map = np.diag([0.0, 0.0, 0.05, 0.3, 0.1, 0.0]) ** 2
+    for camera in (ahead, left):
+        turn = np.kron(np.eye(2), camera[:3, :3])
+        np.testing.assert_allclose(_planar_sigmas(turn.T @ of_map @ turn, camera), [0.3, 0.1, 0.05], atol=1e-12)
