@@ -14,7 +14,8 @@ from objslam.live.meeting import Meeting, information, meet, misses, sightings
 from objslam.types import Floats, Ints
 
 _DEPTH, _DEPTH_SIGMA = 2.5, 2.0  # m; where an object is taken to be that has been seen from one place only
-_AGAIN = 1.5  # times as many rays, or as wide a spread, as when it was last tried, before it is tried again
+_AGAIN = 1.2  # times as many rays, or as wide a spread, as when it was last tried, before it is tried again
+_EARLY, _SURE = 0.4, 0.05  # share of the least parallax that is enough for a place this sure, as a share of its distance
 _AGREE = 0.7  # share of the rays of a track that must agree, and of those that merely share a label
 _AGREE_BY_LABEL = 0.5
 _SLACK = 0.02  # m; the poses of one stretch fit each other that well
@@ -116,17 +117,19 @@ def ripe(candidate: Candidate, graph: IncrementalGraph, settings: Settings, rng:
         return None
     if len(candidate) < _AGAIN * candidate.tried and candidate.spread < _AGAIN * candidate.tried_spread:
         return None
-    least = np.radians(settings.joint.min_parallax_deg)
+    full = np.radians(settings.joint.min_parallax_deg)
     ranged = any(np.isfinite(ray[4]) for ray in candidate.rays)
-    if not ranged and candidate.spread < least:
+    if not ranged and candidate.spread < _EARLY * full:
         return None
     candidate.tried, candidate.tried_spread = len(candidate), candidate.spread
     s = candidate.sight(graph)
     met = meet(s, rng, _SLACK)
-    if met is None or met.agree.sum() < live.min_rays or (met.parallax < least and not ranged):
+    if met is None or met.agree.sum() < live.min_rays:
         return None
     if met.agree.mean() < (_AGREE_BY_LABEL if candidate.by_label else _AGREE):
         return None
     away = float(np.median(np.linalg.norm(met.position - s.origin[met.agree], axis=1)))
-    surely = np.sqrt(np.linalg.eigvalsh(met.covariance)[-1]) <= settings.triangulation.max_rel_sigma * away
-    return met if surely else None
+    sigma = np.sqrt(np.linalg.eigvalsh(met.covariance)[-1])
+    early = met.parallax >= _EARLY * full and sigma <= _SURE * away
+    wide = met.parallax >= full or ranged
+    return met if early or (wide and sigma <= settings.triangulation.max_rel_sigma * away) else None

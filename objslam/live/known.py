@@ -13,6 +13,7 @@ _NOISE = (1.0, 3.0)  # times the noise that was promised
 _POOLED = 20.0  # rays that weigh an object's own noise as much as the promised one
 _INNER = 0.05  # share of the image along its edge where a box may be cut off
 _NEAREST = 0.3  # m; nearer things do not fit into the image
+_HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
 _FURTHER = 1.1  # times the distance from which an object was seen, it should be seen from
 
 
@@ -63,6 +64,11 @@ def gathered(now: Floats, then: Floats) -> Floats:
     """What drift (6, 6) was gathered since it was `then` (n, 6, 6): nothing for a frame that comes late, from before."""
     since = now - then
     return np.where((np.trace(since, axis1=1, axis2=2) > 0)[:, None, None], since, 0.0)
+
+
+def long_unseen(now: Floats, then: Floats) -> Bools:
+    """Of which things (n,) that were last seen at the drift `then` (n, 6, 6) a robot with the drift now (6, 6) was away."""
+    return np.asarray(np.sqrt(np.maximum(gathered(now, then)[:, 2, 2], 0.0)) > _HORIZON)
 
 
 def in_view(known: Table, camera: Camera, map_T_camera: Floats) -> Bools:

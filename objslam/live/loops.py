@@ -11,14 +11,13 @@ from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
 from objslam.graph.closure import bend
 from objslam.live.joining import join, without
-from objslam.live.known import covariances, gathered
+from objslam.live.known import covariances, long_unseen
 from objslam.live.meeting import misses
 from objslam.types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
-_HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
 _ANCHORS = 3
 _ITERATIONS, _TOLERANCE = 15, 1e-3  # the graph settles the rest in its updates: no frame may wait for it
 _HOLDS, _FITS = 0.7, 4.0  # share of a closed loop's rays that must still fit, to so many standard deviations
@@ -29,8 +28,7 @@ def close_loop(m: Mapper) -> None:
     """Look for a loop that closes, and close it; where too many rays contradict it afterwards, all is as it was."""
     known = m.known
     newest = int(np.argmax(m.keyframes.stamp))
-    heading = np.sqrt(np.maximum(gathered(m.keyframes.drift[newest], known.drift)[:, 2, 2], 0.0))
-    there = heading > _HORIZON
+    there = long_unseen(m.keyframes.drift[newest], known.drift)
     here = ~there
     state = (tuple(known.id[here].tolist()), int(there.sum()))
     if state == m.looked_at:

@@ -11,14 +11,16 @@ from objslam.association.landmarks import RANGE_LOSS, Landmarks
 from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
-from objslam.live.known import carried, covariances, gathered, noise
+from objslam.live.known import carried, covariances, gathered, long_unseen, noise
 from objslam.live.meeting import sightings
 from objslam.live.table import Table
-from objslam.types import Floats, Ints
+from objslam.types import Bools, Floats, Ints
 
 _VIEW = np.cos(np.radians(40.0))  # landmarks further off every box of a frame are not looked at
 _ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough
 _CLEAR = 6.0  # squared deviations by which the best of several places that are all rough must be better
+_CROWD = 0.02  # other objects that may be expected in the gate of a landmark that was not seen for long
+_REACH, _TALL = 4.0, 1.0  # m; a room that holds objects is that long and wide and tall, at the least
 _WIDEST = 0.3  # m; a place that is rougher than that tells no landmark from another
 _BY_LABEL = 4.0  # times the gate, where only one object has the label
 
@@ -86,7 +88,10 @@ def match(
     limit = gate_limit(gate)
     edges = gated_edges(s, Landmarks(places, covariance, np.append(noises, np.ones(len(ours))), accepts), limit)
     away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
-    edges = _clear(edges, rays.sigma[edges.ray] * away, len(rows))
+    clear = _clear(edges, rays.sigma[edges.ray] * away, len(rows))
+    unseen = long_unseen(doubt.drift, np.concatenate([known.drift[rows], *(c.drift[None] for c in ours)]))
+    alone = _crowd(edges, rays.sigma[edges.ray], label, unseen, known, limit) < _CROWD
+    edges = _some(edges, clear & alone)
     number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
@@ -170,7 +175,34 @@ def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) 
     return chosen
 
 
-def _clear(edges: Edges, own: Floats, landmarks: int) -> Edges:
+def _crowd(edges: Edges, sigma: Floats, label: Ints, unseen: Bools, known: Table, limit: float) -> Floats:
+    """How many other objects of its label are expected where each match (E,) would be accepted; sigma: (E,) rad.
+
+    label, unseen: (N,) of the places, and whether they were not seen for long. Of the others nothing has drifted that would
+    let another one take their place.
+    """
+    crowd = np.zeros(len(edges.ray))
+    old = np.flatnonzero(unseen[edges.landmark])
+    if len(old):
+        per_m3 = _density(known, label[edges.landmark[old]])
+        reach = float(known.far.max(initial=_REACH))
+        gate = np.pi * limit * sigma[old] ** 2 * np.exp(edges.vague[old] / 2)
+        crowd[old] = per_m3 * reach**3 / 3 * gate
+    return crowd
+
+
+def _density(known: Table, label: Ints) -> Floats:
+    """How many landmarks of labels (n,) there are per m^3, one more of each than are known."""
+    number = np.bincount(known.label, minlength=int(label.max()) + 1) + 1
+    room = np.ptp(known.position, axis=0) if len(known) else np.zeros(3)
+    return np.asarray(number[label] / np.prod(np.maximum(room, [_REACH, _REACH, _TALL])))
+
+
+def _some(edges: Edges, keep: Bools) -> Edges:
+    return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])
+
+
+def _clear(edges: Edges, own: Floats, landmarks: int) -> Bools:
     """Without the matches to landmarks that are expected only roughly, where it could as well be another; own: (n,) m.
 
     Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`).
@@ -181,5 +213,4 @@ def _clear(edges: Edges, own: Floats, landmarks: int) -> Edges:
     ray, cost = edges.ray[order], edges.cost[order]
     rivals = np.flatnonzero((np.diff(ray) == 0) & (np.diff(cost) < _CLEAR) & (np.diff(ray, prepend=-1)[:-1] != 0)) + 1
     both = rough[order[rivals]] & rough[order[rivals - 1]]
-    keep = ~(rough & (np.isin(edges.ray, ray[rivals[both]]) | (width > _WIDEST)))
-    return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])
+    return ~(rough & (np.isin(edges.ray, ray[rivals[both]]) | (width > _WIDEST)))

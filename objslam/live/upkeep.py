@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.association.constellation import densities
 from objslam.association.extent import grouped_median
 from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
@@ -27,6 +28,7 @@ _MISS = 4.0  # standard deviations by which a ray may miss its landmark
 _WIDEST = 5.0  # times the noise that was promised
 _RAYLEIGH_MEDIAN = 1.1774
 _SAME = 11.3  # squared Mahalanobis distance below which 99 % of equal points lie (chi-squared, 3 degrees of freedom)
+_ODDS = 2.5  # log odds that two landmarks are one, against another one that happens to stand there
 _FARTHEST = 1.0  # m; objects further apart are two, however little is known of them
 _TOGETHER = 0.03  # share of frames with both that a wrong box may account for
 _GHOST, _GHOST_FRAMES = 0.1, 40  # seen in a smaller share of so many frames that should show it, it is none
@@ -144,6 +146,7 @@ def _merge(m: Mapper) -> None:
     apart = known.position[a] - known.position[b]
     near = (known.label[a] == known.label[b]) & (np.linalg.norm(apart, axis=1) < _FARTHEST)
     a, b, apart = a[near], b[near], apart[near]
+    density = densities(known.position, known.label)
     gone: set[int] = set()
     for i, j, way in zip(a.tolist(), b.tolist(), apart, strict=True):
         ids = int(known.id[i]), int(known.id[j])
@@ -154,7 +157,7 @@ def _merge(m: Mapper) -> None:
             continue
         rows = np.array([i, j])
         spread = (covariances(known, rows) * (noise(known, rows) ** 2)[:, None, None]).sum(axis=0) + _drifted(m, rows)
-        if not np.isfinite(spread).all() or way @ np.linalg.solve(spread, way) > _SAME:
+        if not np.isfinite(spread).all() or not _one(way, spread, density[i]):
             m.apart[ids] = fewer // 5
             continue
         keep, drop = (i, j) if known.seen[i] >= known.seen[j] else (j, i)
@@ -163,6 +166,14 @@ def _merge(m: Mapper) -> None:
     if gone:
         m.counters.accept("merged objects", len(gone))
         without(m, np.array(sorted(gone)))
+
+
+def _one(way: Floats, spread: Floats, density: float) -> bool:
+    """Whether two landmarks `way` (3,) m apart are one: by the covariance (3, 3) of that, and by how many of their label
+    there are per m^2, one of which may stand there as well."""
+    squared = float(way @ np.linalg.solve(spread, way))
+    area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
+    return squared <= _SAME and -np.log(area * density) - squared / 2 >= _ODDS
 
 
 def _drifted(m: Mapper, rows: Ints) -> Floats:
