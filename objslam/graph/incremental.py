@@ -175,6 +175,11 @@ class IncrementalGraph:
         self._turns = Turns(self._kept.copy(), order.tolist(), dict(self._poses), dict(self._points))
         self._unfinished = True
 
+    @property
+    def in_turns(self) -> bool:
+        """Whether `rebuild_in_turns` is not done yet."""
+        return self._unfinished
+
     def take_turn(self) -> None:
         """Go on with what `rebuild_in_turns` began, if it did."""
         if self._turns is None:

@@ -11,7 +11,7 @@ from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
 from objslam.graph.closure import bend
 from objslam.live.joining import join, without
-from objslam.live.known import covariances, long_unseen
+from objslam.live.known import covariances, gathered, long_unseen
 from objslam.live.meeting import misses
 from objslam.types import Bools, Floats, Ints
 
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
 _ANCHORS = 3
-_ITERATIONS, _TOLERANCE = 15, 1e-3  # the graph settles the rest in its updates: no frame may wait for it
+_NEAR, _TURNED = 0.25, 0.05  # m, rad; by a correction smaller than that no factor is linearised far off
+_AROUND, _ERA = 6.0, 15.0  # m, s; landmarks so close to recognised ones, last seen at about the same time
+_ITERATIONS, _TOLERANCE = 5, 1e-3  # the graph settles the rest in its updates: no frame may wait for it
 _HOLDS, _FITS = 0.7, 4.0  # share of a closed loop's rays that must still fit, to so many standard deviations
 _BENT = 0.02  # m
 
@@ -89,6 +91,34 @@ def _together(m: Mapper) -> Bools:
 
 
 def _close(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
+    """Make landmarks now (P,) one with the old (P,)."""
+    _expect_around(m, now, old)
+    turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
+    pivot = m.known.position[now].mean(axis=0)
+    shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
+    if shift < _NEAR and turn < _TURNED:
+        for i, j in zip(old.tolist(), now.tolist(), strict=True):
+            join(m, i, j)
+        without(m, np.unique(now))
+        m.unsettled = True
+        m.counters.accept("merged objects", len(now))
+    else:
+        _bend(m, now, old, correction)
+
+
+def _expect_around(m: Mapper, now: Ints, old: Ints) -> None:
+    """What stands around the old landmarks (P,) is expected again: it has drifted no more since than the new ones (P,)."""
+    known = m.known
+    drift = known.drift[now[np.argmin(known.first[now])]]
+    since = gathered(drift, known.drift)
+    near = np.linalg.norm(known.position[:, :2] - known.position[old, :2].mean(axis=0), axis=1) < _AROUND
+    same_time = np.abs(known.last - np.median(known.last[old])) < _ERA
+    expected = near & same_time & (np.trace(since, axis1=1, axis2=2) > 0)
+    expected[now] = expected[old] = False
+    known.drift[expected] = drift
+
+
+def _bend(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
     """Bend the path so that landmarks now (P,) lie on the old (P,), make them one, solve; or leave all as it was."""
     known, k, rays = m.known, m.keyframes, m.rays
     m.graph.refresh()

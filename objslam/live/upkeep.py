@@ -55,6 +55,8 @@ def after_keyframe(m: Mapper) -> None:
         return
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
+    if m.graph.in_turns:  # one thing after the other
+        return
     if not m.by_label:
         close_loop(m)
         _merge(m)
