@@ -24,6 +24,7 @@ _GATE = 16.3  # chi-squared, 3 degrees of freedom, 0.999
 _PRIOR_GATE = 14.2  # chi-squared, 3 degrees of freedom, 0.997
 _REFINEMENTS = 3
 _HYPOTHESES, _CLOSELY = 2000, 20
+_AT_ONCE = 200_000  # gains
 _BASE = 0.3  # m; two landmarks closer than that tell no heading
 _SAME_PLACE, _SAME_HEADING = 0.5, 0.2  # m, rad; hypotheses closer than that are one
 
@@ -78,14 +79,14 @@ def recognise(
     density: (N,) landmarks `there` of the label of each one here, per m^2. possible: (N, M) which may be the same at all.
     """
     problem = _problem(here, there, pivot, prior, density, possible)
-    seeds = _seeds(problem, *_candidates(problem))
-    if len(seeds) == 0:
+    a, b = _candidates(problem)
+    if len(a) == 0:
         return None
-    x = _solve_seeds(problem, seeds)
+    x = _solve_seeds(problem, _seeds(problem, a, b))
     x = x[np.einsum("hi,ij,hj->h", x, problem.weight, x) <= _PRIOR_GATE]
     # rank all by what they gain where each landmark may take any partner, then look closely at the best
-    order = np.argsort(-_quick_score(problem, x), kind="stable")[:_CLOSELY]
-    found = [result for h in order.tolist() if (result := _evidence(problem, x[h])) is not None]
+    order = np.argsort(-_quick_score(problem, a, b, x), kind="stable")[:_CLOSELY]
+    found = [result for h in order.tolist() if (result := _evidence(problem, a, b, x[h])) is not None]
     if not found:
         return None
     evidence, best, pairs = max(found, key=lambda one: one[0])
@@ -202,36 +203,45 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: F
     return x + np.linalg.solve(hessian, gradient[..., None])[..., 0], hessian
 
 
-def _quick_score(problem: _Problem, x: Floats) -> Floats:
-    """What each correction (H, 3) gains, (H,), were each landmark free to take the partner it likes best."""
+def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
+    """What each correction (H, 3) gains, (H,), were each landmark free to take the partner it likes best.
+
+    a, b: (C,) the pairs that are possible, a in increasing order.
+    """
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
-    size = max(1, 2_000_000 // max(1, problem.possible.size))
+    first = np.flatnonzero(np.diff(a, prepend=-1))
+    size = max(1, _AT_ONCE // len(a))
     for begin in range(0, len(x), size):
         part = slice(begin, begin + size)
-        score[part] += np.maximum(_gains(problem, x[part]).max(axis=2), 0.0).sum(axis=1)
+        gain = _gains(problem, a, b, x[part])
+        score[part] += np.maximum(np.maximum.reduceat(gain, first, axis=1), 0.0).sum(axis=1)
     return score
 
 
-def _gains(problem: _Problem, x: Floats) -> Floats:
-    """Log likelihood ratio (..., N, M) of each pair against a new landmark, -inf beyond the gate; x: (..., 3)."""
-    miss = problem.target - _moved(problem.offset, x)[0][..., :, None, :]
-    squared = (miss * (problem.information @ miss[..., None])[..., 0]).sum(axis=-1)
-    return np.where(problem.possible & (squared <= _GATE), problem.peak - 0.5 * squared, -np.inf)
+def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
+    """Log likelihood ratio (..., C) of pairs (C,) against new landmarks, -inf beyond the gate; x: (..., 3)."""
+    miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
+    squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
+    return np.where(squared <= _GATE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
-def _evidence(problem: _Problem, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """The log Bayes factor of a correction (3,), refined with the best assignment, and its pairs (P, 2)."""
+def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
+    """The log Bayes factor of a correction (3,), refined with the best assignment, and its pairs (P, 2).
+
+    one, two: (C,) the pairs that are possible.
+    """
+    gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
-        gain = _gains(problem, x)
-        a, b = linear_sum_assignment(np.where(gain > 0, -gain, 0.0))
+        gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)
+        a, b = linear_sum_assignment(-gain)
         good = gain[a, b] > 0
         a, b = a[good], b[good]
         if len(a) == 0:
             return None
         x, hessian = _gauss_newton(problem, a, b, problem.information[a, b], x)
-    gain = _gains(problem, x)[a, b]
-    if not np.isfinite(gain).all():
+    final = _gains(problem, a, b, x)
+    if not np.isfinite(final).all():
         return None
     # Laplace: the prior's density at x times the volume that the landmarks leave open
     occam = 0.5 * (np.linalg.slogdet(problem.weight)[1] - np.linalg.slogdet(hessian)[1])
-    return float(gain.sum() - 0.5 * x @ problem.weight @ x + occam), x, np.stack([a, b], axis=1)
+    return float(final.sum() - 0.5 * x @ problem.weight @ x + occam), x, np.stack([a, b], axis=1)

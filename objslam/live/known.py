@@ -13,7 +13,7 @@ _NOISE = (1.0, 3.0)  # times the noise that was promised
 _POOLED = 20.0  # rays that weigh an object's own noise as much as the promised one
 _INNER = 0.05  # share of the image along its edge where a box may be cut off
 _NEAREST = 0.3  # m; nearer things do not fit into the image
-_HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
+HORIZON = 0.06  # rad of drift in heading since they were last seen: others may stand elsewhere than expected
 _FURTHER = 1.1  # times the distance from which an object was seen, it should be seen from
 
 
@@ -68,7 +68,7 @@ def gathered(now: Floats, then: Floats) -> Floats:
 
 def long_unseen(now: Floats, then: Floats) -> Bools:
     """Of which things (n,) that were last seen at the drift `then` (n, 6, 6) a robot with the drift now (6, 6) was away."""
-    return np.asarray(np.sqrt(np.maximum(gathered(now, then)[:, 2, 2], 0.0)) > _HORIZON)
+    return np.asarray(np.sqrt(np.maximum(gathered(now, then)[:, 2, 2], 0.0)) > HORIZON)
 
 
 def in_view(known: Table, camera: Camera, map_T_camera: Floats) -> Bools:

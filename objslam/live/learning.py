@@ -19,7 +19,7 @@ _TRACKS = 4096  # of the detector, that are remembered
 
 
 class Lesson(NamedTuple):
-    """A frame that is in the map: which of its rays matched which rows of the landmarks, and its camera as of then."""
+    """A frame that is in the map: which of its rays matched which rows of the landmarks, its camera and its keyframe."""
 
     rays: FrameRays
     matched: Ints
@@ -27,13 +27,14 @@ class Lesson(NamedTuple):
     camera: int
     drift: Floats
     stamp: float
-    map_T_camera: Floats
+    keyframe: int
 
 
 def learn(m: Mapper, lesson: Lesson) -> None:
     """What the landmarks of a frame learn from it."""
     known = m.known
-    rays, matched, rows, camera, drift, stamp, pose = lesson
+    rays, matched, rows, camera, drift, stamp, k = lesson
+    pose = m.graph.pose(k)
     seen = in_view(known, m.cameras[camera], pose)
     seen[rows] = True
     known.expected[seen] += 1

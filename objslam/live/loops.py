@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -142,14 +144,9 @@ def _bend(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
     for i, j in zip(old.tolist(), now.tolist(), strict=True):
         join(m, i, j)
     without(m, np.unique(now), rebuild=False)
-    try:
-        m.graph.solve(_ITERATIONS, _TOLERANCE)
-    except SolveError:
-        held = False
-    else:
-        known.position[:] = m.graph.points(known.id)
-        held = _holds(m, mine)
+    held = any(_holds(m, mine) for _ in _settled(m))
     if held:
+        m.unsettled = True
         m.counters.accept("loops closed")
         m.counters.accept("merged objects", len(ids))
         m.move_candidates(correction, back)
@@ -160,9 +157,18 @@ def _bend(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
     m.known.position[:] = m.graph.points(m.known.id)
 
 
+def _settled(m: Mapper) -> Iterator[None]:
+    """The bent graph solved: by one step, which a good correction leaves little to do; then, if asked, by several."""
+    for solve in (m.graph.rebuild, lambda: m.graph.solve(_ITERATIONS, _TOLERANCE)):
+        with suppress(SolveError):  # then it does not hold
+            solve()
+            yield
+
+
 def _holds(m: Mapper, mine: Ints) -> bool:
     """Whether the rays (n,) of the landmarks that became one still fit them."""
     m.graph.refresh()
+    m.known.position[:] = m.graph.points(m.known.id)
     s = m.sight(mine)
     points = m.known.position[m.rows_of(m.rays.owner[mine])]
     distance = np.linalg.norm(points - s.origin, axis=1)

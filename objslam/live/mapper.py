@@ -238,7 +238,7 @@ class Mapper:
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
         give_birth(self, k)
         self.graph.update()
-        self._lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, self.graph.pose(k))
+        self._lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, k)
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""

@@ -11,7 +11,7 @@ from objslam.association.landmarks import RANGE_LOSS, Landmarks
 from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
-from objslam.live.known import carried, covariances, gathered, long_unseen, noise
+from objslam.live.known import HORIZON, carried, covariances, gathered, long_unseen, noise
 from objslam.live.meeting import sightings
 from objslam.live.table import Table
 from objslam.types import Bools, Floats, Ints
@@ -22,6 +22,7 @@ _CLEAR = 6.0  # squared deviations by which the best of several places that are 
 _CROWD = 0.02  # other objects that may be expected in the gate of a landmark that was not seen for long
 _REACH, _TALL = 4.0, 1.0  # m; a room that holds objects is that long and wide and tall, at the least
 _WIDEST = 0.3  # m; a place that is rougher than that tells no landmark from another
+_PLACED = 0.1  # m; a camera known that well in the map tells apart what it saw long ago, too
 _BY_LABEL = 4.0  # times the gate, where only one object has the label
 
 
@@ -56,6 +57,12 @@ class Doubt:
     camera_from_drift: Floats
     pose: Floats
 
+    @property
+    def placed(self) -> bool:
+        """Whether the camera's place in the map is known well."""
+        turn, way = (float(np.sqrt(np.trace(self.pose[i : i + 3, i : i + 3]))) for i in (0, 3))
+        return turn < HORIZON and way < _PLACED
+
 
 def match(
     rays: FrameRays,
@@ -69,28 +76,28 @@ def match(
 ) -> Ints:
     """For each ray (n,) the row of its landmark, len(known) + the index of its candidate, or -1.
 
-    tracks: the landmark (id) that a detector's track was given last.
+    Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark (id) that a detector's track was given last.
     """
-    rows, position, spread, noises = predicted(rays, map_T_camera, known, doubt)
+    rows = _ahead(rays, map_T_camera, known)
     here = set(rays.label.tolist())
-    waiting = [i for i, c in enumerate(candidates) if not c.by_label and c.label in here]
+    lately = -np.inf if doubt.placed else float(doubt.drift[2, 2]) - HORIZON**2
+    waiting = [i for i, c in enumerate(candidates) if c.label in here and not c.by_label and c.drift[2, 2] > lately]
     if not len(rows) and not waiting:
         return np.full(len(rays), -1, dtype=np.int64)
     ours = [candidates[i] for i in waiting]
-    places = np.concatenate([position, *(c.position[None] for c in ours)])
-    own = np.array([c.covariance for c in ours]).reshape(-1, 3, 3)
-    since = gathered(doubt.drift, np.array([c.drift for c in ours]).reshape(-1, 6, 6))
-    to = places[len(rows) :] - map_T_camera[:3, 3]
-    covariance = np.concatenate([spread, own + carried(to, since, map_T_camera, doubt.camera_from_drift)])
+    places = np.concatenate([known.position[rows], np.array([c.position for c in ours]).reshape(-1, 3)])
+    own = np.concatenate([covariances(known, rows), np.array([c.covariance for c in ours]).reshape(-1, 3, 3)])
+    then = np.concatenate([known.drift[rows], np.array([c.drift for c in ours]).reshape(-1, 6, 6)])
+    covariance = own + _doubtful(places - map_T_camera[:3, 3], then, map_T_camera, doubt)
     label = np.concatenate([known.label[rows], np.array([c.label for c in ours], dtype=np.int64)])
+    noises = np.append(noise(known, rows), np.ones(len(ours)))
     accepts = label[:, None] == np.arange(labels)
     s = in_map(rays, map_T_camera)
     limit = gate_limit(gate)
-    edges = gated_edges(s, Landmarks(places, covariance, np.append(noises, np.ones(len(ours))), accepts), limit)
+    edges = gated_edges(s, Landmarks(places, covariance, noises, accepts), limit)
     away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
     clear = _clear(edges, rays.sigma[edges.ray] * away, len(rows))
-    unseen = long_unseen(doubt.drift, np.concatenate([known.drift[rows], *(c.drift[None] for c in ours)]))
-    alone = _crowd(edges, rays.sigma[edges.ray], label, unseen, known, limit) < _CROWD
+    alone = _crowd(edges, rays.sigma[edges.ray], rows, known, doubt.drift, limit) < _CROWD
     edges = _some(edges, clear & alone)
     number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
     cost = edges.cost
@@ -108,13 +115,16 @@ def match_by_label(rays: FrameRays, map_T_camera: Floats, known: Table, doubt: D
 
     Of several boxes with one label the one with the highest score counts.
     """
-    rows, position, spread, noises = predicted(rays, map_T_camera, known, doubt, everywhere=True)
+    rows = np.flatnonzero(np.isin(known.label, rays.label))
     hit, missed = (np.full(len(rays), -1, dtype=np.int64) for _ in range(2))
     if not len(rows):
         return hit, missed
     s = in_map(rays, map_T_camera)
+    position = known.position[rows]
+    doubtful = _doubtful(position - map_T_camera[:3, 3], known.drift[rows], map_T_camera, doubt)
     accepts = known.label[rows][:, None] == np.arange(int(max(rays.label.max(), known.label.max())) + 1)
-    edges = gated_edges(s, Landmarks(position, spread, noises, accepts), _BY_LABEL * gate_limit(gate))
+    landmarks = Landmarks(position, covariances(known, rows) + doubtful, noise(known, rows), accepts)
+    edges = gated_edges(s, landmarks, _BY_LABEL * gate_limit(gate))
     hit[edges.ray] = rows[edges.landmark]
     for i in np.flatnonzero(hit < 0).tolist():
         same = rows[known.label[rows] == rays.label[i]]
@@ -136,30 +146,26 @@ def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
     return sightings(origin, direction, rays.sigma, rays.range, rays.range_sigma, rays.label)
 
 
-def predicted(
-    rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, everywhere: bool = False
-) -> tuple[Ints, Floats, Floats, Floats]:
-    """Rows (n,) of the landmarks that could be in the frame, where (n, 3), with what covariance (n, 3, 3) as seen from its
-    camera, and the noise (n,) of their rays.
+def _ahead(rays: FrameRays, map_T_camera: Floats, known: Table) -> Ints:
+    """Rows (n,) of the landmarks that the rays could show."""
+    wanted = np.flatnonzero(np.isin(known.label, rays.label))
+    to = known.position[wanted] - map_T_camera[:3, 3]
+    off = (to @ (rays.direction @ map_T_camera[:3, :3].T).T).max(axis=1, initial=-np.inf)
+    return wanted[off > _VIEW * np.sqrt(np.einsum("ni,ni->n", to, to))]
 
-    The camera's own doubt is what the odometry gathered since the landmark was last seen, or that of its place in the map,
-    whichever is less.
+
+def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
+    """Covariances (n, 3, 3) of how places `to` (n, 3) away lie to the camera, by the doubt about where the camera is.
+
+    What the odometry gathered since the drift was `then` (n, 6, 6), or the doubt about its place in the map, whichever is
+    less.
     """
-    to = known.position - map_T_camera[:3, 3]
-    distance = np.linalg.norm(to, axis=1)
-    wanted = np.isin(known.label, rays.label)
-    if not everywhere:
-        off = (to / np.maximum(distance, 1e-6)[:, None]) @ (rays.direction @ map_T_camera[:3, :3].T).T
-        wanted &= off.max(axis=1, initial=-1.0) > _VIEW
-    rows = np.flatnonzero(wanted)
-    to = to[rows]
-    since = carried(to, gathered(doubt.drift, known.drift[rows]), map_T_camera, doubt.camera_from_drift)
-    own = covariances(known, rows)
-    if np.isfinite(doubt.pose).all():
-        placed = carried(to, doubt.pose, map_T_camera, np.eye(6))
-        less = np.trace(placed, axis1=1, axis2=2) < np.trace(since, axis1=1, axis2=2)
-        since = np.where(less[:, None, None], placed, since)
-    return rows, known.position[rows], own + since, noise(known, rows)
+    since = carried(to, gathered(doubt.drift, then), map_T_camera, doubt.camera_from_drift)
+    if not np.isfinite(doubt.pose).all():
+        return since
+    placed = carried(to, doubt.pose, map_T_camera, np.eye(6))
+    less = np.trace(placed, axis1=1, axis2=2) < np.trace(since, axis1=1, axis2=2)
+    return np.where(less[:, None, None], placed, since)
 
 
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
@@ -175,26 +181,26 @@ def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) 
     return chosen
 
 
-def _crowd(edges: Edges, sigma: Floats, label: Ints, unseen: Bools, known: Table, limit: float) -> Floats:
+def _crowd(edges: Edges, sigma: Floats, rows: Ints, known: Table, drift: Floats, limit: float) -> Floats:
     """How many other objects of its label are expected where each match (E,) would be accepted; sigma: (E,) rad.
 
-    label, unseen: (N,) of the places, and whether they were not seen for long. Of the others nothing has drifted that would
-    let another one take their place.
+    Of landmarks, rows (n,) of `known`, that were not seen for long. Of the others nothing has drifted that would let
+    another one take their place.
     """
     crowd = np.zeros(len(edges.ray))
-    old = np.flatnonzero(unseen[edges.landmark])
-    if len(old):
-        per_m3 = _density(known, label[edges.landmark[old]])
-        reach = float(known.far.max(initial=_REACH))
-        gate = np.pi * limit * sigma[old] ** 2 * np.exp(edges.vague[old] / 2)
-        crowd[old] = per_m3 * reach**3 / 3 * gate
+    of = np.flatnonzero(edges.landmark < len(rows))
+    of = of[long_unseen(drift, known.drift[rows])[edges.landmark[of]]]
+    if len(of):
+        per_m3 = _density(known, known.label[rows[edges.landmark[of]]])
+        gate = np.pi * limit * sigma[of] ** 2 * np.exp(edges.vague[of] / 2)
+        crowd[of] = per_m3 * float(known.far.max()) ** 3 / 3 * gate
     return crowd
 
 
 def _density(known: Table, label: Ints) -> Floats:
     """How many landmarks of labels (n,) there are per m^3, one more of each than are known."""
     number = np.bincount(known.label, minlength=int(label.max()) + 1) + 1
-    room = np.ptp(known.position, axis=0) if len(known) else np.zeros(3)
+    room = np.ptp(known.position, axis=0)
     return np.asarray(number[label] / np.prod(np.maximum(room, [_REACH, _REACH, _TALL])))
 
 

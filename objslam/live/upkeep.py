@@ -48,21 +48,27 @@ def after_keyframe(m: Mapper) -> None:
     due = m.keyframes_so_far % _EVERY == 0
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    if due or m.unrest:
+    if (due or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
         m.graph.update(relinearise=True)
         m.unrest = max(0, m.unrest - 1)
     if not due:
         return
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
-    if m.graph.in_turns:  # one thing after the other
-        return
+    tasks = [_thin_if_many, _polish_if_grown]
     if not m.by_label:
-        close_loop(m)
-        _merge(m)
-        _drop_ghosts(m)
+        tasks += [close_loop, _merge, _drop_ghosts]
+    for task in tasks:
+        if not m.graph.in_turns:  # one thing after the other: no frame may wait for long
+            task(m)
+
+
+def _thin_if_many(m: Mapper) -> None:
     if len(m.keyframes) > m.settings.live.max_keyframes:
         thin(m)
+
+
+def _polish_if_grown(m: Mapper) -> None:
     if m.keyframes_so_far >= max(_FIRST, _GROWTH * m.polished) and len(m.known):
         m.polished = m.keyframes_so_far
         polish(m)
