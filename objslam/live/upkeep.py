@@ -32,7 +32,9 @@ _ODDS = 2.5  # log odds that two landmarks are one, against another one that hap
 _FARTHEST = 1.0  # m; objects further apart are two, however little is known of them
 _TOGETHER = 0.03  # share of frames with both that a wrong box may account for
 _GHOST, _GHOST_FRAMES = 0.1, 40  # seen in a smaller share of so many frames that should show it, it is none
-_KEPT_FREE = 500  # the newest keyframes are never left out
+_NEWEST, _OLDEST = 1 / 3, 1 / 30
+"""Of live.max_keyframes that are never left out: the newest, and the oldest, whose rays alone tell how the map lies to where
+the robot began."""
 _SHARE = 0.25  # of the keyframes that are left out at a time
 _FEWEST = 10  # rays that a landmark keeps
 _HALF = 0.5  # of a landmark's rays; when fewer fit, it is looked for anew
@@ -222,10 +224,11 @@ def thin(m: Mapper) -> None:
     step = np.linalg.norm(np.diff(place, axis=0), axis=1)
     span = np.full(len(order), np.inf)
     span[1:-1] = step[:-1] + step[1:]
-    span[-_KEPT_FREE:] = np.inf
+    most = m.settings.live.max_keyframes
+    span[: int(_OLDEST * most)] = span[len(span) - int(_NEWEST * most) :] = np.inf
     rays_of = np.bincount(m.rays.owner[m.rays.used], minlength=int(m.known.id.max(initial=0)) + 1)
     out = np.zeros(len(order), dtype=bool)
-    wanted = int(_SHARE * m.settings.live.max_keyframes)
+    wanted = int(_SHARE * most)
     by_keyframe = np.argsort(m.rays.keyframe, kind="stable")
     sorted_keyframe = m.rays.keyframe[by_keyframe]
     for i in np.argsort(span, kind="stable").tolist():

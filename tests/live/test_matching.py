@@ -1,0 +1,104 @@
+"""Who a box may be of: near what was seen just now, and after a long way only where no other could be meant."""
+
+import numpy as np
+import pytest
+
+from objslam.config import load_settings
+from objslam.geometry import adjoint, inverse
+from objslam.live.candidates import Candidate, ripe
+from objslam.live.known import new_landmarks
+from objslam.live.matching import Doubt, FrameRays, match
+from objslam.live.upkeep import _one
+
+AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+SIGMA = 0.004
+
+
+def landmarks(positions, labels):
+    known = new_landmarks()
+    for i, (position, label) in enumerate(zip(positions, labels, strict=True)):
+        known.add(
+            id=[i], position=[position], information=[np.eye(3) * 1e4], label=[label], drift=np.zeros((1, 6, 6)), first=[0.0],
+            last=[0.0], seen=[30], expected=[30], far=[6.0], squared=[60.0], rejected=[0],
+        )  # fmt: skip
+    return known
+
+
+def ray(target, label=0):
+    local = AHEAD[:3, :3].T @ np.asarray(target)
+    nothing = np.full(1, np.nan)
+    direction = (local / np.linalg.norm(local))[None]
+    return FrameRays(
+        direction, np.full(1, SIGMA), nothing, nothing, np.array([label]), np.ones(1), np.zeros((1, 4)), np.array([-1])
+    )
+
+
+def doubt(heading, place=np.nan):
+    """Drift of so much in heading (rad) since what is known was seen; `place`: m and rad, of the place in the map."""
+    drift = np.diag([1e-8, 1e-8, heading**2, 1e-6, 1e-6, 1e-8])
+    return Doubt(drift, adjoint(inverse(AHEAD)), np.eye(6) * place**2)
+
+
+def found(known, target, heading, place=np.nan, candidates=()):
+    return match(ray(target), AHEAD, known, list(candidates), doubt(heading, place), 2, 0.99, {}).tolist()
+
+
+HALL = [(5.0, 0.0, 0.5), *((x, y, 0.5) for x in (-8.0, 0.0, 8.0, 14.0) for y in (-8.0, -5.0, 5.0, 8.0))]
+
+
+def test_a_landmark_seen_just_now_is_matched_among_many():
+    assert found(landmarks(HALL, [0] * len(HALL)), (5.0, 0.05, 0.5), 0.02) == [0]
+
+
+def test_after_a_long_way_only_where_hardly_another_of_its_label_could_be_meant():
+    many, alone = landmarks(HALL, [0] * len(HALL)), landmarks(HALL, [0] + [1] * (len(HALL) - 1))
+    off = (5.0, 0.1, 0.5)
+    assert found(many, off, 0.07) == [-1]
+    assert found(many, off, 0.07, place=0.01) == [0]  # known well where the camera is: nobody else
+    assert found(alone, off, 0.07) == [0]
+    assert found(alone, off, 0.5) == [-1]  # a drift that large leaves room for an object that is not known yet
+
+
+def candidate(drift):
+    one = Candidate(0, 0, False, 0.0, 0.0, drift)
+    one.position, one.covariance = np.array([5.0, 0.0, 0.5]), np.eye(3) * 1e-4
+    one.rays = [(0, 0, np.zeros(3), SIGMA, np.nan, np.nan)]
+    return one
+
+
+def test_a_candidate_is_given_up_after_a_long_way_unless_the_camera_knows_where_it_is():
+    known, one = landmarks([], []), candidate(np.zeros((6, 6)))
+    assert found(known, (5.0, 0.01, 0.5), 0.01, candidates=[one]) == [0]
+    assert found(known, (5.0, 0.01, 0.5), 0.07, candidates=[one]) == [-1]
+    assert found(known, (5.0, 0.01, 0.5), 0.07, place=0.01, candidates=[one]) == [0]
+
+
+class Still:
+    """Keyframes on a line across the view, 1 cm apart."""
+
+    def pose(self, k):
+        return np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.01 * k], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(("width", "count", "born"), [(45, 45, True), (15, 15, False), (45, 4, False), (100, 20, True)])
+def test_a_candidate_becomes_a_landmark_as_soon_as_it_is_sure(width, count, born):
+    """5 m away, 1 cm are 0.11 degrees: 45 of them are 5, less than half of joint.min_parallax_deg."""
+    graph, rng = Still(), np.random.default_rng(0)
+    one = Candidate(0, 0, False, 0.0, 0.0, np.zeros((6, 6)))
+    for number, k in enumerate(np.linspace(0, width, count).astype(int).tolist()):
+        pose = graph.pose(k)
+        local = pose[:3, :3].T @ (np.array([5.0, 0.2, 0.3]) - pose[:3, 3]) / 5.0 + rng.normal(0, SIGMA, 3)
+        one.extend((number, k, local / np.linalg.norm(local), SIGMA, np.nan, np.nan), pose)
+    met = ripe(one, graph, load_settings(None, ()), rng)
+    assert (met is not None) == born
+    if met is not None:
+        off = met.position - [5.0, 0.2, 0.3]
+        assert off @ np.linalg.solve(met.covariance, off) < 25
+
+
+def test_landmarks_are_one_where_they_are_near_and_few():
+    spread = np.eye(3) * 0.1**2
+    assert _one(np.array([0.1, 0.0, 0.0]), spread, 0.03)
+    assert not _one(np.array([0.1, 0.0, 0.0]), spread, 3.0)
+    assert not _one(np.array([0.5, 0.0, 0.0]), spread, 0.03)
+    assert not _one(np.array([0.5, 0.0, 0.0]), spread * 100, 0.5)
