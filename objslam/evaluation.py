@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from objslam.atomic_files import write_file
 from objslam.errors import ConfigError, LogError
 from objslam.geometry import align as align_points
 from objslam.geometry import interpolate
@@ -21,7 +22,6 @@ from objslam.results import (
     load_map,
     load_trajectory,
     load_truth,
-    write_file,
 )
 from objslam.types import Floats, MapObject, ObjectMap, Trajectory, Truth, TruthObject
 

@@ -71,8 +71,8 @@ class ObjectMap:
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the map as JSON (objects.json); `load` gives the same map back, to the last bit. OutputError if not."""
+        from objslam.atomic_files import write_file
         from objslam.objects_file import dump_objects
-        from objslam.results import write_file
 
         write_file(Path(file), dump_objects(self).encode())
 

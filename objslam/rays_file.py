@@ -1,16 +1,20 @@
-"""rays.parquet read back."""
+"""rays.parquet, the file of a result's rays: the one place that writes and reads it."""
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from objslam.atomic_files import encode
 from objslam.errors import OutputError
-from objslam.results import RAYS
 from objslam.types import Floats, Ints
+
+if TYPE_CHECKING:
+    from objslam.results import RunResult
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,42 @@ class RaysTable:
         return len(self.object)
 
 
-def read_rays(out: Path) -> RaysTable:
-    """The rays of the result in the folder `out`; OutputError where the file is missing, damaged, or of an older version."""
+def dump_rays(result: RunResult) -> bytes:
+    """The content of rays.parquet: one row a ray; object is the id in objects.json, null where none.
+
+    OutputError where a name of a label or a camera is no text that can be written.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    file = out / RAYS
+    ids = np.array([o.id for o in result.map.objects] or [0], dtype=np.int64)
+    index = result.association.object
+    names = np.array([encode(name).decode() for name in result.rays.label_names], dtype=object)
+    cameras = np.array([encode(camera.name).decode() for camera in result.cameras], dtype=object)
+    table = pa.table(
+        {
+            "stamp": pa.array(result.keyframes.stamps[result.rays.keyframe]),
+            "object": pa.array(ids[index], mask=index < 0),
+            "origin": pa.FixedSizeListArray.from_arrays(pa.array(result.origins.ravel()), 3),
+            "direction": pa.FixedSizeListArray.from_arrays(pa.array(result.directions.ravel()), 3),
+            "residual": pa.array(result.residual, mask=np.isnan(result.residual)),
+            "weight": pa.array(result.weight),
+            "label": pa.array(names[result.rays.label], type=pa.string()),
+            "score": pa.array(result.rays.score),
+            "camera": pa.array(cameras[result.keyframes.camera[result.rays.keyframe]], type=pa.string()),
+            "box": pa.FixedSizeListArray.from_arrays(pa.array(result.rays.box.ravel()), 4),
+        }
+    )
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer)
+    return buffer.getvalue()
+
+
+def read_rays(file: Path) -> RaysTable:
+    """What `dump_rays` wrote; OutputError where the file is missing, damaged, or of an older version."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         table = pq.read_table(file)
         index = table["object"]

@@ -1,14 +1,9 @@
-"""The result of a run on disk: a folder that is either whole or does not claim to be."""
+"""The result of a run, and what of it is on disk: which files, what writes them and reads them back."""
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import io
 import json
 import math
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from objslam.atomic_files import FileSet, disk_errors, encode, has_staging, is_cut_short, replace_files, try_folder
 from objslam.config import Settings, dump_settings
 from objslam.errors import LogError, OutputError
 from objslam.folders import no_empty_folders
@@ -26,6 +22,7 @@ from objslam.matching import lay_truth
 from objslam.motions_file import Motions, dump_motions, motions_of, read_motions
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
 from objslam.ply_file import write_cloud, write_mesh
+from objslam.rays_file import RaysTable, dump_rays, read_rays
 from objslam.sources.detections_file import write_detections
 from objslam.sources.folder import resembles_log
 from objslam.sources.trajectory_file import read_trajectory, write_trajectory
@@ -53,16 +50,15 @@ SURFACE, SURFACE_BEFORE, CLOUD = "reconstruction.ply", "reconstruction_before.pl
 EVALUATION, REPORT = "evaluation.json", "report.html"
 MOTIONS = "motions.parquet"
 EXPORTS = ("objects.csv", "objects.geojson", "objects.ply", "graph.g2o", "map.mcap")
-_OWN = (
-    *(SUMMARY, OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
-    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT, *EXPORTS),
+_FILES = FileSet(
+    SUMMARY,
+    (
+        *(OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
+        *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT, *EXPORTS),
+    ),
+    f"*.{DETECTIONS}",
 )
-"""Every file that belongs to a result, the summary first: it goes first and comes last, so that it stands for the whole."""
-_STAGING = ".objslam-staging"
-_SWAPPING = "swapping"
-"""In the staging folder from before the first old file goes: what a killed swap left beside it is no one's but ours."""
-_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
-"""What network file systems answer that can neither lock nor sync a folder: there we go on without."""
+"""Every file that belongs to a result, those of the commands that come after the run as well."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +99,14 @@ def prepare_output(out: Path) -> None:
     OutputError when no result could be written there, or only in the place of files that no run wrote: those of a log, a
     ground truth, or others that are called as ours are.
     """
-    with _disk(out):
+    with disk_errors(out):
         if out.exists() and not out.is_dir():
             raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
         _check_foreign(out)
-        out.mkdir(parents=True, exist_ok=True)
-        for name in _OWN:
+        for name in _FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
                 raise OutputError("a folder stands where a file of the result goes", where=str(out / name))
-        with _staged(out) as staging:
-            _write(staging / "probe", b"objslam")
+    try_folder(out, _FILES)
 
 
 @contextmanager
@@ -129,32 +123,14 @@ def write_result(
     """Write the whole result into the folder `out`, in place of an older one; other files there stay.
 
     Returns the names of the older one's files that went and have no successor, such as what was exported or reported of it.
+    Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json only with everything
+    that belongs to it. OutputError when the disk refuses or another run writes there.
 
-    Everything is written beside the result first. Only then the old files go, all of them, and the new ones come by rename,
-    summary.json last. Killed at any moment, the folder holds no half file and no mix of two results, and a summary.json
-    only with everything that belongs to it. OutputError when the disk refuses or another run writes there. truth is kept
-    beside the result for `load_truth`, and drawn as it lies on the map. detected: cameras whose detections this run made;
-    they are kept as detections.jsonl (of several cameras, with the camera's name), which a log can take over.
+    truth is kept beside the result for `load_truth`, and drawn as it lies on the map. detected: cameras whose detections
+    this run made; they are kept as detections.jsonl (of several cameras, with the camera's name), which a log can take over.
     """
     prepare_output(out)
-    with _disk(out), _staged(out) as staging:
-        for name, write in _writers(result, truth, detected).items():
-            write(staging / name)
-            _sync(staging / name)
-        _sync(staging)
-        return _swap(staging, out)
-
-
-def write_file(file: Path, data: bytes) -> None:
-    """Write one file under a temporary name and rename it; OutputError, with the file's own name, when the disk refuses."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    with _disk(file, only=True):
-        try:
-            _write(temporary, data)
-            temporary.replace(file)
-            _sync(file.parent)
-        finally:
-            temporary.unlink(missing_ok=True)
+    return replace_files(out, _FILES, _writers(result, truth, detected))
 
 
 def load_map(out: Path) -> ObjectMap:
@@ -179,6 +155,11 @@ def load_motions(out: Path) -> Motions | None:
     _existing(out, OBJECTS)
     file = out / MOTIONS
     return read_motions(file) if file.is_file() else None
+
+
+def load_rays(out: Path) -> RaysTable:
+    """The rays of the result in the folder `out`; OutputError where the file is missing, damaged, or of an older version."""
+    return read_rays(out / RAYS)
 
 
 def load_truth(path: Path) -> Truth | None:
@@ -217,28 +198,28 @@ def _existing(out: Path, name: str) -> Path:
     if not out.is_dir():
         raise OutputError("there is no such result folder", where=str(out))
     if not (out / name).is_file():
-        hint = "was its run killed? run again" if (out / _STAGING).exists() else hint_below(out)
+        hint = "was its run killed? run again" if has_staging(out) else hint_below(out)
         raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
     return out / name
 
 
-def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], None]]:
+def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:
     """What writes each file, by name."""
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])
-    writers: dict[str, Callable[[Path], None]] = {
-        OBJECTS: lambda file: _write(file, _encode(dump_objects(result.map))),
+    writers: dict[str, Callable[[Path], object]] = {
+        OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
         TRAJECTORY: lambda file: write_trajectory(path, file),
-        RAYS: lambda file: _write(file, _rays_parquet(result)),
-        CONFIG: lambda file: _write(file, _encode(dump_settings(result.settings))),
-        SUMMARY: lambda file: _write(file, _encode(dump_json(result.summary))),
+        RAYS: lambda file: file.write_bytes(dump_rays(result)),
+        CONFIG: lambda file: file.write_bytes(encode(dump_settings(result.settings))),
+        SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),
     }
     motions = motions_of(result)
     if motions is not None:
-        writers[MOTIONS] = lambda file: _write(file, dump_motions(motions))
+        writers[MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))
     if truth is not None and truth.objects:
         true = truth.objects
-        writers[TRUTH_OBJECTS] = lambda file: _write(file, _encode(dump_truth_objects(true)))
+        writers[TRUTH_OBJECTS] = lambda file: file.write_bytes(encode(dump_truth_objects(true)))
     if truth is not None and truth.trajectory is not None:
         true_path = truth.trajectory
         writers[TRUTH_TRAJECTORY] = lambda file: write_trajectory(true_path, file)
@@ -281,44 +262,12 @@ def _plain(data: Any) -> Any:
     return data
 
 
-def _rays_parquet(result: RunResult) -> bytes:
-    """rays.parquet: one row a ray; object is the id in objects.json, null where none."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    ids = np.array([o.id for o in result.map.objects] or [0], dtype=np.int64)
-    index = result.association.object
-    names = np.array([_encode(name).decode() for name in result.rays.label_names], dtype=object)
-    cameras = np.array([_encode(camera.name).decode() for camera in result.cameras], dtype=object)
-    table = pa.table(
-        {
-            "stamp": pa.array(result.keyframes.stamps[result.rays.keyframe]),
-            "object": pa.array(ids[index], mask=index < 0),
-            "origin": pa.FixedSizeListArray.from_arrays(pa.array(result.origins.ravel()), 3),
-            "direction": pa.FixedSizeListArray.from_arrays(pa.array(result.directions.ravel()), 3),
-            "residual": pa.array(result.residual, mask=np.isnan(result.residual)),
-            "weight": pa.array(result.weight),
-            "label": pa.array(names[result.rays.label], type=pa.string()),
-            "score": pa.array(result.rays.score),
-            "camera": pa.array(cameras[result.keyframes.camera[result.rays.keyframe]], type=pa.string()),
-            "box": pa.FixedSizeListArray.from_arrays(pa.array(result.rays.box.ravel()), 4),
-        }
-    )
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer)
-    return buffer.getvalue()
-
-
-def _own(folder: Path) -> tuple[str, ...]:
-    return _OWN + tuple(sorted(file.name for file in folder.glob(f"*.{DETECTIONS}")))
-
-
 def _check_foreign(out: Path) -> None:
     """OutputError where the folder holds files that a result would replace and that no run wrote."""
     if resembles_log(out):
         raise OutputError("this is a log, not a place for its result", where=str(out), hint="name another folder with -o")
-    names = [name for name in _own(out) if (out / name).is_file()]
-    if names and not _is_cut_short(out) and not _is_result(out, names):
+    names = [name for name in _FILES.names(out) if (out / name).is_file()]
+    if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
         raise OutputError(
             f"in the way of a result, and not written by a run: {', '.join(names)}",
             where=str(out),
@@ -335,95 +284,3 @@ def _is_result(out: Path, names: list[str]) -> bool:
         return names == [OBJECTS] or isinstance(json.loads((out / SUMMARY).read_bytes()), dict)
     except (OutputError, OSError, ValueError):
         return False
-
-
-def _swap(staging: Path, out: Path) -> tuple[str, ...]:
-    """Put the staged files in the place of the old ones; the order is what keeps a killed run from a mix."""
-    removed = tuple(name for name in _own(out) if (out / name).exists() and not (staging / name).exists())
-    _write(staging / _SWAPPING, b"")
-    _sync(staging)
-    for name in _own(out):
-        (out / name).unlink(missing_ok=True)
-        if name == SUMMARY:
-            _sync(out)
-    _sync(out)
-    for name in reversed(_own(staging)):
-        if (staging / name).exists():
-            if name == SUMMARY:
-                _sync(out)
-            (staging / name).replace(out / name)
-    _sync(out)
-    return removed
-
-
-def _write(file: Path, data: bytes) -> None:
-    with file.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _encode(text: str) -> bytes:
-    try:
-        return text.encode()
-    except UnicodeEncodeError as error:
-        bad = error.object[max(error.start - 20, 0) : error.end]
-        raise OutputError(f"text that cannot be written (half of a surrogate pair) near {bad!r}") from error
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno not in _UNSUPPORTED:
-            raise
-    finally:
-        os.close(handle)
-
-
-def _is_cut_short(out: Path) -> bool:
-    """Whether a swap began in the folder and did not end: then it holds parts of a result."""
-    return (out / _STAGING / _SWAPPING).exists() and not (out / SUMMARY).exists()
-
-
-@contextmanager
-def _staged(out: Path) -> Iterator[Path]:
-    """An empty staging folder in `out`, and `out` to ourselves as long as the process lives; gone afterwards.
-
-    A swap that was cut short leaves it, as the sign of whose the rest is; here that rest goes too. OutputError when another
-    run has it.
-    """
-    staging = out / _STAGING
-    handle = os.open(out, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OutputError("another run is writing here", where=str(out), hint="name another folder with -o") from error
-        except OSError as error:
-            if error.errno not in _UNSUPPORTED:
-                raise
-        if staging.exists():  # a killed run left it: the lock says that nobody is at it
-            if _is_cut_short(out):
-                for name in _own(out):
-                    (out / name).unlink(missing_ok=True)
-            shutil.rmtree(staging)
-        staging.mkdir()
-        try:
-            yield staging
-        finally:
-            if not _is_cut_short(out):
-                shutil.rmtree(staging, ignore_errors=True)
-    finally:
-        os.close(handle)
-
-
-@contextmanager
-def _disk(path: Path, *, only: bool = False) -> Iterator[None]:
-    """What the disk refuses, as an OutputError of one line; it names the file in question, or (only) always the path."""
-    try:
-        yield
-    except OSError as error:
-        where = str(path if only or error.filename is None else error.filename)
-        raise OutputError(f"cannot write or read: {error.strerror or error}", where=where) from error

@@ -21,11 +21,10 @@ from objslam.config import Settings
 from objslam.errors import OutputError
 from objslam.evaluation import evaluate, evaluate_folder, write_evaluation
 from objslam.ledger import Ledger
-from objslam.rays_file import read_rays
 from objslam.report import write_report
 from objslam.report.charts import HEIGHT, axis_end, histogram
 from objslam.report.crops import best_rays
-from objslam.results import load_map, load_trajectory, load_truth, write_result
+from objslam.results import load_map, load_rays, load_trajectory, load_truth, write_result
 from objslam.simulation import make_camera
 from objslam.sources import SourceOptions, read
 from objslam.types import ObjectMap
@@ -305,7 +304,7 @@ def test_no_file_outside_the_log_is_shown(mapped: Path) -> None:
 
 
 def test_the_best_boxes_are_spread_over_time(mapped: Path) -> None:
-    rays = read_rays(mapped / "out")
+    rays = load_rays(mapped / "out")
     mine = np.flatnonzero(rays.object == 0)
     score, weight = np.full(len(rays), 0.5), np.ones(len(rays))
     score[mine[[3, 20]]] = 0.9

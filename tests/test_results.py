@@ -10,7 +10,6 @@ import math
 import os
 import re
 import resource
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +18,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from killed import contents, in_child, killed_at
 from small_log import small_log
 from synthetic_result import clusters, synthetic_result
 
-from objslam import results
 from objslam.config import Output, Settings, load_settings
-from objslam.errors import LogError, ObjslamError, OutputError
+from objslam.errors import LogError, OutputError
 from objslam.objects_file import dump_objects, dump_truth_objects, read_objects, read_truth_objects
-from objslam.results import RunResult, load_map, load_trajectory, load_truth, prepare_output, write_file, write_result
+from objslam.results import RunResult, load_map, load_trajectory, load_truth, prepare_output, write_result
 from objslam.simulation import make_camera
 from objslam.sources.folder import write_log_folder
 from objslam.sources.trajectory_file import write_trajectory
@@ -318,46 +317,6 @@ def test_an_older_result_goes_as_a_whole_and_foreign_files_stay(tmp_path: Path) 
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def in_child(work: Callable[[], None]) -> int:
-    """The exit code of a forked process that does the work: 0 done, 3 an ObjslamError, 4 any other error, 9 killed."""
-    child = os.fork()
-    if child == 0:
-        try:
-            work()
-            os._exit(0)
-        except ObjslamError:
-            os._exit(3)
-        finally:
-            os._exit(4)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-
-
-def killed_at(step: int, work: Callable[[], None]) -> Callable[[], None]:
-    """The work, with the process killed right before its step-th call that touches the disk for good."""
-
-    def run() -> None:
-        left = step
-
-        def count(call: Callable[..., object]) -> Callable[..., object]:
-            def counted(*args: object, **kwargs: object) -> object:
-                nonlocal left
-                left -= 1
-                if left < 0:
-                    os._exit(9)
-                return call(*args, **kwargs)
-
-            return counted
-
-        os.fsync, os.rename, os.replace, os.unlink = map(count, (os.fsync, os.rename, os.replace, os.unlink))  # type: ignore[assignment]
-        work()
-
-    return run
-
-
-def contents(out: Path) -> dict[str, bytes]:
-    return {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
-
-
 def test_killed_at_any_moment_no_half_file_and_no_mix(tmp_path: Path) -> None:
     old, new = small(seed=0), dataclasses.replace(small(seed=1, keyframes=13), summary={"mode": "fixed"})
     write_result(old, tmp_path / "old")
@@ -420,6 +379,15 @@ def test_places_where_no_result_can_go(tmp_path: Path) -> None:
         prepare_output(tmp_path / "out")
 
 
+def test_a_folder_in_the_way_of_any_file_leaves_the_old_result(tmp_path: Path) -> None:
+    write_result(small(), tmp_path)
+    (tmp_path / "front.detections.jsonl").mkdir()
+    before = contents(tmp_path)
+    with pytest.raises(OutputError, match="a folder stands where a file of the result goes"):
+        write_result(small(seed=1), tmp_path)
+    assert contents(tmp_path) == before
+
+
 @pytest.mark.parametrize("inner", [".", "groundtruth", "cameras/left"])
 def test_a_result_does_not_go_into_a_log(tmp_path: Path, inner: str) -> None:
     log = small_log(cameras=tuple(make_camera(name) for name in (("left", "right") if "left" in inner else ("left",))))
@@ -475,17 +443,6 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     write_result(small(), tmp_path)
 
 
-def test_a_folder_that_cannot_be_synced_still_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unsupported(*_: object) -> None:
-        raise OSError(22, "Invalid argument")
-
-    monkeypatch.setattr(results.fcntl, "flock", unsupported)
-    monkeypatch.setattr(results, "_write", lambda file, data: file.write_bytes(data))
-    monkeypatch.setattr(results.os, "fsync", unsupported)
-    write_result(small(), tmp_path)
-    assert load_map(tmp_path).objects
-
-
 def test_half_a_surrogate_pair_is_one_line(tmp_path: Path) -> None:
     result = small()
     rays = dataclasses.replace(result.rays, label_names=("\ud800", *result.rays.label_names[1:]))
@@ -495,20 +452,6 @@ def test_half_a_surrogate_pair_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="surrogate"):
         write_result(summary, tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_write_file_replaces_at_once(tmp_path: Path) -> None:
-    file = tmp_path / "evaluation.json"
-    write_file(file, b"old")
-    for step in range(20):
-        code = in_child(killed_at(step, lambda: write_file(file, b"new")))
-        assert file.read_bytes() in (b"old", b"new")
-        if code == 0:
-            break
-    assert file.read_bytes() == b"new"
-    with pytest.raises(OutputError, match="No such file") as caught:
-        write_file(tmp_path / "none" / "x.json", b"")
-    assert caught.value.where == str(tmp_path / "none" / "x.json")  # not the temporary name
 
 
 def test_loading_what_is_not_there(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from mesh_view import Picture, View, save
 
 from objslam.ply_file import read_mesh
 from objslam.proximity import Field, Slice, field, pulling
-from objslam.rays_file import RaysTable, read_rays
-from objslam.results import SURFACE, load_map
+from objslam.rays_file import RaysTable
+from objslam.results import SURFACE, load_map, load_rays
 from objslam.types import Floats, MapObject, Surface
 
 BLUE, BLACK, INK = (38, 110, 205), (12, 12, 14), "#282c34"
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--object", type=int, help="id; the one with the most rays if not given")
     parser.add_argument("-o", "--out", type=Path, default=Path("fig2.png"))
     args = parser.parse_args()
-    surface, objects, rays = read_mesh(args.result / SURFACE), load_map(args.result).resolved(), read_rays(args.result)
+    surface, objects, rays = read_mesh(args.result / SURFACE), load_map(args.result).resolved(), load_rays(args.result)
     named = {o.id: o for o in objects}
     if args.object is not None and args.object not in named:
         parser.error(f"there is no resolved object {args.object}")

@@ -174,8 +174,9 @@ def _replay(
 
 def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
     """Run the adapter until it ends or Ctrl-C, with a status line and objects.json."""
+    from objslam.atomic_files import write_file
     from objslam.objects_file import dump_objects
-    from objslam.results import OBJECTS, write_file
+    from objslam.results import OBJECTS
 
     sys.setswitchinterval(_HAND_OVER)
     stop, failure = threading.Event(), list[BaseException]()

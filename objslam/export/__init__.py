@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from objslam.atomic_files import write_file
 from objslam.errors import ConfigError, OutputError
 from objslam.export import csv_file, g2o_file, geojson_file, mcap_file, ply_file
 from objslam.export.content import Content, load_content
 from objslam.export.datum import Datum
-from objslam.results import write_file
 
 Format = Literal["csv", "geojson", "ply", "g2o", "mcap"]
 

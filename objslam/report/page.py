@@ -15,14 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from objslam.atomic_files import write_file
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.errors import ConfigError, OutputError
 from objslam.evaluation import Evaluation, evaluate
 from objslam.matching import lay_truth
-from objslam.rays_file import RaysTable, read_rays
+from objslam.rays_file import RaysTable
 from objslam.report.charts import Histogram, axis_end, histogram
 from objslam.report.crops import Crop, best_rays, cut_crops, images_of
-from objslam.results import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY, load_map, load_trajectory, load_truth, write_file
+from objslam.results import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY, load_map, load_rays, load_trajectory, load_truth
 from objslam.scene import REJECTED_BELOW, captions, label_colours
 from objslam.types import MapObject, ObjectMap
 
@@ -81,7 +82,7 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
     import jinja2
 
     progress("reading the result", 0, 0)
-    objects, rays, summary = load_map(out), read_rays(out), _json(out / SUMMARY)
+    objects, rays, summary = load_map(out), load_rays(out), _json(out / SUMMARY)
     settings = _settings(out / CONFIG)
     errors, scores = _evaluation(out, objects)
     mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from objslam.errors import ConfigError, OutputError
 from objslam.proximity import Field, field, level, pulling
-from objslam.rays_file import read_rays
-from objslam.results import RECORDING, load_map, load_trajectory
+from objslam.results import RECORDING, load_map, load_rays, load_trajectory
 from objslam.scene import RayKind, captions
 from objslam.types import Bools, Floats, MapObject, ObjectMap
 from objslam.viewer.eye import Eye, first_eye, look_at
@@ -36,7 +35,7 @@ def write_field(out: Path, number: int, file: Path) -> Field:
     """
     import rerun as rr
 
-    objects, rays = load_map(out), read_rays(out)
+    objects, rays = load_map(out), load_rays(out)
     o = next((o for o in objects.objects if o.id == number), None)
     if o is None:
         ids = ", ".join(str(o.id) for o in objects.objects) or "none"
