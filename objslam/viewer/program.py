@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,12 +116,11 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
     web, data = free_port(), free_port()
     viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))
     try:
-        wait_for(viewer, web)
-        say(f"{web_address(web, data)} (Ctrl+C ends it)")
-        _, said = _until_closed(viewer)
-        raise _failure(viewer.returncode, said, None)
-    except KeyboardInterrupt:
-        pass
+        with suppress(KeyboardInterrupt):  # Ctrl+C is how serving ends
+            wait_for(viewer, web)
+            say(f"{web_address(web, data)} (Ctrl+C ends it)")
+            _, said = _until_closed(viewer)
+            raise _failure(viewer.returncode, said, None)
     finally:
         stop(viewer)
 
