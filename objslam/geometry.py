@@ -25,8 +25,11 @@ def make_pose(rotation: Floats, translation: Floats) -> Floats:
 
 def inverse(pose: Floats) -> Floats:
     """The inverse of rigid poses (..., 4, 4)."""
-    rotation_t = np.swapaxes(pose[..., :3, :3], -1, -2)
-    return make_pose(rotation_t, -(rotation_t @ pose[..., :3, 3:])[..., 0])
+    back = np.zeros(pose.shape)
+    back[..., :3, :3] = np.swapaxes(pose[..., :3, :3], -1, -2)
+    back[..., :3, 3:] = -(back[..., :3, :3] @ pose[..., :3, 3:])
+    back[..., 3, 3] = 1.0
+    return back
 
 
 def pose_from_quaternion(translation: Floats, xyzw: Floats) -> Floats:

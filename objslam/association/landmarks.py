@@ -85,9 +85,9 @@ class State:
         return merged.keep(target == np.arange(len(target)))
 
 
-def variance(s: Sightings, distance: Floats, noise: Floats) -> Floats:
-    """Variance (R,), m^2 per axis across, of the offset of a landmark at `distance` (R,) m from its ray."""
-    return np.asarray(noise**2 * ((s.sigma * distance) ** 2 + s.place**2))
+def variance(s: Sightings, distance: Floats, noise: Floats, of: Ints | slice = slice(None)) -> Floats:
+    """Variance (E,), m^2 per axis across, of the offset of a landmark at `distance` (E,) m from its ray; of: (E,) which one."""
+    return np.asarray(noise**2 * ((s.sigma[of] * distance) ** 2 + s.place**2))
 
 
 def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
@@ -98,10 +98,12 @@ def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
     return np.where(depth > 0, np.maximum(distance2 - depth**2, 0.0), np.inf), np.sqrt(distance2)
 
 
-def range_costs(s: Sightings, distance: Floats, variance_along: Floats | float = 0.0) -> Floats:
-    """What the range of each ray (R,) adds to the cost of a landmark at `distance` (R,) m; 0 where there is none."""
+def range_costs(
+    s: Sightings, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
+) -> Floats:
+    """What the range of a ray adds to the cost of a landmark at `distance` (E,) m, 0 where there is none; of: (E,) which."""
     with np.errstate(invalid="ignore"):
-        wrong = (distance - s.range) ** 2 / (s.range_sigma**2 + variance_along) - RANGE_GAIN
+        wrong = (distance - s.range[of]) ** 2 / (s.range_sigma[of] ** 2 + variance_along) - RANGE_GAIN
     return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
 
 

@@ -36,9 +36,17 @@ class Edges:
 def across(direction: Floats) -> Floats:
     """Two unit vectors (R, 2, 3) across each unit direction (R, 3) and each other."""
     helper = np.eye(3)[np.abs(direction).argmin(axis=1)]  # the axis that is furthest from parallel
-    first = np.cross(direction, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(direction, first)], axis=1)
+    axes = np.empty((len(direction), 2, 3))
+    axes[:, 0] = _cross(direction, helper)
+    axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1, keepdims=True)
+    axes[:, 1] = _cross(direction, axes[:, 0])
+    return axes
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """np.cross of (R, 3) and (R, 3), in a fifth of its time for few of them."""
+    i, j = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[:, i] * b[:, j] - a[:, j] * b[:, i])
 
 
 def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
@@ -47,23 +55,23 @@ def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | 
     pose: (R, 6, 6) covariance of each ray's camera, rotation first, rotations about the map's axes (rad) and position (m).
     """
     ray, index = _near(s, landmarks, gate, pose)
-    r = s.take(ray)
-    to = landmarks.position[index] - r.origin
+    direction = s.direction[ray]
+    to = landmarks.position[index] - s.origin[ray]
     distance = np.linalg.norm(to, axis=1)
-    axes = across(r.direction)
+    axes = across(direction)
     offset = np.einsum("eij,ej->ei", axes, to)
     covariance = landmarks.covariance[index]
     if pose is not None:
         covariance = covariance + _carried(to, pose[ray])
     spread = np.einsum("eij,ejk,elk->eil", axes, covariance, axes)
-    own = variance(r, distance, landmarks.noise[index])
+    own = variance(s, distance, landmarks.noise[index], ray)
     spread += own[:, None, None] * np.eye(2)
     a, b, c = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]
     determinant = a * c - b**2
     deviation = (c * offset[:, 0] ** 2 - 2 * b * offset[:, 0] * offset[:, 1] + a * offset[:, 1] ** 2) / determinant
-    along = np.einsum("ei,eij,ej->e", r.direction, covariance, r.direction)
+    along = np.einsum("ei,eij,ej->e", direction, covariance, direction)
     vague = np.log(determinant / own**2)
-    cost = deviation + vague + range_costs(r, distance, along)
+    cost = deviation + vague + range_costs(s, distance, along, ray)
     keep = np.flatnonzero(deviation <= gate)
     keep = keep[np.lexsort((index[keep], ray[keep]))]
     return Edges(ray[keep], index[keep], deviation[keep], vague[keep], cost[keep])

@@ -132,11 +132,11 @@ def along_ray(
     ]
 
 
-def motions(keyframes: Keyframes, settings: Settings) -> tuple[Floats, Floats]:
+def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:
     """Camera motion (K-1, 4, 4) between consecutive keyframes by odometry, and its covariance (K-1, 6, 6), rotation first.
 
     The measured motion is E_prev^-1 * odo * E_next and its covariance Ad(E_next^-1) S Ad(E_next^-1)^T, where S, in base, is
-    what the odometry gathered between the two, and a floor for each step.
+    what the odometry gathered between the two, and a floor for each step. on_plane: whether the path is planar, None to see.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
@@ -144,7 +144,8 @@ def motions(keyframes: Keyframes, settings: Settings) -> tuple[Floats, Floats]:
     back = adjoint(inverse(odom_T_base[1:]))
     s = back @ (drift[1:] - drift[:-1]) @ np.swapaxes(back, 1, 2)
     odometry, planar = settings.odometry, settings.planar
-    tilt, z = (planar.tilt, planar.z) if is_planar(odom_T_base) else (odometry.floor_yaw, odometry.floor_xy)
+    on_plane = is_planar(odom_T_base) if on_plane is None else on_plane
+    tilt, z = (planar.tilt, planar.z) if on_plane else (odometry.floor_yaw, odometry.floor_xy)
     s += np.diag([tilt, tilt, odometry.floor_yaw, odometry.floor_xy, odometry.floor_xy, z]) ** 2
     to_camera = adjoint(inverse(keyframes.base_T_camera[1:]))
     map_T_camera = odom_T_base @ keyframes.base_T_camera

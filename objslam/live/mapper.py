@@ -181,6 +181,7 @@ class Mapper:
         """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
         if self._lesson is not None:
             learn(self, self._lesson)
+            place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == self._lesson.keyframe])
             self._lesson = None
         upkeep.after_keyframe(self)
 
@@ -233,7 +234,6 @@ class Mapper:
             new_candidate(self, rays, i, numbers[i], k, stamp, doubt)
         if not self.by_label:
             leave_out_the_least(self)
-        place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == k])
         if len(matched):
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
         give_birth(self, k)
@@ -287,7 +287,7 @@ class Mapper:
             noise = self.settings.localization
             doubt = np.diag([noise.yaw] * 3 + [noise.xy] * 3) ** 2 if before is not None else np.zeros((6, 6))
             return np.asarray(row["map_T_base"]) @ np.asarray(row["base_T_camera"]), doubt, None
-        motion, covariance = factors.motions(self._pair(before, row), self.settings)
+        motion, covariance = factors.motions(self._pair(before, row), self.settings, self.odometry.planar)
         k = int(self.keyframes.id[before])
         back = adjoint(inverse(motion[0]))
         if k not in self._doubts:  # asked for now and then: between, the odometry adds to it

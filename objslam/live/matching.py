@@ -17,6 +17,10 @@ from objslam.live.table import Table
 from objslam.types import Bools, Floats, Ints
 
 _VIEW = np.cos(np.radians(40.0))  # landmarks further off every box of a frame are not looked at
+_BEYOND, _NEAR = (
+    1.5,
+    10.0,
+)  # times the greatest distance from which anything was seen, and m; what is further is not looked at
 _ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough
 _CLEAR = 6.0  # squared deviations by which the best of several places that are all rough must be better
 _CROWD = 0.02  # other objects that may be expected in the gate of a landmark that was not seen for long
@@ -76,7 +80,8 @@ def match(
 ) -> Ints:
     """For each ray (n,) the row of its landmark, len(known) + the index of its candidate, or -1.
 
-    Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark (id) that a detector's track was given last.
+    Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark
+    (id) that a detector's track was given last.
     """
     rows = _ahead(rays, map_T_camera, known)
     here = set(rays.label.tolist())
@@ -96,9 +101,8 @@ def match(
     limit = gate_limit(gate)
     edges = gated_edges(s, Landmarks(places, covariance, noises, accepts), limit)
     away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
-    clear = _clear(edges, rays.sigma[edges.ray] * away, len(rows))
-    alone = _crowd(edges, rays.sigma[edges.ray], rows, known, doubt.drift, limit) < _CROWD
-    edges = _some(edges, clear & alone)
+    edges = _clear(edges, rays.sigma, away, len(rows))
+    edges = _alone(edges, rays.sigma, rows, known, doubt.drift, limit)
     number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
@@ -151,7 +155,8 @@ def _ahead(rays: FrameRays, map_T_camera: Floats, known: Table) -> Ints:
     wanted = np.flatnonzero(np.isin(known.label, rays.label))
     to = known.position[wanted] - map_T_camera[:3, 3]
     off = (to @ (rays.direction @ map_T_camera[:3, :3].T).T).max(axis=1, initial=-np.inf)
-    return wanted[off > _VIEW * np.sqrt(np.einsum("ni,ni->n", to, to))]
+    distance2 = np.einsum("ni,ni->n", to, to)
+    return wanted[(off > _VIEW * np.sqrt(distance2)) & (distance2 < max(_BEYOND * known.far.max(initial=0.0), _NEAR) ** 2)]
 
 
 def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
@@ -181,20 +186,20 @@ def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) 
     return chosen
 
 
-def _crowd(edges: Edges, sigma: Floats, rows: Ints, known: Table, drift: Floats, limit: float) -> Floats:
-    """How many other objects of its label are expected where each match (E,) would be accepted; sigma: (E,) rad.
+def _alone(edges: Edges, sigma: Floats, rows: Ints, known: Table, drift: Floats, limit: float) -> Edges:
+    """Without the matches to landmarks that were not seen for long where others of their label may be meant as well.
 
-    Of landmarks, rows (n,) of `known`, that were not seen for long. Of the others nothing has drifted that would let
-    another one take their place.
+    rows: (n,) of the landmarks in `known`. Of the others nothing has drifted that would let another one take their place.
     """
-    crowd = np.zeros(len(edges.ray))
     of = np.flatnonzero(edges.landmark < len(rows))
     of = of[long_unseen(drift, known.drift[rows])[edges.landmark[of]]]
-    if len(of):
-        per_m3 = _density(known, known.label[rows[edges.landmark[of]]])
-        gate = np.pi * limit * sigma[of] ** 2 * np.exp(edges.vague[of] / 2)
-        crowd[of] = per_m3 * float(known.far.max()) ** 3 / 3 * gate
-    return crowd
+    if not len(of):
+        return edges
+    per_m3 = _density(known, known.label[rows[edges.landmark[of]]])
+    gate = np.pi * limit * sigma[edges.ray[of]] ** 2 * np.exp(edges.vague[of] / 2)  # steradians
+    crowd = np.zeros(len(edges.ray))
+    crowd[of] = per_m3 * float(known.far.max()) ** 3 / 3 * gate
+    return _some(edges, crowd < _CROWD)
 
 
 def _density(known: Table, label: Ints) -> Floats:
@@ -208,15 +213,17 @@ def _some(edges: Edges, keep: Bools) -> Edges:
     return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])
 
 
-def _clear(edges: Edges, own: Floats, landmarks: int) -> Bools:
-    """Without the matches to landmarks that are expected only roughly, where it could as well be another; own: (n,) m.
+def _clear(edges: Edges, sigma: Floats, away: Floats, landmarks: int) -> Edges:
+    """Without the matches to landmarks that are expected only roughly, where it could as well be another; away: (E,) m.
 
     Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`).
     """
     rough = (edges.vague > 2 * np.log(_ROUGH)) & (edges.landmark < landmarks)
-    width = own * np.exp(edges.vague / 4)  # the side of a square as large as what the landmark covers
+    if not rough.any():
+        return edges
+    width = sigma[edges.ray] * away * np.exp(edges.vague / 4)  # the side of a square as large as what the landmark covers
     order = np.lexsort((edges.cost, edges.ray))
     ray, cost = edges.ray[order], edges.cost[order]
     rivals = np.flatnonzero((np.diff(ray) == 0) & (np.diff(cost) < _CLEAR) & (np.diff(ray, prepend=-1)[:-1] != 0)) + 1
     both = rough[order[rivals]] & rough[order[rivals - 1]]
-    return ~(rough & (np.isin(edges.ray, ray[rivals[both]]) | (width > _WIDEST)))
+    return _some(edges, ~(rough & (np.isin(edges.ray, ray[rivals[both]]) | (width > _WIDEST))))

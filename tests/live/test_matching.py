@@ -18,8 +18,8 @@ def landmarks(positions, labels):
     known = new_landmarks()
     for i, (position, label) in enumerate(zip(positions, labels, strict=True)):
         known.add(
-            id=[i], position=[position], information=[np.eye(3) * 1e4], label=[label], drift=np.zeros((1, 6, 6)), first=[0.0],
-            last=[0.0], seen=[30], expected=[30], far=[6.0], squared=[60.0], rejected=[0],
+            id=[i], position=[position], information=[np.eye(3) * 1e4], label=[label], drift=np.zeros((1, 6, 6)),
+            first=[0.0], last=[0.0], seen=[30], expected=[30], far=[6.0], squared=[60.0], rejected=[0],
         )  # fmt: skip
     return known
 
