@@ -86,7 +86,7 @@ class State:
 
 
 def variance(s: Sightings, distance: Floats, noise: Floats, of: Ints | slice = slice(None)) -> Floats:
-    """Variance (E,), m^2 per axis across, of the offset of a landmark at `distance` (E,) m from its ray; of: (E,) which one."""
+    """Variance (E,), m^2 per axis across, of the offset of a landmark at `distance` (E,) m from its ray; of: (E,) which."""
     return np.asarray(noise**2 * ((s.sigma[of] * distance) ** 2 + s.place**2))
 
 
