@@ -129,9 +129,11 @@ def live(
 
             feed = replace(feed, views=(*feed.views, DdsPublisher(open_network(domain, interface)).publish))
         if view is not None:
+            from objslam.viewer.images import of_log
             from objslam.viewer.live import open_view
 
-            feed = replace(feed, views=(*feed.views, stack.enter_context(open_view(view, say)).show))
+            image = feed.image if recording is None else of_log(recording[0])
+            feed = replace(feed, views=(*feed.views, stack.enter_context(open_view(view, say, image)).show))
         session.start()
         _drive(session, feed, out, interval)
         _finish(session, feed, out, truth)

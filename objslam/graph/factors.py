@@ -6,6 +6,7 @@ Keys: X(k) is keyframe k's camera in map (Pose3), L(j) is object j (Point3).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -46,22 +47,21 @@ def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRE
     (in the residual's unit). `gnc` is left without a loss: its optimiser brings it.
     """
     digits = 10.0 ** (np.floor(np.log10(sigmas)) - 2)
-    values, which = np.unique(np.round(sigmas / digits) * digits, return_inverse=True)
+    return [_model(loss, sigma, dimension, l1_kink) for sigma in (np.round(sigmas / digits) * digits).tolist()]
+
+
+@lru_cache(maxsize=4096)
+def _model(loss: Loss, sigma: float, dimension: int, l1_kink: float) -> gtsam.noiseModel.Base:
     estimators, wrap = gtsam.noiseModel.mEstimator, gtsam.noiseModel.Robust.Create
-    models: list[gtsam.noiseModel.Base] = []
-    for sigma in values:
-        if loss == "l1":  # whitened by s, Huber's slope is k / s and its kink k * s: these are 1 / sigma and l1_kink
-            whitened = gtsam.noiseModel.Isotropic.Sigma(dimension, np.sqrt(sigma * l1_kink))
-            models.append(wrap(estimators.Huber.Create(np.sqrt(l1_kink / sigma)), whitened))
-            continue
-        model = gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
-        if loss == "huber":
-            models.append(wrap(estimators.Huber.Create(HUBER_K), model))
-        elif loss == "cauchy":
-            models.append(wrap(estimators.Cauchy.Create(CAUCHY_K), model))
-        else:
-            models.append(model)
-    return [models[i] for i in which]
+    if loss == "l1":  # whitened by s, Huber's slope is k / s and its kink k * s: these are 1 / sigma and l1_kink
+        whitened = gtsam.noiseModel.Isotropic.Sigma(dimension, np.sqrt(sigma * l1_kink))
+        return wrap(estimators.Huber.Create(np.sqrt(l1_kink / sigma)), whitened)
+    model = gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
+    if loss == "huber":
+        return wrap(estimators.Huber.Create(HUBER_K), model)
+    if loss == "cauchy":
+        return wrap(estimators.Cauchy.Create(CAUCHY_K), model)
+    return model
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:

@@ -78,4 +78,5 @@ class DetectorWorker:
                 self._drop("image that the detector failed on", f"{place}: {error}")
             else:
                 size, frame = (image.shape[1], image.shape[0]), frame_name(message.header.frame_id)
-                self._deliver(Boxes(topic, stamp, frame, self._clock(), found.boxes, found.labels, found.scores, size=size))
+                what = found.boxes, found.labels, found.scores
+                self._deliver(Boxes(topic, stamp, frame, self._clock(), *what, size=size, image=image))

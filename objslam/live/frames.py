@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from objslam.types import Floats
 
 Drop = Callable[[str, str], None]
@@ -16,7 +19,7 @@ class Boxes:
     """The boxes of one image: stamp, s; frame: the camera's, as tf names it, "" where unknown; arrived: s, any clock.
 
     points: by the index of its box, a tag that comes without a box (see boxes2d). size: of the image, where known.
-    whole: as `types.Detections` has it.
+    whole: as `types.Detections` has it. image: (H, W, 3) uint8 BGR, where it was at hand.
     """
 
     topic: str
@@ -30,6 +33,7 @@ class Boxes:
     points: dict[int, Floats] = field(default_factory=dict)
     size: tuple[int, int] | None = None
     whole: bool = False
+    image: NDArray[np.uint8] | None = None
 
     @property
     def place(self) -> str:

@@ -53,10 +53,9 @@ def carried(to: Floats, drift: Floats, map_T_camera: Floats, camera_from_drift: 
 
     camera_from_drift: (6, 6) takes the covariances to the camera's frame.
     """
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = map_T_camera[:3, :3]
-    lever = skew(to)
-    jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2) @ (turn @ camera_from_drift)
+    turn = map_T_camera[:3, :3]
+    move = turn @ camera_from_drift[3:]
+    jacobian = skew(to) @ (turn @ camera_from_drift[:3]) - move
     return np.asarray(jacobian @ drift @ np.swapaxes(jacobian, 1, 2))
 
 

@@ -152,7 +152,7 @@ def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
 
 def _ahead(rays: FrameRays, map_T_camera: Floats, known: Table) -> Ints:
     """Rows (n,) of the landmarks that the rays could show."""
-    wanted = np.flatnonzero(np.isin(known.label, rays.label))
+    wanted = np.flatnonzero((known.label[:, None] == rays.label).any(axis=1))
     to = known.position[wanted] - map_T_camera[:3, 3]
     off = (to @ (rays.direction @ map_T_camera[:3, :3].T).T).max(axis=1, initial=-np.inf)
     distance2 = np.einsum("ni,ni->n", to, to)

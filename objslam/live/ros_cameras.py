@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from objslam.errors import LogError
 from objslam.live.depth_images import DepthImages
@@ -27,6 +28,7 @@ PATIENCE = 1.0
 
 _DEPTH_WAIT = 0.2  # s that boxes wait for a depth image
 _MAX_WAITING = 200
+_IMAGES, _SAME = 8, 0.001  # images of a camera that are kept for a view, and s by which their stamps may differ
 _MAX_CAMERAS = 64
 _STILL = 1e-9
 
@@ -64,6 +66,7 @@ class Cameras:
         self._waiting: deque[Boxes] = deque()
         self._topics: dict[str, str] = {}
         self._depths = DepthImages(drop)
+        self._images: dict[str, deque[tuple[float, NDArray[np.uint8]]]] = {}
 
     def add_info(self, topic: str, info: Any) -> None:
         """Take a sensor_msgs/CameraInfo: a calibration that changes is pushed anew with the next boxes."""
@@ -136,7 +139,13 @@ class Cameras:
         depths = self._depths.at(boxes, camera)
         found = boxes.boxes, boxes.labels, boxes.scores, depths, boxes.track_ids, boxes.whole
         self._sink.push_detections(boxes.stamp, name, *found)
+        if boxes.image is not None:
+            self._images.setdefault(name, deque(maxlen=_IMAGES)).append((boxes.stamp, boxes.image))
         return ""
+
+    def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
+        """The image that a camera's boxes of a stamp, s, came from, where it is one of the newest."""
+        return next((image for at, image in self._images.get(camera, ()) if abs(at - stamp) <= _SAME), None)
 
     def _place(self, known: _Known, stamp: float) -> Floats:
         return np.asarray(self._tf.at(self._base(), known.frame, stamp) @ known.frame_T_camera)

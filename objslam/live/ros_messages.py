@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from objslam.errors import ConfigError
 from objslam.ledger import Ledger
@@ -135,6 +136,11 @@ class RosMessages:
         """Push the boxes of an image, however they were found."""
         with self._lock:
             self._cameras.add(boxes)
+
+    def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
+        """The image (H, W, 3), uint8 BGR, that the detector saw at a stamp, s; None where it is not one of the newest."""
+        with self._lock:
+            return self._cameras.image(camera, stamp)
 
     def serves(self, role: str) -> str | None:
         """The topic (or "tf") that plays a role by now."""

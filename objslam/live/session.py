@@ -19,7 +19,7 @@ from objslam.live.interface import Snapshot
 from objslam.live.journal import Journal, messages
 from objslam.live.mapper import Mapper
 from objslam.live.messages import FrameMessage, Message
-from objslam.live.snapshots import Describer, path
+from objslam.live.snapshots import Describer, frames, path
 from objslam.results import RunResult
 from objslam.types import Camera, Floats, ObjectMap, Trajectory
 
@@ -270,6 +270,7 @@ class Session:
             stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
             map=self._describer.map(m, whole=self._stopping),
             path=path(m),
+            frames=frames(m),
             keyframes=m.keyframes_so_far,
             rebuilds=m.graph.rebuilds,
             lag=self._lag,

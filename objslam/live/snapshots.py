@@ -10,6 +10,7 @@ import numpy as np
 from objslam.association.extent import extents
 from objslam.geometry import inverse, widest_angle
 from objslam.live.candidates import Candidate
+from objslam.live.interface import Frame
 from objslam.live.known import covariances
 from objslam.live.mapper import Mapper
 from objslam.live.meeting import misses, sightings
@@ -107,6 +108,22 @@ def path(m: Mapper) -> Trajectory:
     stamps, first = np.unique(k.stamp, return_index=True)
     poses = m.graph.poses(k.id[first]) @ inverse(k.base_T_camera[first])
     return Trajectory(stamps, poses)
+
+
+def frames(m: Mapper) -> tuple[Frame, ...]:
+    """The newest keyframe of each camera, with the boxes that became rays."""
+    m.graph.refresh()
+    found, k, r = [], m.keyframes, m.rays
+    for number, camera in enumerate(m.cameras):
+        mine = np.flatnonzero(k.camera == number)
+        if not len(mine):
+            continue
+        row = int(mine[k.stamp[mine].argmax()])
+        rays = np.flatnonzero(r.keyframe == k.id[row])
+        owner = r.owner[rays].copy()
+        rejected = (owner >= 0) & ~r.used[rays]
+        found.append(Frame(float(k.stamp[row]), camera, m.graph.pose(int(k.id[row])), r.box[rays].copy(), owner, rejected))
+    return tuple(found)
 
 
 def _waiting(m: Mapper, candidate: Candidate) -> MapObject:

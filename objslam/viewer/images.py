@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from objslam.detection.frames import ahead, decode_image
 from objslam.errors import LogError
 from objslam.sources.textfile import read_bytes
-from objslam.types import Floats, Images, Ints
+from objslam.types import Floats, Images, Ints, Log
 
 MAX_LAG = 0.05  # s between a keyframe and the image that is shown for it
 _QUALITY = 70
@@ -30,17 +32,35 @@ def choose(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
     return there, near[there]
 
 
+def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
+    """What finds the image (H, W, 3), uint8 BGR, of a camera, by its name, at a stamp, s, in a log; None without one."""
+    streams = {c.camera.name: c.rgb for c in log.cameras if c.rgb is not None}
+
+    def find(camera: str, stamp: float) -> NDArray[np.uint8] | None:
+        images = streams.get(camera)
+        if images is None:
+            return None
+        _, which = choose(images, np.array([stamp]), 1)
+        return _read(images.paths[which[0]]) if len(which) else None
+
+    return find
+
+
 def jpegs(images: Images, which: Ints, width: int, height: int) -> Iterator[bytes | None]:
     """The chosen images as JPEG of this size, px, one after the other; None for one that cannot be read."""
     return ahead(lambda i: _jpeg(images, int(i), (width, height)), which.tolist(), _AHEAD)
 
 
 def _jpeg(images: Images, index: int, size: tuple[int, int]) -> bytes | None:
+    pixels = _read(images.paths[index])
+    return None if pixels is None else pack(pixels, size)
+
+
+def _read(path: Path) -> NDArray[np.uint8] | None:
     try:
-        pixels = decode_image(read_bytes(images.paths[index]))
+        return decode_image(read_bytes(path))
     except LogError:
         return None
-    return None if pixels is None else pack(pixels, size)
 
 
 def pack(pixels: np.ndarray, size: tuple[int, int]) -> bytes:

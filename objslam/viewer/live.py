@@ -7,31 +7,42 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from objslam.errors import ConfigError, OutputError
 from objslam.viewer import program
-from objslam.viewer.wire import Frame, encode
+from objslam.viewer.wire import encode
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from objslam.live.interface import Snapshot
 
 _WAITING = 4  # snapshots that wait at the most: of more, the oldest is dropped
 _ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")
 
 
-def open_view(where: str, say: Callable[[str], None]) -> LiveView:
-    """A live view in a window (`window`), a browser (`web`), a recording (a name that ends in .rrd), or at an address."""
+Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
+"""The image of a camera, by its name, at a stamp, s; None where there is none."""
+
+
+def open_view(where: str, say: Callable[[str], None], image: Image | None = None) -> LiveView:
+    """A live view in a window (`window`), a browser (`web`), a recording (a name that ends in .rrd), or at an address.
+
+    image: what finds the images of frames, if anything does.
+    """
     if where == "window":
-        return LiveView.spawn()
+        return LiveView.spawn(image=image)
     if where == "web":
-        return LiveView.serve(say)
+        return LiveView.serve(say, image=image)
     if where.endswith(".rrd"):
-        return LiveView(file=Path(where))
-    return LiveView(address=where)
+        return LiveView(file=Path(where), image=image)
+    return LiveView(address=where, image=image)
 
 
 class LiveView:
@@ -42,9 +53,10 @@ class LiveView:
     A viewer that was killed is looked for again every few seconds; started anew at the same address, it gets all that comes.
     """
 
-    def __init__(self, *, file: Path | None = None, address: str | None = None) -> None:
+    def __init__(self, *, file: Path | None = None, address: str | None = None, image: Image | None = None) -> None:
         """Log to a recording file (as it comes: readable at any time), to the viewer at an address, or to both.
 
+        image: finds the images of the frames in snapshots; it is called from the view's own thread.
         ConfigError where an address is none; OutputError where the file cannot be written.
         """
         if address is not None and not _ADDRESS.fullmatch(address):
@@ -64,7 +76,8 @@ class LiveView:
         """Snapshots that arrived."""
         self.dropped = 0
         """Snapshots that did not: the viewer was too slow, or gone."""
-        self._waiting: deque[tuple[Snapshot, tuple[Frame, ...]]] = deque()
+        self._image = image
+        self._waiting: deque[Snapshot] = deque()
         self._changed = threading.Condition()
         self._closing = False
         self._viewer: subprocess.Popen[bytes] | None = None
@@ -79,34 +92,34 @@ class LiveView:
         self._thread.start()
 
     @classmethod
-    def spawn(cls, *, file: Path | None = None) -> Self:
+    def spawn(cls, *, file: Path | None = None, image: Image | None = None) -> Self:
         """Open the native viewer; it stays open at the end. OutputError where it cannot open."""
         port = program.free_port()
         viewer = program.start("--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
         program.wait_for(viewer, port)
         program.let_go(viewer)
-        return cls(file=file, address=program.address(port))
+        return cls(file=file, address=program.address(port), image=image)
 
     @classmethod
-    def serve(cls, say: Callable[[str], None], *, file: Path | None = None) -> Self:
+    def serve(cls, say: Callable[[str], None], *, file: Path | None = None, image: Image | None = None) -> Self:
         """Serve a viewer to a browser on this machine, until the end; say(text) gets the address."""
         web, port = program.free_port(), program.free_port()
         viewer = program.start("--serve-web", "--web-viewer-port", str(web), "--port", str(port))
         program.wait_for(viewer, web)
         program.let_go(viewer)
         say(program.web_address(web, port))
-        view = cls(file=file, address=program.address(port))
+        view = cls(file=file, address=program.address(port), image=image)
         view._viewer = viewer
         return view
 
-    def show(self, snapshot: Snapshot, frames: Sequence[Frame] = ()) -> bool:
-        """Take a snapshot, and what the cameras saw since the last one; False where an older one was dropped for it."""
+    def show(self, snapshot: Snapshot) -> bool:
+        """Take a snapshot; False where an older one was dropped for it."""
         with self._changed:
             full = len(self._waiting) >= _WAITING
             if full:
                 self._waiting.popleft()
                 self.dropped += 1
-            self._waiting.append((snapshot, tuple(frames)))
+            self._waiting.append(snapshot)
             self._changed.notify_all()
         return not full
 
@@ -143,9 +156,9 @@ class LiveView:
                 self._changed.wait_for(lambda: self._waiting or self._closing)
                 if not self._waiting:
                     break
-                snapshot, frames = self._waiting.popleft()
+                snapshot = self._waiting.popleft()
             try:
-                into.write(encode(snapshot, frames, self.dropped))
+                into.write(encode(self._with_images(snapshot), self.dropped))
                 into.flush()
                 answer = back.readline()
             except OSError:  # the process is gone
@@ -161,6 +174,13 @@ class LiveView:
             into.close()
         except OSError:  # what was left in it has nowhere to go: it is counted
             return
+
+    def _with_images(self, snapshot: Snapshot) -> Snapshot:
+        find = self._image
+        if find is None:
+            return snapshot
+        frames = (f if f.image is not None else replace(f, image=find(f.camera.name, f.stamp)) for f in snapshot.frames)
+        return replace(snapshot, frames=tuple(frames))
 
     def _drop_all(self) -> None:
         """Without a process there is nothing to show to: count until the end."""

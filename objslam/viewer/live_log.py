@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from objslam.geometry import quaternion
+from objslam.live.interface import Frame
 from objslam.rays import undistort
 from objslam.types import Ints, ObjectMap
 from objslam.viewer.blueprint import blueprint
@@ -17,7 +18,7 @@ from objslam.viewer.objects import colours, log_objects
 from objslam.viewer.rays import RAY_COLOURS
 from objslam.viewer.story import map_changes
 from objslam.viewer.times import STAMP, is_date
-from objslam.viewer.wire import Frame, Shown
+from objslam.viewer.wire import Shown
 
 _PATH = (40, 44, 52)
 _LOST = 2.0  # m; how far a ray is drawn that ends on no object

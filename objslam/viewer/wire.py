@@ -4,37 +4,19 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from objslam.live.interface import Snapshot
+from objslam.live.interface import Frame, Snapshot
 from objslam.objects_file import dump_objects, parse_objects
-from objslam.types import Bools, Camera, Floats, Ints, ObjectMap
+from objslam.types import Camera, Floats, ObjectMap
 from objslam.viewer.paths import thinned
 
 _LENGTH = struct.Struct("<Q")
 _MOST_POINTS = 500  # of the path
 _LARGEST = 1 << 30
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What a camera saw at one keyframe.
-
-    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) ids, -1 where none explains a box. rejected: (B,)
-    whether the robust loss rejected it. image: (H, W, 3) uint8 BGR or JPEG, as the camera has it; None without.
-    """
-
-    stamp: float
-    camera: Camera
-    map_T_camera: Floats
-    boxes: Floats
-    objects: Ints
-    rejected: Bools
-    image: np.ndarray | bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -50,8 +32,9 @@ class Shown:
     dropped: dict[str, int]
 
 
-def encode(snapshot: Snapshot, frames: Sequence[Frame], unseen: int = 0) -> bytes:
-    """A snapshot and frames as one message; unseen: snapshots that were dropped before it."""
+def encode(snapshot: Snapshot, unseen: int = 0) -> bytes:
+    """A snapshot as one message; unseen: snapshots that were dropped before it."""
+    frames = snapshot.frames
     numbers = {
         "keyframes": snapshot.keyframes,
         "rebuilds": snapshot.rebuilds,

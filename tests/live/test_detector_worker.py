@@ -82,6 +82,9 @@ def test_the_newest_image_counts_and_the_overtaken_are_counted(robot):
     assert [(round(stamp, 3), name) for stamp, name, *_ in sink.detections] == [(0.1, "front"), (1.1, "front")]
     np.testing.assert_array_equal([row[2][0] for row in sink.detections], [[1, 2, 2, 3], [11, 22, 12, 23]])
     assert sink.detections[1][3] == ["spot"]
+    assert messages.image("front", 1.1)[22, 11, 2] == 255  # what a view asks for
+    assert messages.image("front", 0.7) is None
+    assert messages.image("rear", 1.1) is None
     assert messages.ledger.dropped == {"image that a newer one overtook before the detector had time for it": 9}
 
 

@@ -18,12 +18,13 @@ from rrd import Recording, rgb
 from synthetic_result import clusters, synthetic_result
 
 from objslam.errors import ConfigError, OutputError
-from objslam.live.interface import Snapshot
+from objslam.live.interface import Frame, Snapshot
 from objslam.results import RunResult
-from objslam.types import ObjectMap, Trajectory
+from objslam.types import Camera, CameraLog, Images, Log, ObjectMap, Trajectory
 from objslam.viewer import program
+from objslam.viewer.images import of_log
 from objslam.viewer.live import LiveView
-from objslam.viewer.wire import Frame, encode, read
+from objslam.viewer.wire import encode, read
 
 
 def snapshots(result: RunResult, count: int) -> list[Snapshot]:
@@ -61,9 +62,9 @@ def result() -> RunResult:
 
 
 def test_a_message_comes_through_whole(result: RunResult) -> None:
-    snapshot = snapshots(result, 4)[-1]
-    stream = io.BytesIO(encode(snapshot, [frame(result, 7)], 5) + encode(Snapshot(np.nan, ObjectMap(()), Trajectory(
-        np.zeros(0), np.zeros((0, 4, 4)))), ()))  # fmt: skip
+    snapshot = dataclasses.replace(snapshots(result, 4)[-1], frames=(frame(result, 7),))
+    nothing = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
+    stream = io.BytesIO(encode(snapshot, 5) + encode(nothing))
     first, second = read(stream), read(stream)
     assert read(stream) is None
     assert first is not None
@@ -81,16 +82,49 @@ def test_a_message_comes_through_whole(result: RunResult) -> None:
     np.testing.assert_allclose(cv2.imdecode(np.frombuffer(got.image, np.uint8), 1)[5, 5], (10, 20, 200), atol=4)
     assert np.isnan(second[0].stamp)
     assert second[0].base is None
-    cut = encode(snapshot, [frame(result, 7)])[:-10]
+    cut = encode(snapshot)[:-10]
     assert read(io.BytesIO(cut)) is None
     assert read(io.BytesIO(cut[:300])) is None
+
+
+def test_frames_get_their_images_where_they_are_found(result: RunResult, tmp_path: Path) -> None:
+    """What a session hands over has none: they are asked for by the camera's name and the stamp."""
+    bare = dataclasses.replace(frame(result, 7), image=None)
+    snapshot = dataclasses.replace(snapshots(result, 4)[-1], frames=(bare,))
+    images = {("front", bare.stamp): np.full((480, 640, 3), (200, 20, 10), dtype=np.uint8)}
+    for name, find in (("with", lambda *asked: images.get(asked)), ("without", lambda *_: None)):
+        with LiveView(file=tmp_path / f"{name}.rrd", image=find) as view:
+            view.show(snapshot)
+            wait_until(lambda view=view: view.shown)
+    r = Recording(tmp_path / "with.rrd")
+    blob = bytes(np.array(r.get("/map/camera/front/image", "EncodedImage:blob")[-1][0], dtype=np.uint8))
+    np.testing.assert_allclose(cv2.imdecode(np.frombuffer(blob, np.uint8), 1)[5, 5], (200, 20, 10), atol=4)
+    assert "/map/camera/front/image" not in Recording(tmp_path / "without.rrd").paths()
+    assert len(Recording(tmp_path / "without.rrd").get("/map/camera/front/boxes", "Boxes2D:half_sizes")[-1])
+
+
+def test_the_image_of_a_log_at_a_stamp(tmp_path: Path) -> None:
+    paths = []
+    for i in range(3):
+        paths.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(paths[-1]), np.full((4, 6, 3), 10 * i, dtype=np.uint8))
+    paths[2].write_bytes(b"no image")
+    front = Camera("front", 6, 4, np.eye(3))
+    log = Log("log", (CameraLog(front, rgb=Images(np.array([1.0, 1.1, 1.2]), tuple(paths))),))
+    find = of_log(log)
+    near, next_one = find("front", 1.02), find("front", 1.09)
+    assert near is not None and next_one is not None  # noqa: PT018
+    assert (near[0, 0, 0], next_one[0, 0, 0]) == (0, 10)
+    assert find("front", 1.2) is None  # damaged
+    assert find("front", 5.0) is None
+    assert find("rear", 1.0) is None
 
 
 def test_a_session_becomes_a_recording(result: RunResult, tmp_path: Path) -> None:
     every = snapshots(result, 4)
     with LiveView(file=tmp_path / "live.rrd") as view:
         for k, snapshot in enumerate(every):
-            view.show(snapshot, [frame(result, 10 * k + 9)])
+            view.show(dataclasses.replace(snapshot, frames=(frame(result, 10 * k + 9),)))
             while view.shown <= k:
                 time.sleep(0.01)
     assert (view.shown, view.dropped) == (4, 0)
@@ -139,11 +173,13 @@ def viewer() -> Iterator[tuple[subprocess.Popen[bytes], int]]:
         process.wait()
 
 
-def heavy(result: RunResult) -> tuple[Snapshot, list[Frame]]:
-    """A snapshot with more images than a socket has room for."""
+def heavy(result: RunResult) -> tuple[Snapshot, Snapshot]:
+    """A snapshot, and the same with more images than a socket has room for."""
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     picture = cv2.imencode(".jpg", noise)[1].tobytes()
-    return snapshots(result, 4)[-1], [dataclasses.replace(frame(result, k), image=picture) for k in range(40)]
+    snapshot = snapshots(result, 4)[-1]
+    many = tuple(dataclasses.replace(frame(result, k), image=picture) for k in range(40))
+    return snapshot, dataclasses.replace(snapshot, frames=many)
 
 
 @pytest.mark.parametrize("how", ["frozen", "killed"])
@@ -151,7 +187,7 @@ def test_a_viewer_that_hangs_or_dies_keeps_nobody_waiting(
     result: RunResult, viewer: tuple[subprocess.Popen[bytes], int], how: str
 ) -> None:
     process, port = viewer
-    snapshot, frames = heavy(result)
+    snapshot, large = heavy(result)
     view = LiveView(address=program.address(port))
     view.show(snapshot)
     end = time.monotonic() + 20
@@ -165,7 +201,7 @@ def test_a_viewer_that_hangs_or_dies_keeps_nobody_waiting(
         process.wait()
     number = 40
     for _ in range(number):  # a call that waited for the viewer would never come back
-        view.show(snapshot, frames)
+        view.show(large)
         time.sleep(0.02)
     view.close(timeout=1.0)
     assert view.shown + view.dropped == number + 1
@@ -208,10 +244,10 @@ def test_a_process_ends_however_its_viewer_is(viewer: tuple[subprocess.Popen[byt
     script = (
         "import os, signal, sys, time\n"
         "import numpy as np\n"
-        "from objslam.live.interface import Snapshot\n"
+        "from objslam.live.interface import Frame, Snapshot\n"
         "from objslam.types import Camera, ObjectMap, Trajectory\n"
         "from objslam.viewer.live import LiveView\n"
-        "from objslam.viewer.wire import Frame\n"
+        "from dataclasses import replace\n"
         "snapshot = Snapshot(1.0, ObjectMap(()), Trajectory(np.zeros(1), np.eye(4)[None]))\n"
         "none = np.zeros(0, dtype=np.int64)\n"
         "camera = Camera('front', 640, 480, np.eye(3))\n"
@@ -220,7 +256,7 @@ def test_a_process_ends_however_its_viewer_is(viewer: tuple[subprocess.Popen[byt
         "view.show(snapshot)\n"
         "while not view.shown: time.sleep(0.02)\n"
         "os.kill(int(sys.argv[2]), signal.SIGSTOP)\n"
-        "for _ in range(10): view.show(snapshot, [frame, frame])\n"
+        "for _ in range(10): view.show(replace(snapshot, frames=(frame, frame)))\n"
         "time.sleep(0.5)\n"
         "print(view._process.pid, view.shown, flush=True)\n"
     )

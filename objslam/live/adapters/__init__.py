@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from objslam.ledger import Ledger
 from objslam.live.interface import Sink, Snapshot
 from objslam.sources import SourceOptions
@@ -48,11 +51,15 @@ class LiveOptions:
 
 @dataclass(frozen=True)
 class Feed:
-    """An adapter, what else wants to see the snapshots, and what to close in the end."""
+    """An adapter, what else wants to see the snapshots, and what to close in the end.
+
+    image: the image of a camera, by its name, at a stamp, s, where the adapter sees any.
+    """
 
     adapter: Adapter
     views: tuple[Callable[[Snapshot], object], ...] = ()
     close: tuple[Callable[[], None], ...] = ()
+    image: Callable[[str, float], NDArray[np.uint8] | None] | None = None
 
 
 def _stdin(sink: Sink, options: LiveOptions) -> Feed:
@@ -69,14 +76,14 @@ def _dds(sink: Sink, options: LiveOptions) -> Feed:
 
     network = open_network(options.domain, options.interface)
     messages, choice, close = _ros(sink, options)
-    return Feed(DdsAdapter(network, messages, choice), close=close)
+    return Feed(DdsAdapter(network, messages, choice), close=close, image=messages.image)
 
 
 def _rclpy(sink: Sink, options: LiveOptions) -> Feed:
     from objslam.live.adapters.rclpy import RclpyAdapter
 
     messages, choice, close = _ros(sink, options)
-    return Feed(RclpyAdapter(messages, choice), close=close)
+    return Feed(RclpyAdapter(messages, choice), close=close, image=messages.image)
 
 
 def _ros(sink: Sink, options: LiveOptions) -> tuple[RosMessages, TopicChoice, tuple[Callable[[], None], ...]]:
