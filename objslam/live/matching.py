@@ -192,10 +192,12 @@ def _alone(edges: Edges, sigma: Floats, rows: Ints, known: Table, drift: Floats,
     rows: (n,) of the landmarks in `known`. Of the others nothing has drifted that would let another one take their place.
     """
     of = np.flatnonzero(edges.landmark < len(rows))
-    of = of[long_unseen(drift, known.drift[rows])[edges.landmark[of]]]
-    if not len(of):
+    row = rows[edges.landmark[of]]
+    unseen = long_unseen(drift, known.drift[row])
+    if not unseen.any():
         return edges
-    per_m3 = _density(known, known.label[rows[edges.landmark[of]]])
+    of, row = of[unseen], row[unseen]
+    per_m3 = _density(known, known.label[row])
     gate = np.pi * limit * sigma[edges.ray[of]] ** 2 * np.exp(edges.vague[of] / 2)  # steradians
     crowd = np.zeros(len(edges.ray))
     crowd[of] = per_m3 * float(known.far.max()) ** 3 / 3 * gate
