@@ -33,6 +33,7 @@ from objslam.types import Camera, Floats, Ints, Keyframes
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
 _STANDING = 10  # keyframes from one place
+_NOVEL = 0.02  # weight of a frame in the share of boxes that show nothing known
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
 
 
@@ -69,6 +70,7 @@ class Mapper:
         self._doubts: dict[int, Floats] = {}
         self._lesson: Lesson | None = None
         self.doubt = np.full((6, 6), np.nan)
+        self.novelty = 1.0
         self._next_ray = self._next_keyframe = self._count = 0
         self.next_object = self.next_candidate = 0
 
@@ -208,7 +210,10 @@ class Mapper:
             owner[mine[lost]] = known.id[missed[lost]]
             free = mine[(hit < 0) & ~lost]
         else:
-            hit = match(some, guess, known, self.candidates, doubt, len(self.labels), settings.association.gate, self.tracks)
+            hit = match(
+                some, guess, known, self.candidates, doubt, len(self.labels), settings.association.gate, self.tracks, self.novelty
+            )
+            self.novelty += _NOVEL * float((hit < 0).mean() + ((hit >= len(known)).mean()) - self.novelty)
             for i in np.flatnonzero(hit >= len(known)).tolist():
                 extend(self, self.candidates[hit[i] - len(known)], rays, i, numbers[i], k, stamp, doubt)
             free = mine[hit < 0]

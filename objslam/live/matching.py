@@ -13,6 +13,7 @@ from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
 from objslam.live.known import HORIZON, carried, covariances, gathered, long_unseen, noise
 from objslam.live.meeting import sightings
+from objslam.live.returning import expected_unknown, trusted
 from objslam.live.table import Table
 from objslam.types import Bools, Floats, Ints
 
@@ -23,8 +24,6 @@ _BEYOND, _NEAR = (
 )  # times the greatest distance from which anything was seen, and m; what is further is not looked at
 _ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough
 _CLEAR = 6.0  # squared deviations by which the best of several places that are all rough must be better
-_CROWD = 0.02  # other objects that may be expected in the gate of a landmark that was not seen for long
-_REACH, _TALL = 4.0, 1.0  # m; a room that holds objects is that long and wide and tall, at the least
 _WIDEST = 0.3  # m; a place that is rougher than that tells no landmark from another
 _PLACED = 0.1  # m; a camera known that well in the map tells apart what it saw long ago, too
 _BY_LABEL = 4.0  # times the gate, where only one object has the label
@@ -77,11 +76,12 @@ def match(
     labels: int,
     gate: float,
     tracks: dict[int, int],
+    novelty: float = 1.0,
 ) -> Ints:
     """For each ray (n,) the row of its landmark, len(known) + the index of its candidate, or -1.
 
     Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark
-    (id) that a detector's track was given last.
+    (id) that a detector's track was given last. novelty: the share of boxes that showed nothing known, of late.
     """
     rows = _ahead(rays, map_T_camera, known)
     here = set(rays.label.tolist())
@@ -102,7 +102,6 @@ def match(
     edges = gated_edges(s, Landmarks(places, covariance, noises, accepts), limit)
     away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
     edges = _clear(edges, rays.sigma, away, len(rows))
-    edges = _alone(edges, rays.sigma, rows, known, doubt.drift, limit)
     number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
@@ -111,6 +110,15 @@ def match(
         cost = cost - np.where(before[edges.ray] == ids[edges.landmark], 2.0, 0.0)
     unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
     chosen = _best(edges, cost, len(rays), len(places), unmatched)
+    unseen = np.append(long_unseen(doubt.drift, known.drift[rows]), np.zeros(len(ours), dtype=bool))
+    back = np.flatnonzero((chosen >= 0) & unseen[chosen])
+    if len(back):
+        at, some = chosen[back], s.take(back)
+        landmarks = Landmarks(places[at], own[at], noises[at], accepts[at])
+        worst = _least(then[at], places[at] - map_T_camera[:3, 3], map_T_camera, doubt)
+        sure = back[trusted(some, landmarks, worst, map_T_camera, expected_unknown(some, rows[at], known, novelty))]
+        keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
+        chosen = _best(_some(edges, keep), cost[keep], len(rays), len(places), unmatched)
     return np.where(chosen >= 0, number[chosen], -1)
 
 
@@ -173,6 +181,20 @@ def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> F
     return np.where(less[:, None, None], placed, since)
 
 
+def _least(then: Floats, to: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
+    """The covariance (6, 6) of the camera's pose against places `to` (n, 3) away that were last seen at those drifts (n, 6, 6).
+
+    One for all of them, by that which was not seen for longest.
+    """
+    oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
+    since = doubt.camera_from_drift @ gathered(doubt.drift, oldest[None])[0] @ doubt.camera_from_drift.T
+    if not np.isfinite(doubt.pose).all():
+        return since
+    reach = float(np.mean(to**2)) * 3
+    size = [np.trace(c[:3, :3]) * reach + np.trace(c[3:, 3:]) for c in (since, doubt.pose)]
+    return since if size[0] <= size[1] else doubt.pose
+
+
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
     """The place of each ray (n,) of one frame, -1 none, with the least total cost: what `matches.choose` is for a log."""
     from scipy.optimize import linear_sum_assignment
@@ -184,31 +206,6 @@ def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) 
     real = gain[ray, place] > 0
     chosen[ray[real]] = place[real]
     return chosen
-
-
-def _alone(edges: Edges, sigma: Floats, rows: Ints, known: Table, drift: Floats, limit: float) -> Edges:
-    """Without the matches to landmarks that were not seen for long where others of their label may be meant as well.
-
-    rows: (n,) of the landmarks in `known`. Of the others nothing has drifted that would let another one take their place.
-    """
-    of = np.flatnonzero(edges.landmark < len(rows))
-    row = rows[edges.landmark[of]]
-    unseen = long_unseen(drift, known.drift[row])
-    if not unseen.any():
-        return edges
-    of, row = of[unseen], row[unseen]
-    per_m3 = _density(known, known.label[row])
-    gate = np.pi * limit * sigma[edges.ray[of]] ** 2 * np.exp(edges.vague[of] / 2)  # steradians
-    crowd = np.zeros(len(edges.ray))
-    crowd[of] = per_m3 * float(known.far.max()) ** 3 / 3 * gate
-    return _some(edges, crowd < _CROWD)
-
-
-def _density(known: Table, label: Ints) -> Floats:
-    """How many landmarks of labels (n,) there are per m^3, one more of each than are known."""
-    number = np.bincount(known.label, minlength=int(label.max()) + 1) + 1
-    room = np.ptp(known.position, axis=0)
-    return np.asarray(number[label] / np.prod(np.maximum(room, [_REACH, _REACH, _TALL])))
 
 
 def _some(edges: Edges, keep: Bools) -> Edges:
