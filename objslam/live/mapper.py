@@ -210,10 +210,10 @@ class Mapper:
             owner[mine[lost]] = known.id[missed[lost]]
             free = mine[(hit < 0) & ~lost]
         else:
-            hit = match(
-                some, guess, known, self.candidates, doubt, len(self.labels), settings.association.gate, self.tracks, self.novelty
-            )
-            self.novelty += _NOVEL * float((hit < 0).mean() + ((hit >= len(known)).mean()) - self.novelty)
+            gate, number = settings.association.gate, len(self.labels)
+            hit = match(some, guess, known, self.candidates, doubt, number, gate, self.tracks, self.novelty)
+            new = float(((hit < 0) | (hit >= len(known))).mean())
+            self.novelty += _NOVEL * (new - self.novelty)
             for i in np.flatnonzero(hit >= len(known)).tolist():
                 extend(self, self.candidates[hit[i] - len(known)], rays, i, numbers[i], k, stamp, doubt)
             free = mine[hit < 0]

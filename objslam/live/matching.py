@@ -182,7 +182,7 @@ def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> F
 
 
 def _least(then: Floats, to: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
-    """The covariance (6, 6) of the camera's pose against places `to` (n, 3) away that were last seen at those drifts (n, 6, 6).
+    """The covariance (6, 6) of the camera's pose against places `to` (n, 3) away, last seen at the drifts `then` (n, 6, 6).
 
     One for all of them, by that which was not seen for longest.
     """

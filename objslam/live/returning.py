@@ -24,8 +24,8 @@ def trusted(s: Sightings, landmarks: Landmarks, doubt: Floats, map_T_camera: Flo
     """Which of the rays (n,) of one frame are of the landmark (n,) that each has.
 
     doubt: (6, 6) covariance of the camera's pose against these landmarks, in its own frame. unknown: (n,) objects of the
-    label, not known yet, that are expected for each steradian where the ray looks. A landmark stays where it is likelier than
-    those by e^4.5, given all others that stay.
+    label, not known yet, that are expected for each steradian where the ray looks. A landmark stays where it is so much
+    likelier than those, given all others that stay.
     """
     to = landmarks.position - s.origin
     distance = np.linalg.norm(to, axis=1)
@@ -36,12 +36,12 @@ def trusted(s: Sightings, landmarks: Landmarks, doubt: Floats, map_T_camera: Flo
     total = (jacobian @ doubt @ jacobian.T).reshape(len(s), 2, len(s), 2)
     own = axes @ landmarks.covariance @ np.swapaxes(axes, 1, 2)
     own += variance(s, distance, landmarks.noise)[:, None, None] * np.eye(2)
-    each = np.arange(len(s))
+    each, both = np.arange(len(s)), np.arange(2)
     total[each, :, each] += own
     rare = -np.log(2 * np.pi * np.maximum(unknown, 1e-12) / distance**2)
     left = each
     while len(left):
-        precision = np.linalg.inv(total[np.ix_(left, [0, 1], left, [0, 1])].reshape(2 * len(left), -1))
+        precision = np.linalg.inv(total[np.ix_(left, both, left, both)].reshape(2 * len(left), -1))
         pull = (precision @ offset[left].ravel()).reshape(-1, 2)
         rest = precision.reshape(len(left), 2, len(left), 2)[np.arange(len(left)), :, np.arange(len(left))]
         squared = np.einsum("ni,ni->n", pull, np.linalg.solve(rest, pull[:, :, None])[:, :, 0])

@@ -24,12 +24,13 @@ def landmarks(positions, labels):
     return known
 
 
-def ray(target, label=0):
-    local = AHEAD[:3, :3].T @ np.asarray(target)
-    nothing = np.full(1, np.nan)
-    direction = (local / np.linalg.norm(local))[None]
+def rays(targets, label=0):
+    local = np.asarray(targets) @ AHEAD[:3, :3]
+    count = len(local)
+    nothing, one = np.full(count, np.nan), np.ones(count)
+    direction = local / np.linalg.norm(local, axis=1, keepdims=True)
     return FrameRays(
-        direction, np.full(1, SIGMA), nothing, nothing, np.array([label]), np.ones(1), np.zeros((1, 4)), np.array([-1])
+        direction, one * SIGMA, nothing, nothing, np.full(count, label), one, np.zeros((count, 4)), np.full(count, -1)
     )
 
 
@@ -40,7 +41,8 @@ def doubt(heading, place=np.nan):
 
 
 def found(known, target, heading, place=np.nan, candidates=()):
-    return match(ray(target), AHEAD, known, list(candidates), doubt(heading, place), 2, 0.99, {}).tolist()
+    targets = [target] if np.ndim(target) == 1 else target
+    return match(rays(targets), AHEAD, known, list(candidates), doubt(heading, place), 2, 0.99, {}).tolist()
 
 
 HALL = [(5.0, 0.0, 0.5), *((x, y, 0.5) for x in (-8.0, 0.0, 8.0, 14.0) for y in (-8.0, -5.0, 5.0, 8.0))]
@@ -50,13 +52,28 @@ def test_a_landmark_seen_just_now_is_matched_among_many():
     assert found(landmarks(HALL, [0] * len(HALL)), (5.0, 0.05, 0.5), 0.02) == [0]
 
 
-def test_after_a_long_way_only_where_hardly_another_of_its_label_could_be_meant():
-    many, alone = landmarks(HALL, [0] * len(HALL)), landmarks(HALL, [0] + [1] * (len(HALL) - 1))
-    off = (5.0, 0.1, 0.5)
-    assert found(many, off, 0.07) == [-1]
-    assert found(many, off, 0.07, place=0.01) == [0]  # known well where the camera is: nobody else
-    assert found(alone, off, 0.07) == [0]
-    assert found(alone, off, 0.5) == [-1]  # a drift that large leaves room for an object that is not known yet
+def turned(points, angle):
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(points) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_after_a_long_way_only_where_nothing_unknown_could_be_meant():
+    many, few = landmarks(HALL, [0] * len(HALL)), landmarks(HALL, [0] + [1] * (len(HALL) - 1))
+    off = turned(HALL[0], 0.05)
+    assert found(many, off, 0.15) == [-1]
+    assert found(many, off, 0.15, place=0.01) == [-1]  # it is known better where the camera is, and this is too far off
+    assert found(many, HALL[0], 0.15, place=0.01) == [0]
+    assert found(few, off, 0.15) == [0]
+    assert found(few, off, 1.5) == [-1]  # a drift that large leaves room for the few that may be unknown, too
+
+
+def test_several_that_one_drift_explains_are_trusted_together():
+    near = [(5.0, 0.0, 0.5), (4.0, 1.5, 0.9), (4.5, -1.5, 0.2)]
+    known = landmarks([*near, *HALL[1:]], [0] * (len(HALL) + 2))
+    off = turned(near, 0.05)
+    assert found(known, off, 0.15) == [0, 1, 2]
+    off[1] = turned(near[1], -0.2)
+    assert found(known, off, 0.15) == [0, -1, 2]  # the odd one is something else
 
 
 def candidate(drift):
