@@ -108,7 +108,7 @@ def test_a_hall_of_objects_that_look_alike_from_odometry_alone():
     """60 objects of 5 labels in 16 x 12 m: by dead reckoning the robot comes back metres beside where it was."""
     hall = {"room": (16.0, 12.0), "path": (2, 3), "objects": 60, "classes": 5, "laps": None, "min_view_share": 0.01}
     rates = {"frames": 1200, "frame_rate": 10.0, "odometry_rate": 50.0, "speed": 0.8}
-    log = simulate(preset("large", localization=None, odometry=Odometry(), **hall, **rates), 1)
+    log = simulate(preset("large", localization=None, odometry=Odometry(), **hall, **rates), 12)
     session = drive(log)
     snapshot = session.snapshot()
     session.abort()
