@@ -72,6 +72,7 @@ def solve(
     SolveError where joint mode has neither odometry nor localisation.
     """
     from objslam.graph import batch
+    from objslam.graph.placing import pose_noise, triangulate_at
 
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
@@ -82,10 +83,10 @@ def solve(
         if settings.association.method == "by_label":
             association = associate_by_label(rays_of_keyframes)
         else:
-            noise = batch.pose_noise(rays, frames, settings)
+            noise = pose_noise(rays, frames, settings)
             association = _associate(frames, rays, cameras, settings, frames.map_T_camera, noise)
         progress("solve", 0, 0)
-        placed = batch.triangulate_at(keyframes.map_T_camera, keyframes, rays_of_keyframes, association, settings)
+        placed = triangulate_at(keyframes.map_T_camera, keyframes, rays_of_keyframes, association, settings)
         estimate = batch.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
         if trace is not None:
             trace.end_round("fixed", association, estimate)

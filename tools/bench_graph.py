@@ -20,8 +20,9 @@ from custom_factor import eq1_factor
 from objslam.config import Settings
 from objslam.geometry import exp_se3, inverse, lift_se2
 from objslam.graph import factors
-from objslam.graph.batch import solve_fixed, solve_joint, triangulate_at
+from objslam.graph.batch import solve_fixed, solve_joint
 from objslam.graph.optimise import build_graph, make_values
+from objslam.graph.placing import triangulate_at
 from objslam.keyframes import gathered_drift
 from objslam.ledger import Ledger
 from objslam.types import Association, Keyframes, Rays, Trajectory

@@ -18,12 +18,12 @@ from objslam.association.assign import assign
 from objslam.association.lay import lay
 from objslam.association.search import associate
 from objslam.config import Settings
-from objslam.geometry import adjoint, inverse, log_se3
+from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.graph.closure import Closure, Known, bend, find_closure
+from objslam.graph.cost import truncated_cost
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
 from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
-from objslam.rays import angles_off
 from objslam.triangulation import triangulate
 from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
 
@@ -33,7 +33,6 @@ _PLACE = 0.1  # m
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02  # share of the drift, rad, m that laying a step leaves open
 _FEWEST = 5  # rays that must agree on a new landmark: a wrong one pulls on every pose after it
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-_STRAY = 13.8  # squared deviations that a ray costs at the most
 _STRAIN = 200.0
 """Squared deviations by which a loop may raise the cost for each landmark that it joins: on MRCLAM right ones took up to
 110, wrong ones 240 and more."""
@@ -150,25 +149,12 @@ def _close(
         landmark_priors(np.arange(len(merged)), merged.position, settings),
     )
     values = _solve(graph, poses, merged, _ITERATIONS_OF_A_LOOP)
-    before = _cost(rays, owner, known.position, map_T_camera, motion, covariance)
+    before = truncated_cost(rays, owner, known.position, map_T_camera, motion, covariance)
     poses, merged.position = read_poses(values), read_points(values)
-    if _cost(rays, owned, merged.position, poses, motion, covariance) > before + _STRAIN * len(now):
+    if truncated_cost(rays, owned, merged.position, poses, motion, covariance) > before + _STRAIN * len(now):
         return None
     merged.covariance = _covariances(rays, owned, merged.position, poses)
     return graph, merged, owned, poses
-
-
-def _cost(rays: Rays, owner: Ints, positions: Floats, map_T_camera: Floats, motion: Floats, covariance: Floats) -> float:
-    """Squared deviations of all rays with a landmark, none more than a stray's, and of the odometry, up to here."""
-    held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
-    some = rays.take(held)
-    origins, directions = some.in_map(map_T_camera)
-    off = angles_off(origins, directions, positions[owner[held]])
-    distance = np.linalg.norm(positions[owner[held]] - origins, axis=1)
-    seen = np.minimum(off**2 / (some.sigma**2 + (_FLOOR / distance) ** 2), _STRAY).sum()
-    steps = len(map_T_camera) - 1
-    twist = log_se3(inverse(motion[:steps]) @ inverse(map_T_camera[:-1]) @ map_T_camera[1:])
-    return float(seen + (twist * np.linalg.solve(covariance[:steps], twist[..., None])[..., 0]).sum())
 
 
 def _heading_drift(keyframes: Keyframes) -> Floats:

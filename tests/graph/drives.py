@@ -10,7 +10,8 @@ import numpy as np
 from objslam.association.by_label import associate_by_label
 from objslam.config import Odometry, Settings, load_settings
 from objslam.geometry import align, interpolate
-from objslam.graph.batch import Estimate, solve_fixed, solve_joint, triangulate_at
+from objslam.graph.batch import Estimate, solve_fixed, solve_joint
+from objslam.graph.placing import triangulate_at
 from objslam.keyframes import build_keyframes
 from objslam.ledger import Ledger
 from objslam.rays import angles_off, build_rays

@@ -8,7 +8,8 @@ from drives import ODOMETRY_ALONE, Drive, make_drive
 from scipy.stats import chi2
 
 from objslam.config import Settings
-from objslam.graph.batch import solve_fixed, triangulate_at
+from objslam.graph.batch import solve_fixed
+from objslam.graph.placing import triangulate_at
 from objslam.simulation import DepthNoise, PoseNoise
 from objslam.triangulation import solve_eq1
 from objslam.types import Association, Keyframes, Rays
