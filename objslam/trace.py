@@ -61,6 +61,14 @@ class Trace:
         path = (map_T_camera @ inverse(self.base_T_camera[: len(map_T_camera)]))[:, :3, 3]
         self._iterations.append(Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32)))
 
+    def aside(self) -> Trace:
+        """A trace for an attempt that may come to nothing."""
+        return Trace(self.base_T_camera)
+
+    def take(self, attempt: Trace) -> None:
+        """The iterations of an attempt that was worth it."""
+        self._iterations += attempt._iterations
+
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
         """The round that the iterations since the last one made."""
         iterations = tuple(self._iterations)

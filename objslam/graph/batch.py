@@ -135,11 +135,15 @@ def solve_joint(
     found = settle(keyframes, rays, association, settings, map_T_camera, positions, nothing, nothing, trace)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every
     back = rejected_stretches(rays, association, found) if loose else nothing
-    iterations = found.iterations
     if back.any():
-        other = settle(keyframes, rays, association, settings, found.map_T_camera, found.positions, found.used, back, trace)
-        iterations += other.iterations
-        found = min(found, other, key=lambda state: misfit(state, keyframes, rays, association, settings))
+        attempt = trace.aside() if trace is not None else None
+        at = found.map_T_camera, found.positions, found.used
+        other = settle(keyframes, rays, association, settings, *at, back, attempt)
+        if misfit(other, keyframes, rays, association, settings) < misfit(found, keyframes, rays, association, settings):
+            iterations = found.iterations + other.iterations
+            found = replace(other, cost_before=found.cost_before, iterations=iterations)
+            if trace is not None and attempt is not None:
+                trace.take(attempt)
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
 
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
@@ -167,7 +171,7 @@ def solve_joint(
         weight=weight,
         cost_before=found.cost_before,
         cost_after=optimum.cost_after,
-        iterations=iterations,
+        iterations=found.iterations,
     )
 
 
