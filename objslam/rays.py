@@ -20,8 +20,10 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
     if len(pixels) == 0:
         return np.zeros((0, 3)), np.zeros(0, dtype=bool)
     if camera.distortion_model != "equidistant" and not camera.distortion.any():
-        straight = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T
-        return straight / np.linalg.norm(straight, axis=1, keepdims=True), np.ones(len(pixels), dtype=bool)
+        finite: Bools = np.asarray(np.isfinite(pixels).all(axis=1))
+        straight = np.column_stack([np.where(finite[:, None], pixels, 0.0), np.ones(len(pixels))])
+        straight = straight @ np.linalg.inv(camera.matrix).T
+        return straight / np.linalg.norm(straight, axis=1, keepdims=True), finite
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     if camera.distortion_model == "equidistant":

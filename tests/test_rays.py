@@ -260,3 +260,11 @@ def test_angles_off():
     np.testing.assert_allclose(angles_off(origins, directions, points), np.radians([0, 45, 90, 180]), atol=1e-12)
     tiny = np.array([[1e-9, 0, 1.0]])  # arccos of the cosine would say 0
     np.testing.assert_allclose(angles_off(origins[:1], directions[:1], tiny), 1e-9, rtol=1e-6)
+
+
+@pytest.mark.parametrize("distortion", [np.zeros(5), np.array([-0.1, 0.01, 0.0, 0.0, 0.0])])
+def test_a_pixel_that_is_not_finite_has_no_ray(distortion):
+    camera = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), "plumb_bob", distortion)
+    directions, valid = undistort(camera, np.array([[320.0, 240.0], [np.nan, 1.0], [np.inf, 1.0], [820.0, 240.0]]))
+    assert valid[:3].tolist() == [True, False, False]
+    np.testing.assert_allclose(directions[0], [0.0, 0.0, 1.0], atol=1e-9)

@@ -21,7 +21,7 @@ from objslam.config import Settings
 from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
 from objslam.graph.closure import Closure, Known, bend, find_closure
-from objslam.graph.cost import truncated_cost
+from objslam.graph.cost import FLOOR, truncated_cost
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
 from objslam.graph.optimise import build_graph, levenberg_marquardt, make_values, read_points, read_poses
 from objslam.triangulation import triangulate
@@ -36,7 +36,6 @@ _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 _STRAIN = 200.0
 """Squared deviations by which a loop may raise the cost for each landmark that it joins: on MRCLAM right ones took up to
 110, wrong ones 240 and more."""
-_FLOOR = 0.02  # m; landmarks are never taken to be known better than that
 
 
 @dataclass(frozen=True)
@@ -287,4 +286,4 @@ def _covariances(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats
     along = np.isfinite(rays.range[held])
     spread = rays.range_sigma[held][along] ** 2
     np.add.at(information, owner[held][along], n[along, :, None] * n[along, None, :] / spread[:, None, None])
-    return np.linalg.inv(information + 1e-6 * np.eye(3)) + _FLOOR**2 * np.eye(3)
+    return np.linalg.inv(information + 1e-6 * np.eye(3)) + FLOOR**2 * np.eye(3)

@@ -94,11 +94,11 @@ def _together(m: Mapper) -> Bools:
 
 def _close(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
     """Make landmarks now (P,) one with the old (P,)."""
-    _expect_around(m, now, old)
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.known.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
     if shift < _NEAR and turn < _TURNED:
+        _expect_around(m, now, old)
         for i, j in zip(old.tolist(), now.tolist(), strict=True):
             join(m, i, j)
         without(m, np.unique(now))
@@ -126,6 +126,7 @@ def _bend(m: Mapper, now: Ints, old: Ints, correction: Floats) -> None:
     m.graph.refresh()
     saved = m.graph.save()
     table = known.copy(), rays.owner.copy(), dict(m.together), dict(m.apart)
+    _expect_around(m, now, old)
     order = np.argsort(k.stamp, kind="stable")
     poses, stamps = m.graph.poses(k.id[order]), k.stamp[order]
     left, back = float(known.last[old].max()), float(known.first[now].min())

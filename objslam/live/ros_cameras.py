@@ -28,7 +28,7 @@ PATIENCE = 1.0
 
 _DEPTH_WAIT = 0.2  # s that boxes wait for a depth image
 _MAX_WAITING = 200
-_IMAGES, _SAME = 8, 0.001  # images of a camera that are kept for a view, and s by which their stamps may differ
+_IMAGES, _SAME = 4, 0.001  # images of a camera that are kept for a view, and s by which their stamps may differ
 _MAX_CAMERAS = 64
 _STILL = 1e-9
 

@@ -120,9 +120,9 @@ def frames(m: Mapper) -> tuple[Frame, ...]:
             continue
         row = int(mine[k.stamp[mine].argmax()])
         rays = np.flatnonzero(r.keyframe == k.id[row])
-        owner = r.owner[rays].copy()
+        owner = r.owner[rays]
         rejected = (owner >= 0) & ~r.used[rays]
-        found.append(Frame(float(k.stamp[row]), camera, m.graph.pose(int(k.id[row])), r.box[rays].copy(), owner, rejected))
+        found.append(Frame(float(k.stamp[row]), camera, m.graph.pose(int(k.id[row])), r.box[rays], owner, rejected))
     return tuple(found)
 
 

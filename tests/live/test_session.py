@@ -104,11 +104,35 @@ def test_several_objects_of_a_label(tmp_path):
     assert max(near) < 0.1
 
 
-def test_a_hall_of_objects_that_look_alike_from_odometry_alone():
+def hall():
     """60 objects of 5 labels in 16 x 12 m: by dead reckoning the robot comes back metres beside where it was."""
-    hall = {"room": (16.0, 12.0), "path": (2, 3), "objects": 60, "classes": 5, "laps": None, "min_view_share": 0.01}
+    room = {"room": (16.0, 12.0), "path": (2, 3), "objects": 60, "classes": 5, "laps": None, "min_view_share": 0.01}
     rates = {"frames": 1200, "frame_rate": 10.0, "odometry_rate": 50.0, "speed": 0.8}
-    log = simulate(preset("large", localization=None, odometry=Odometry(), **hall, **rates), 12)
+    return simulate(preset("large", localization=None, odometry=Odometry(), **room, **rates), 12)
+
+
+def test_a_loop_that_does_not_hold_leaves_all_as_it_was(monkeypatch):
+    from objslam.live import loops
+
+    bend, same = loops._bend, list[bool]()
+
+    def watched(m, *loop):
+        before = m.known.drift.copy(), m.known.id.copy(), m.rays.owner.copy()
+        bend(m, *loop)
+        same.append(
+            all(np.array_equal(x, y) for x, y in zip(before, (m.known.drift, m.known.id, m.rays.owner), strict=True))
+        )
+
+    monkeypatch.setattr(loops, "_bend", watched)
+    monkeypatch.setattr(loops, "_holds", lambda m, mine: False)
+    session = drive(hall())
+    session.abort()
+    assert same
+    assert all(same)
+
+
+def test_a_hall_of_objects_that_look_alike_from_odometry_alone():
+    log = hall()
     session = drive(log)
     snapshot = session.snapshot()
     session.abort()
