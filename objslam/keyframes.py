@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.config import Odometry, Settings
 from objslam.errors import LogError
-from objslam.geometry import adjoint, interpolate, inverse, is_planar, twist_lengths
+from objslam.geometry import adjoint, interpolate, inverse, is_planar, twist_length, twist_lengths
 from objslam.ledger import Ledger
 from objslam.types import Bools, CameraLog, Floats, Keyframes, Log, Trajectory
 
@@ -144,3 +144,27 @@ def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats
     noise = np.stack([none, none, angle, x, y, none] if planar else [angle, angle, angle, x, x, x], axis=1)
     moved = adjoint(start_T_base[1:])
     return np.asarray(np.einsum("nij,nj,nkj->nik", moved, noise, moved))
+
+
+def add_step(drift: Floats, before: Floats, after: Floats, settings: Odometry, planar: bool) -> Floats:
+    """The covariance drift (6, 6) and what `step_drift` adds to it for the step between two poses (4, 4).
+
+    In a tenth of its time, most of all after a pause, for it hardly needs numpy: a session asks for every pose as it comes.
+    """
+    turn, way = twist_length(before, after)
+    angle = settings.yaw_per_m**2 * way + settings.yaw_per_rad**2 * turn
+    x = settings.x_per_m**2 * way + settings.xy_per_rad**2 * turn
+    total = drift.copy()
+    if not planar:
+        moved = adjoint(after)
+        total += (moved * [angle, angle, angle, x, x, x]) @ moved.T
+        return total
+    y = settings.y_per_m**2 * way + settings.xy_per_rad**2 * turn
+    (c, _, _, px), (s, _, _, py) = after[:2].tolist()
+    yaw_x, yaw_y, xy = angle * py, -angle * px, -angle * px * py + (x - y) * c * s
+    total[2:5, 2:5] += [
+        [angle, yaw_x, yaw_y],
+        [yaw_x, angle * py * py + x * c * c + y * s * s, xy],
+        [yaw_y, xy, angle * px * px + x * s * s + y * c * c],
+    ]
+    return total

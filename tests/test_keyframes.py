@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from objslam.config import Odometry, Settings
 from objslam.errors import LogError
 from objslam.geometry import adjoint, exp_se3, interpolate, inverse, lift_se2, log_se3, make_pose
-from objslam.keyframes import build_keyframes, correct_path, gathered_drift
+from objslam.keyframes import add_step, build_keyframes, correct_path, gathered_drift, step_drift
 from objslam.ledger import Ledger
 from objslam.types import Camera, CameraLog, Detections, Log, Trajectory
 
@@ -311,6 +312,17 @@ def test_drift_of_a_path_in_space_has_all_six():
     poses, stamps = chain(steps), np.arange(41.0)
     drift = gathered_drift(Trajectory(stamps, poses), stamps, NOISY)
     assert (np.linalg.eigvalsh(between(drift, poses, 0, 40)) > 1e-6).all()
+
+
+@given(hnp.arrays(np.float64, (2, 6), elements=st.floats(-3, 3)), st.booleans())
+def test_one_step_adds_what_it_adds_among_many(twist, planar):
+    if planar:
+        twist[:, [0, 1, 5]] = 0
+    poses, before = exp_se3(twist), np.arange(36.0).reshape(6, 6)
+    for after in (poses[1], poses[0]):  # a step, and none
+        expected = before + step_drift(np.stack([poses[0], after]), NOISY, planar)[0]
+        np.testing.assert_allclose(add_step(before, poses[0], after, NOISY, planar), expected, atol=1e-12)
+    assert (before == np.arange(36.0).reshape(6, 6)).all()
 
 
 def test_a_corrected_path_moves_as_its_keyframes_did():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from objslam.config import Odometry, Triangulation
-from objslam.geometry import interpolate, inverse, lift_se2
+from objslam.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.keyframes import gathered_drift
 from objslam.live.clock import Clock
 from objslam.live.known import carried
@@ -22,10 +22,12 @@ def wiggle(count=400, rate=50.0):
     return 100 + t, lift_se2(np.stack([np.sin(0.3 * t) * 3, 0.4 * t, 0.8 * np.sin(0.5 * t)], axis=1))
 
 
-def test_the_path_buffer_says_what_the_whole_path_says():
+@pytest.mark.parametrize("tilt", [0.0, 0.1])
+def test_the_path_buffer_says_what_the_whole_path_says(tilt):
     stamps, poses = wiggle()
-    buffer, drift = PathBuffer(Odometry(), 100.0), gathered_drift(Trajectory(stamps, poses), stamps[::7] + 0.007, Odometry())
-    asked = stamps[::7] + 0.007
+    poses = poses @ exp_se3(tilt * np.sin(stamps)[:, None] * np.array([1.0, 0.5, 0, 0, 0, 1.0]))
+    asked = np.sort(np.concatenate([stamps[::7] + 0.007, stamps[::9]]))
+    buffer, drift = PathBuffer(Odometry(), 100.0), gathered_drift(Trajectory(stamps, poses), asked, Odometry())
     expected, _ = interpolate(stamps, poses, asked, 1.0)
     at = 0
     for stamp, pose in zip(stamps, poses, strict=True):
