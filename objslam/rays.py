@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.ledger import Ledger
-from objslam.types import Bools, Camera, Detections, Floats, Ints, Keyframes, Log, Rays, label_table
+from objslam.types import Bools, Camera, Floats, Ints, Keyframes, Log, Rays, label_table
 
 
 def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
@@ -21,8 +21,8 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         return np.zeros((0, 3)), np.zeros(0, dtype=bool)
     if camera.distortion_model != "equidistant" and not camera.distortion.any():
         finite: Bools = np.asarray(np.isfinite(pixels).all(axis=1))
-        straight = np.column_stack([np.where(finite[:, None], pixels, 0.0), np.ones(len(pixels))])
-        straight = straight @ np.linalg.inv(camera.matrix).T
+        pixels = pixels if finite.all() else np.where(finite[:, None], pixels, 0.0)
+        straight = pixels @ camera.inverse_matrix[:, :2].T + camera.inverse_matrix[:, 2]
         return straight / np.linalg.norm(straight, axis=1, keepdims=True), finite
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -73,7 +73,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
         boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
-        boxes, directions, angle_sigma = box_rays(boxes, camera, settings, ledger)
+        kept, directions, angle_sigma = box_rays(boxes.boxes, boxes.scores, camera, settings, ledger, boxes.whole)
+        boxes = boxes.take(kept)
         names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         columns.append(
             (
@@ -107,33 +108,39 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 
 
 def box_rays(
-    detections: Detections, camera: Camera, settings: Settings, ledger: Ledger
-) -> tuple[Detections, Floats, Floats]:
-    """The usable boxes (M) of a camera, their unit directions (M, 3) in its frame, sigmas (M,), rad; the rest is counted."""
-    usable = _usable(detections, camera, settings, ledger)
-    boxes = detections if usable.all() else detections.take(usable)
-    directions, valid = undistort(camera, (boxes.boxes[:, :2] + boxes.boxes[:, 2:]) / 2)
-    ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+    boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
+) -> tuple[Ints, Floats, Floats]:
+    """Which boxes (M, 4) of a camera are usable (n,), their unit directions (n, 3) in its frame and sigmas (n,), rad.
+
+    The rest is counted. whole: as `types.Detections` has it.
+    """
+    kept = _usable(boxes, scores, camera, settings, ledger, whole)
+    boxes = boxes if len(kept) == len(boxes) else boxes[kept]
+    directions, valid = undistort(camera, (boxes[:, :2] + boxes[:, 2:]) / 2)
     if not valid.all():
-        boxes, directions = boxes.take(valid), directions[valid]
-    return boxes, directions, _angle_sigma(camera, directions, _centre_sigma(boxes.boxes, settings))
+        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+        kept, boxes, directions = kept[valid], boxes[valid], directions[valid]
+    return kept, directions, _angle_sigma(camera, directions, _centre_sigma(boxes, settings))
 
 
-def _usable(detections: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> Bools:
-    where, boxes = f"camera {camera.name}", detections.boxes
-    keep = detections.scores >= settings.rays.min_score
-    ledger.drop(f"boxes below rays.min_score {settings.rays.min_score:g}", int((~keep).sum()), where)
-    size = np.array([camera.width, camera.height])
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
-    inside = ((centre >= 0) & (centre <= size)).all(axis=1)
-    ledger.drop("boxes with their centre outside the image", int((keep & ~inside).sum()), where)
-    keep &= inside
-    border = np.maximum(settings.rays.border, settings.rays.border_share * (boxes[:, 2:] - boxes[:, :2]))
-    cut = (boxes[:, :2] <= border).any(axis=1) | (boxes[:, 2:] >= size - 1 - border).any(axis=1)
-    if settings.rays.border >= 0 and not detections.whole:
-        ledger.drop("boxes cut off by the image's edge (rays.border)", int((keep & cut).sum()), where)
-        keep &= ~cut
-    return keep
+def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool) -> Ints:
+    of, size = settings.rays, np.array([camera.width, camera.height])
+    low, high = boxes[:, :2], boxes[:, 2:]
+    centre = (low + high) / 2
+    wrong = {
+        f"boxes below rays.min_score {of.min_score:g}": ~(scores >= of.min_score),
+        "boxes with their centre outside the image": ~((centre >= 0) & (centre <= size)).all(axis=1),
+    }
+    if of.border >= 0 and not whole:
+        border = np.maximum(of.border, of.border_share * (high - low))
+        wrong["boxes cut off by the image's edge (rays.border)"] = ((low <= border) | (high >= size - 1 - border)).any(
+            axis=1
+        )
+    keep = np.ones(len(boxes), dtype=bool)
+    for reason, bad in wrong.items():
+        ledger.drop(reason, int((keep & bad).sum()), f"camera {camera.name}")
+        keep &= ~bad
+    return np.flatnonzero(keep)
 
 
 def _centre_sigma(boxes: Floats, settings: Settings) -> Floats:

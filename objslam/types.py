@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -68,10 +69,15 @@ class Camera:
     depth_scale: float = 1000.0
     sees_size: bool = True
 
-    @property
+    @cached_property
     def focal(self) -> float:
         """Geometric mean of fx and fy, px."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
+
+    @cached_property
+    def inverse_matrix(self) -> Floats:
+        """(3, 3), from homogeneous pixels to directions with z = 1."""
+        return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from objslam.ledger import Ledger
 from objslam.live.matching import FrameRays
 from objslam.live.messages import FrameMessage, MountMessage
 from objslam.rays import box_rays
-from objslam.types import Camera, Detections, Floats, label_table
+from objslam.types import Camera, Floats
 
 _MOUNTS = 4096  # of one camera that are kept
 
@@ -52,34 +52,20 @@ class FrameReader:
 
     def rays(self, frame: FrameMessage) -> FrameRays:
         """The usable boxes of a frame as rays; drops are counted."""
-        camera = self.cameras[self.number[frame.camera]]
-        names, label = label_table(frame.labels)
-        boxes = Detections(
-            frame_stamps=np.array([frame.stamp]),
-            frame=np.zeros(len(frame), dtype=np.int64),
-            boxes=frame.boxes,
-            label=label,
-            scores=frame.scores,
-            depths=frame.depths,
-            track_ids=frame.track_ids,
-            label_names=names,
-            whole=frame.whole,
-        )
-        boxes, direction, sigma = box_rays(boxes, camera, self._settings, self._ledger)
-        for name in names:
-            if name not in self._label_number:
-                self._label_number[name] = len(self.labels)
-                self.labels.append(name)
-        number = np.array([self._label_number[name] for name in names], dtype=np.int64)
-        depth = boxes.depths if self._settings.depth.use else np.full(len(boxes), np.nan)
-        reach = depth / direction[:, 2]
+        camera, settings = self.cameras[self.number[frame.camera]], self._settings
+        kept, direction, sigma = box_rays(frame.boxes, frame.scores, camera, settings, self._ledger, frame.whole)
+        for name in sorted(set(frame.labels) - self._label_number.keys()):
+            self._label_number[name] = len(self.labels)
+            self.labels.append(name)
+        label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
+        reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
         return FrameRays(
             direction=direction,
             sigma=sigma,
             range=reach,
-            range_sigma=self._settings.depth.sigma + self._settings.depth.sigma_per_m * reach,
-            label=number[boxes.label] if len(boxes) else boxes.label,
-            score=boxes.scores,
-            box=boxes.boxes,
-            track=boxes.track_ids,
+            range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * reach,
+            label=label[kept],
+            score=frame.scores[kept],
+            box=frame.boxes[kept],
+            track=frame.track_ids[kept],
         )

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 
 import numpy as np
 
@@ -320,4 +321,4 @@ def _wrong_camera(camera: Camera) -> str | None:
 
 
 def _same_camera(a: Camera, b: Camera) -> bool:
-    return all(np.array_equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Camera))

@@ -7,6 +7,7 @@ the same map.
 from __future__ import annotations
 
 import bisect
+import math
 
 import numpy as np
 
@@ -353,6 +354,7 @@ class Mapper:
         if last is None:
             return True
         live = self.settings.live
-        step = inverse(last) @ start_T_camera
-        turned = np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1.0, 1.0))
-        return bool(np.linalg.norm(step[:3, 3]) >= live.keyframe_distance or turned >= np.radians(live.keyframe_angle_deg))
+        way = math.dist(last[:3, 3].tolist(), start_T_camera[:3, 3].tolist())
+        cosine = (float(np.vdot(last[:3, :3], start_T_camera[:3, :3])) - 1) / 2
+        turned = math.acos(min(1.0, max(-1.0, cosine)))
+        return way >= live.keyframe_distance or turned >= math.radians(live.keyframe_angle_deg)
