@@ -141,16 +141,29 @@ def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = No
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
         raise ValueError("motions need odometry")
-    back = adjoint(inverse(odom_T_base[1:]))
-    s = back @ (drift[1:] - drift[:-1]) @ np.swapaxes(back, 1, 2)
-    odometry, planar = settings.odometry, settings.planar
     on_plane = is_planar(odom_T_base) if on_plane is None else on_plane
+    odom_T_camera = odom_T_base @ keyframes.base_T_camera
+    floor = motion_floor(keyframes.base_T_camera[1:], settings, on_plane)
+    covariance = motion_covariance(drift[1:] - drift[:-1], adjoint(inverse(odom_T_camera[1:])), floor)
+    return inverse(odom_T_camera[:-1]) @ odom_T_camera[1:], covariance
+
+
+def motion_floor(base_T_camera: Floats, settings: Settings, on_plane: bool) -> Floats:
+    """The least covariance (..., 6, 6) of a motion to a camera that sits there (..., 4, 4), in its frame."""
+    odometry, planar = settings.odometry, settings.planar
     tilt, z = (planar.tilt, planar.z) if on_plane else (odometry.floor_yaw, odometry.floor_xy)
-    s += np.diag([tilt, tilt, odometry.floor_yaw, odometry.floor_xy, odometry.floor_xy, z]) ** 2
-    to_camera = adjoint(inverse(keyframes.base_T_camera[1:]))
-    map_T_camera = odom_T_base @ keyframes.base_T_camera
-    covariance = to_camera @ s @ np.swapaxes(to_camera, 1, 2)
-    return inverse(map_T_camera[:-1]) @ map_T_camera[1:], (covariance + np.swapaxes(covariance, 1, 2)) / 2
+    floor = np.array([tilt, tilt, odometry.floor_yaw, odometry.floor_xy, odometry.floor_xy, z]) ** 2
+    to_camera = adjoint(inverse(base_T_camera))
+    return np.asarray((to_camera * floor) @ np.swapaxes(to_camera, -1, -2))
+
+
+def motion_covariance(gathered: Floats, camera_from_drift: Floats, floor: Floats) -> Floats:
+    """Covariances (..., 6, 6) of motions in the frames that they lead to, by what drift (..., 6, 6) was gathered on the way.
+
+    camera_from_drift: (..., 6, 6) takes that to these frames.
+    """
+    covariance = camera_from_drift @ gathered @ np.swapaxes(camera_from_drift, -1, -2) + floor
+    return np.asarray((covariance + np.swapaxes(covariance, -1, -2)) / 2)
 
 
 def betweens(motion: Floats, covariance: Floats, first: int) -> list[gtsam.NonlinearFactor]:

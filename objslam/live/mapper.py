@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import math
+from typing import Any
 
 import numpy as np
 
@@ -69,6 +70,7 @@ class Mapper:
         self.localizations = 0
         self.flat = True
         self._doubts: dict[int, Floats] = {}
+        self._last_floor: tuple[Floats | None, bool, Floats] = (None, True, np.zeros((6, 6)))
         self._lesson: Lesson | None = None
         self.doubt = np.full((6, 6), np.nan)
         self.novelty = 1.0
@@ -132,7 +134,8 @@ class Mapper:
         number = self._frame_number.get(camera, 0)
         self._frame_number[camera] = number + 1
         rays = self.reader.rays(frame)
-        moved = self._moved(camera, start_T_base @ base_T_camera)
+        start_T_camera = start_T_base @ base_T_camera
+        moved = self._moved(camera, start_T_camera)
         shown = set(rays.label.tolist())
         if moved:
             self._shown.clear()
@@ -147,7 +150,7 @@ class Mapper:
             self.leave_out(frame, "frames older than the map")
             return False
         k = self._next_keyframe
-        row = {
+        row: dict[str, Any] = {
             "id": k,
             "stamp": frame.stamp,
             "camera": camera,
@@ -158,14 +161,14 @@ class Mapper:
             "drift": drift,
             "localized": False,
         }
-        camera_from_drift = adjoint(inverse(start_T_base @ base_T_camera))
-        guess, pose_doubt, motion = self._predict(before, row)
+        camera_from_drift = adjoint(inverse(start_T_camera))
+        guess, pose_doubt, motion = self._predict(before, row, start_T_camera, camera_from_drift)
         doubt = Doubt(drift, camera_from_drift, pose_doubt)
         if not len(rays):  # what was not seen is evidence, but no keyframe
             self.known.expected[landmarks.in_view(self.known, self.cameras[camera], guess)] += 1
             return False
         self._next_keyframe += 1
-        self._last[camera] = start_T_base @ base_T_camera
+        self._last[camera] = start_T_camera
         self._shown |= shown
         self._standing += 1
         self.keyframes.add(**{name: np.asarray(value)[None] for name, value in row.items()})
@@ -287,36 +290,34 @@ class Mapper:
         """The keyframes (K,) by their stamps."""
         return np.asarray(self.keyframes.id[np.argsort(self.keyframes.stamp, kind="stable")])
 
-    def _predict(self, before: int | None, row: dict[str, object]) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
+    def _predict(
+        self, before: int | None, row: dict[str, Any], start_T_camera: Floats, camera_from_drift: Floats
+    ) -> tuple[Floats, Floats, tuple[Floats, Floats] | None]:
         """The first guess (4, 4) of a keyframe's camera, the covariance (6, 6) of that, and its motion by odometry."""
         if before is None or self.localized_only:
             noise = self.settings.localization
             doubt = np.diag([noise.yaw] * 3 + [noise.xy] * 3) ** 2 if before is not None else np.zeros((6, 6))
-            return np.asarray(row["map_T_base"]) @ np.asarray(row["base_T_camera"]), doubt, None
-        motion, covariance = factors.motions(self._pair(before, row), self.settings, self.odometry.planar)
-        k = int(self.keyframes.id[before])
-        back = adjoint(inverse(motion[0]))
+            return row["map_T_base"] @ row["base_T_camera"], doubt, None
+        of = self.keyframes
+        k = int(of.id[before])
+        motion = inverse(of.start_T_base[before] @ of.base_T_camera[before]) @ start_T_camera
+        floor = self._floor(row["base_T_camera"])
+        covariance = factors.motion_covariance(row["drift"] - of.drift[before], camera_from_drift, floor)
         if k not in self._doubts:  # asked for now and then: between, the odometry adds to it
             self._doubts = {k: self.graph.pose_covariance(k)}
-        doubt = back @ self._doubts[k] @ back.T + covariance[0]
-        self.doubt = doubt
+        back = adjoint(inverse(motion))
+        self.doubt = back @ self._doubts[k] @ back.T + covariance
         if self._next_keyframe % _ASK:
-            self._doubts[self._next_keyframe] = doubt
-        return self.graph.pose(k) @ motion[0], doubt, (motion[0], covariance[0])
+            self._doubts[self._next_keyframe] = self.doubt
+        return self.graph.pose(k) @ motion, self.doubt, (motion, covariance)
 
-    def _pair(self, before: int, row: dict[str, object]) -> Keyframes:
-        def two(name: str) -> Floats:
-            return np.stack([getattr(self.keyframes, name)[before], np.asarray(row[name])])
-
-        return Keyframes(
-            stamps=two("stamp"),
-            camera=np.zeros(2, dtype=np.int64),
-            frame=np.arange(2),
-            base_T_camera=two("base_T_camera"),
-            map_T_base=two("map_T_base"),
-            odom_T_base=two("start_T_base"),
-            drift=two("drift"),
-        )
+    def _floor(self, base_T_camera: Floats) -> Floats:
+        """`factors.motion_floor`, which is the same as long as the mount and the plane are."""
+        made_for, planar, floor = self._last_floor
+        if made_for is not base_T_camera or planar != self.odometry.planar:
+            floor = factors.motion_floor(base_T_camera, self.settings, self.odometry.planar)
+            self._last_floor = base_T_camera, self.odometry.planar, floor
+        return floor
 
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
         """Some of the keyframes (n,), as offline has them."""
