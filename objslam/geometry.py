@@ -116,12 +116,14 @@ def exp_se3(twist: Floats) -> Floats:
     return make_pose(rotation, (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
 
 
+_CROSS = np.zeros((3, 9))  # what each of x, y, z adds to the nine entries of the matrix
+_CROSS[[1, 2, 0], [2, 3, 7]] = 1.0
+_CROSS[[2, 0, 1], [1, 5, 6]] = -1.0
+
+
 def skew(v: Floats) -> Floats:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    m = np.zeros((*v.shape[:-1], 3, 3))
-    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    m[..., 1, 0], m[..., 2, 0], m[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return m
+    return np.asarray(v @ _CROSS).reshape(*v.shape, 3)
 
 
 def _left_jacobian(omega: Floats) -> Floats:

@@ -102,8 +102,11 @@ def range_costs(
     s: Sightings, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
 ) -> Floats:
     """What the range of a ray adds to the cost of a landmark at `distance` (E,) m, 0 where there is none; of: (E,) which."""
+    measured = s.range[of]
+    if not np.isfinite(measured).any():
+        return np.zeros(len(distance))
     with np.errstate(invalid="ignore"):
-        wrong = (distance - s.range[of]) ** 2 / (s.range_sigma[of] ** 2 + variance_along) - RANGE_GAIN
+        wrong = (distance - measured) ** 2 / (s.range_sigma[of] ** 2 + variance_along) - RANGE_GAIN
     return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
 
 

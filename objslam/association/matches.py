@@ -13,6 +13,7 @@ from objslam.types import Floats, Ints
 
 TRACK_GAIN = 2.0
 """What a match to the landmark of the other boxes of its track takes off the cost."""
+_AXES = np.eye(3)
 _CHUNK = 1 << 19  # pairs of a ray and a landmark at a time
 _FEW = 1 << 12  # pairs that are not worth a bound
 
@@ -35,7 +36,7 @@ class Edges:
 
 def across(direction: Floats) -> Floats:
     """Two unit vectors (R, 2, 3) across each unit direction (R, 3) and each other."""
-    helper = np.eye(3)[np.abs(direction).argmin(axis=1)]  # the axis that is furthest from parallel
+    helper = _AXES[np.abs(direction).argmin(axis=1)]  # the axis that is furthest from parallel
     axes = np.empty((len(direction), 2, 3))
     axes[:, 0] = _cross(direction, helper)
     axes[:, 0] /= np.linalg.norm(axes[:, 0], axis=1, keepdims=True)
@@ -57,18 +58,17 @@ def gated_edges(s: Sightings, landmarks: Landmarks, gate: float, pose: Floats | 
     ray, index = _near(s, landmarks, gate, pose)
     direction = s.direction[ray]
     to = landmarks.position[index] - s.origin[ray]
-    distance = np.linalg.norm(to, axis=1)
+    distance = np.sqrt(np.einsum("ei,ei->e", to, to))
     axes = across(direction)
-    offset = np.einsum("eij,ej->ei", axes, to)
+    x, y = np.einsum("eij,ej->ie", axes, to)
     covariance = landmarks.covariance[index]
     if pose is not None:
         covariance = covariance + _carried(to, pose[ray])
-    spread = np.einsum("eij,ejk,elk->eil", axes, covariance, axes)
+    spread = axes @ covariance @ np.swapaxes(axes, 1, 2)
     own = variance(s, distance, landmarks.noise[index], ray)
-    spread += own[:, None, None] * np.eye(2)
-    a, b, c = spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]
-    determinant = a * c - b**2
-    deviation = (c * offset[:, 0] ** 2 - 2 * b * offset[:, 0] * offset[:, 1] + a * offset[:, 1] ** 2) / determinant
+    a, b, c = spread[:, 0, 0] + own, spread[:, 0, 1], spread[:, 1, 1] + own
+    determinant = a * c - b * b
+    deviation = (c * x * x - 2 * b * x * y + a * y * y) / determinant
     along = np.einsum("ei,eij,ej->e", direction, covariance, direction)
     vague = np.log(determinant / own**2)
     cost = deviation + vague + range_costs(s, distance, along, ray)

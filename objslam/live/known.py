@@ -9,6 +9,8 @@ from objslam.live.table import Table
 from objslam.types import Bools, Camera, Floats, Ints
 
 _FLOOR = 0.01  # m; landmarks are never taken to be known better than that
+_KNOWN = _FLOOR**2 * np.eye(3)
+_HELD = 1e-4 * np.eye(3)  # m^-2; rays that all run one way say nothing along it
 _NOISE = (1.0, 3.0)  # times the noise that was promised
 _POOLED = 20.0  # rays that weigh an object's own noise as much as the promised one
 _INNER = 0.05  # share of the image along its edge where a box may be cut off
@@ -39,24 +41,30 @@ def new_landmarks() -> Table:
 
 def noise(known: Table, rows: Ints) -> Floats:
     """By what factor (n,) the rays of landmarks are noisier than promised."""
-    seen = known.seen[rows]
-    return np.clip(np.sqrt((known.squared[rows] / 2 + _POOLED) / (seen + _POOLED)), *_NOISE)
+    seen = known.seen[rows] + _POOLED
+    least, most = _NOISE
+    return np.asarray(np.minimum(np.maximum(np.sqrt((known.squared[rows] / 2 + _POOLED) / seen), least), most))
 
 
 def covariances(known: Table, rows: Ints) -> Floats:
     """Covariances (n, 3, 3), m^2, of landmarks from their rays, as if the poses were known."""
-    return np.linalg.inv(known.information[rows] + 1e-4 * np.eye(3)) + _FLOOR**2 * np.eye(3)
+    return np.linalg.inv(known.information[rows] + _HELD) + _KNOWN
 
 
-def carried(to: Floats, drift: Floats, map_T_camera: Floats, camera_from_drift: Floats) -> Floats:
-    """What covariances (n, 6, 6) of the camera, or one (6, 6), make of landmarks `to` (n, 3) away: (n, 3, 3), m^2.
-
-    camera_from_drift: (6, 6) takes the covariances to the camera's frame.
-    """
+def levers(to: Floats, map_T_camera: Floats) -> Floats:
+    """What a small motion of the camera, in its own frame, does to how landmarks `to` (n, 3) away lie to it: (n, 3, 6)."""
     turn = map_T_camera[:3, :3]
-    move = turn @ camera_from_drift[3:]
-    jacobian = skew(to) @ (turn @ camera_from_drift[:3]) - move
-    return np.asarray(jacobian @ drift @ np.swapaxes(jacobian, 1, 2))
+    lever = np.empty((len(to), 3, 6))
+    lever[:, :, :3] = skew(to) @ turn
+    lever[:, :, 3:] = -turn
+    return lever
+
+
+def carried(to: Floats, covariance: Floats, map_T_camera: Floats) -> Floats:
+    """What covariances (n, 6, 6) of the camera, or one (6, 6), in its own frame, make of landmarks `to` (n, 3) away:
+    (n, 3, 3), m^2."""
+    lever = levers(to, map_T_camera)
+    return np.asarray(lever @ covariance @ np.swapaxes(lever, 1, 2))
 
 
 def gathered(now: Floats, then: Floats) -> Floats:

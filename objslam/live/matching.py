@@ -11,7 +11,7 @@ from objslam.association.landmarks import RANGE_LOSS, Landmarks
 from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
 from objslam.live.candidates import Candidate
-from objslam.live.known import HORIZON, carried, covariances, gathered, long_unseen, noise
+from objslam.live.known import HORIZON, covariances, gathered, levers, long_unseen, noise
 from objslam.live.meeting import sightings
 from objslam.live.returning import expected_unknown, trusted
 from objslam.live.table import Table
@@ -22,7 +22,8 @@ _BEYOND, _NEAR = (
     1.5,
     10.0,
 )  # times the greatest distance from which anything was seen, and m; what is further is not looked at
-_ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough
+_ROUGH = 3.0  # times the noise of a ray: a bearing that is predicted less well is rough,
+_VAGUE = 2 * np.log(_ROUGH)  # as `Edges.vague` has it
 _CLEAR = 6.0  # squared deviations by which the best of several places that are all rough must be better
 _WIDEST = 0.3  # m; a place that is rougher than that tells no landmark from another
 _PLACED = 0.1  # m; a camera known that well in the map tells apart what it saw long ago, too
@@ -63,8 +64,8 @@ class Doubt:
     @property
     def placed(self) -> bool:
         """Whether the camera's place in the map is known well."""
-        turn, way = (float(np.sqrt(np.trace(self.pose[i : i + 3, i : i + 3]))) for i in (0, 3))
-        return turn < HORIZON and way < _PLACED
+        variance = self.pose.diagonal().tolist()
+        return sum(variance[:3]) < HORIZON**2 and sum(variance[3:]) < _PLACED**2
 
 
 def match(
@@ -83,43 +84,38 @@ def match(
     Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark
     (id) that a detector's track was given last. novelty: the share of boxes that showed nothing known, of late.
     """
-    rows = _ahead(rays, map_T_camera, known)
+    s, origin = in_map(rays, map_T_camera), map_T_camera[:3, 3]
+    rows = _ahead(s, origin, known)
     here = set(rays.label.tolist())
     lately = -np.inf if doubt.placed else float(doubt.drift[2, 2]) - HORIZON**2
     waiting = [i for i, c in enumerate(candidates) if c.label in here and not c.by_label and c.drift[2, 2] > lately]
     if not len(rows) and not waiting:
         return np.full(len(rays), -1, dtype=np.int64)
-    ours = [candidates[i] for i in waiting]
-    places = np.concatenate([known.position[rows], np.array([c.position for c in ours]).reshape(-1, 3)])
-    own = np.concatenate([covariances(known, rows), np.array([c.covariance for c in ours]).reshape(-1, 3, 3)])
-    then = np.concatenate([known.drift[rows], np.array([c.drift for c in ours]).reshape(-1, 6, 6)])
-    covariance = own + _doubtful(places - map_T_camera[:3, 3], then, map_T_camera, doubt)
-    label = np.concatenate([known.label[rows], np.array([c.label for c in ours], dtype=np.int64)])
-    noises = np.append(noise(known, rows), np.ones(len(ours)))
+    places, own, then, label, noises = _expected(known, rows, [candidates[i] for i in waiting])
+    to = places - origin
     accepts = label[:, None] == np.arange(labels)
-    s = in_map(rays, map_T_camera)
     limit = gate_limit(gate)
-    edges = gated_edges(s, Landmarks(places, covariance, noises, accepts), limit)
-    away = np.linalg.norm(places[edges.landmark] - map_T_camera[:3, 3], axis=1)
-    edges = _clear(edges, rays.sigma, away, len(rows))
-    number = np.concatenate([rows, len(known) + np.array(waiting, dtype=np.int64)]).astype(np.int64)
+    edges = gated_edges(s, Landmarks(places, own + _doubtful(to, then, map_T_camera, doubt), noises, accepts), limit)
+    edges = _clear(edges, rays.sigma, to, len(rows))
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
         before = np.array([tracks.get(t, -1) for t in rays.track.tolist()])
-        ids = np.append(known.id[rows], np.full(len(ours), -2))
+        ids = np.append(known.id[rows], np.full(len(waiting), -2))
         cost = cost - np.where(before[edges.ray] == ids[edges.landmark], 2.0, 0.0)
     unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
     chosen = _best(edges, cost, len(rays), len(places), unmatched)
-    unseen = np.append(long_unseen(doubt.drift, known.drift[rows]), np.zeros(len(ours), dtype=bool))
+    unseen = long_unseen(doubt.drift, then)
+    unseen[len(rows) :] = False
     back = np.flatnonzero((chosen >= 0) & unseen[chosen])
     if len(back):
         at, some = chosen[back], s.take(back)
         landmarks = Landmarks(places[at], own[at], noises[at], accepts[at])
-        worst = _least(then[at], places[at] - map_T_camera[:3, 3], map_T_camera, doubt)
+        worst = _least(then[at], to[at], doubt)
         sure = back[trusted(some, landmarks, worst, map_T_camera, expected_unknown(some, rows[at], known, novelty))]
         keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
         chosen = _best(_some(edges, keep), cost[keep], len(rays), len(places), unmatched)
-    return np.where(chosen >= 0, number[chosen], -1)
+    number = np.array([*rows.tolist(), *(len(known) + i for i in waiting), -1], dtype=np.int64)
+    return number[chosen]
 
 
 def match_by_label(rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, gate: float) -> tuple[Ints, Ints]:
@@ -158,30 +154,42 @@ def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
     return sightings(origin, direction, rays.sigma, rays.range, rays.range_sigma, rays.label)
 
 
-def _ahead(rays: FrameRays, map_T_camera: Floats, known: Table) -> Ints:
-    """Rows (n,) of the landmarks that the rays could show."""
-    wanted = np.flatnonzero((known.label[:, None] == rays.label).any(axis=1))
-    to = known.position[wanted] - map_T_camera[:3, 3]
-    off = (to @ (rays.direction @ map_T_camera[:3, :3].T).T).max(axis=1, initial=-np.inf)
-    distance2 = np.einsum("ni,ni->n", to, to)
-    return wanted[(off > _VIEW * np.sqrt(distance2)) & (distance2 < max(_BEYOND * known.far.max(initial=0.0), _NEAR) ** 2)]
+def _ahead(s: Sightings, origin: Floats, known: Table) -> Ints:
+    """Rows (n,) of the landmarks that rays from one origin (3,) could show."""
+    wanted = np.flatnonzero((known.label[:, None] == s.label).any(axis=1))
+    to = known.position[wanted] - origin
+    off = (to @ s.direction.T).max(axis=1, initial=-np.inf)
+    distance = np.sqrt((to * to).sum(axis=1))
+    furthest = max(_BEYOND * float(known.far.max(initial=0.0)), _NEAR)
+    return wanted[(off > _VIEW * distance) & (distance < furthest)]
+
+
+def _expected(known: Table, rows: Ints, ours: list[Candidate]) -> tuple[Floats, Floats, Floats, Ints, Floats]:
+    """What landmarks, and then candidates, are taken to be: position, covariance, drift when last seen, label, noise."""
+    columns = known.position[rows], covariances(known, rows), known.drift[rows], known.label[rows], noise(known, rows)
+    if not ours:
+        return columns
+    place, spread, drift, label = zip(*((c.position, c.covariance, c.drift, c.label) for c in ours), strict=True)
+    more = np.array(place), np.array(spread), np.array(drift), np.array(label, dtype=np.int64), np.ones(len(ours))
+    a, b, c, d, e = (np.concatenate(pair) for pair in zip(columns, more, strict=True))
+    return a, b, c, d, e
 
 
 def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
     """Covariances (n, 3, 3) of how places `to` (n, 3) away lie to the camera, by the doubt about where the camera is.
 
     What the odometry gathered since the drift was `then` (n, 6, 6), or the doubt about its place in the map, whichever is
-    less.
+    less; where the graph does not tell that, its NaN is not.
     """
-    since = carried(to, gathered(doubt.drift, then), map_T_camera, doubt.camera_from_drift)
-    if not np.isfinite(doubt.pose).all():
-        return since
-    placed = carried(to, doubt.pose, map_T_camera, np.eye(6))
+    lever = levers(to, map_T_camera)
+    back = np.swapaxes(lever, 1, 2)
+    since = lever @ (doubt.camera_from_drift @ gathered(doubt.drift, then) @ doubt.camera_from_drift.T) @ back
+    placed = lever @ doubt.pose @ back
     less = np.trace(placed, axis1=1, axis2=2) < np.trace(since, axis1=1, axis2=2)
     return np.where(less[:, None, None], placed, since)
 
 
-def _least(then: Floats, to: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
+def _least(then: Floats, to: Floats, doubt: Doubt) -> Floats:
     """The covariance (6, 6) of the camera's pose against places `to` (n, 3) away, last seen at the drifts `then` (n, 6, 6).
 
     One for all of them, by that which was not seen for longest.
@@ -212,14 +220,15 @@ def _some(edges: Edges, keep: Bools) -> Edges:
     return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])
 
 
-def _clear(edges: Edges, sigma: Floats, away: Floats, landmarks: int) -> Edges:
-    """Without the matches to landmarks that are expected only roughly, where it could as well be another; away: (E,) m.
+def _clear(edges: Edges, sigma: Floats, to: Floats, landmarks: int) -> Edges:
+    """Without the matches to landmarks that are expected only roughly, where it could as well be another; to: (N, 3) m.
 
     Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`).
     """
-    rough = (edges.vague > 2 * np.log(_ROUGH)) & (edges.landmark < landmarks)
+    rough = (edges.vague > _VAGUE) & (edges.landmark < landmarks)
     if not rough.any():
         return edges
+    away = np.linalg.norm(to[edges.landmark], axis=1)
     width = sigma[edges.ray] * away * np.exp(edges.vague / 4)  # the side of a square as large as what the landmark covers
     order = np.lexsort((edges.cost, edges.ray))
     ray, cost = edges.ray[order], edges.cost[order]

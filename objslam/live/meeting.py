@@ -6,6 +6,7 @@ The same consensus of pairs, in numpy, for the few rays of one object: a call of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -35,22 +36,30 @@ def sightings(
     origin: Floats, direction: Floats, sigma: Floats, range_: Floats, range_sigma: Floats, label: Ints | None = None
 ) -> Sightings:
     """Rays (R,) in map as sightings, all of one frame, with nothing but where they point."""
-    count = len(origin)
-    nothing = np.zeros(count, dtype=np.int64)
+    zero, minus, one, size, box = _nothing(len(origin))
     return Sightings(
-        frame=nothing,
-        label=nothing if label is None else label,
+        frame=zero,
+        label=zero if label is None else label,
         origin=origin,
         direction=direction,
         sigma=sigma,
         place=0.0,
         range=range_,
         range_sigma=range_sigma,
-        size=np.zeros((count, 2)),
-        box=np.zeros((count, 4)),
-        track=nothing - 1,
-        score=np.ones(count),
+        size=size,
+        box=box,
+        track=minus,
+        score=one,
     )
+
+
+@lru_cache(maxsize=256)
+def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats, Floats]:
+    zero = np.zeros(count, dtype=np.int64)
+    columns = zero, zero - 1, np.ones(count), np.zeros((count, 2)), np.zeros((count, 4))
+    for column in columns:
+        column.flags.writeable = False
+    return columns
 
 
 def meet(s: Sightings, rng: np.random.Generator, slack: float = 0.0) -> Meeting | None:

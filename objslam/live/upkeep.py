@@ -197,10 +197,11 @@ def _drifted(m: Mapper, rows: Ints) -> Floats:
     first, second = rows[np.argsort(known.last[rows], kind="stable")]
     to = (known.position[rows].mean(axis=0) - pose[:3, 3])[None]
     camera_from_drift = adjoint(inverse(k.start_T_base[newest] @ k.base_T_camera[newest]))
-    since = carried(to, gathered(known.drift[second], known.drift[first][None]), pose, camera_from_drift)[0]
+    gained = camera_from_drift @ gathered(known.drift[second], known.drift[first][None]) @ camera_from_drift.T
+    since = carried(to, gained, pose)[0]
     if not np.isfinite(m.doubt).all():
         return since
-    placed = carried(to, m.doubt, pose, np.eye(6))[0]
+    placed = carried(to, m.doubt, pose)[0]
     return placed if np.trace(placed) < np.trace(since) else since
 
 
