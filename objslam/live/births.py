@@ -16,12 +16,10 @@ if TYPE_CHECKING:
 _CANDIDATES = 150  # at the most
 
 
-def give_birth(m: Mapper, k: int) -> None:
-    """Candidates that saw something in this keyframe become landmarks where their rays carry it."""
+def give_birth(m: Mapper, grown: list[Candidate]) -> list[Candidate]:
+    """Of the candidates that have a ray more, those become landmarks whose rays carry it; the others are left."""
     born: list[Candidate] = []
-    for candidate in m.candidates:
-        if candidate.rays[-1][1] != k:
-            continue
+    for candidate in grown:
         met = ripe(candidate, m.graph, m.settings, m.rng)
         if met is None:
             continue
@@ -52,20 +50,22 @@ def give_birth(m: Mapper, k: int) -> None:
         m.graph.add_rays(m.bearings(at[met.agree]))
     for candidate in born:
         m.candidates.remove(candidate)
+    return [candidate for candidate in grown if candidate not in born]
 
 
-def new_candidate(m: Mapper, rays: FrameRays, i: int, number: int, k: int, stamp: float, doubt: Doubt) -> None:
+def new_candidate(m: Mapper, rays: FrameRays, i: int, number: int, k: int, stamp: float, doubt: Doubt) -> Candidate:
     """A ray that nobody has becomes a candidate, or part of that of its label."""
     label = int(rays.label[i])
     if m.by_label:
         for candidate in m.candidates:
             if candidate.label == label:
                 extend(m, candidate, rays, i, number, k, stamp, doubt)
-                return
+                return candidate
     candidate = Candidate(m.next_candidate, label, m.by_label, stamp, stamp, doubt.drift)
     m.next_candidate += 1
     m.candidates.append(candidate)
     extend(m, candidate, rays, i, number, k, stamp, doubt)
+    return candidate
 
 
 def leave_out_the_least(m: Mapper) -> None:

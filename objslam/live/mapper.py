@@ -24,6 +24,7 @@ from objslam.live.births import extend, give_birth, leave_out_the_least, new_can
 from objslam.live.candidates import Candidate, place
 from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
+from objslam.live.expected import Expected, expect
 from objslam.live.frame_reader import FrameReader
 from objslam.live.learning import Lesson, learn
 from objslam.live.localizing import localize
@@ -72,6 +73,8 @@ class Mapper:
         self._doubts: dict[int, Floats] = {}
         self._last_floor: tuple[Floats | None, bool, Floats] = (None, True, np.zeros((6, 6)))
         self._lesson: Lesson | None = None
+        self._grown: list[Candidate] = []
+        self._expected: Expected | None = None
         self.doubt = np.full((6, 6), np.nan)
         self.novelty = 1.0
         self._next_ray = self._next_keyframe = self._count = 0
@@ -187,9 +190,12 @@ class Mapper:
         """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
         if self._lesson is not None:
             learn(self, self._lesson)
-            place([c for c in self.candidates if not c.by_label and c.rays[-1][1] == self._lesson.keyframe])
+            place([c for c in self._grown if not c.by_label])
             self._lesson = None
         upkeep.after_keyframe(self)
+        if not self.by_label:
+            leave_out_the_least(self)
+            self._expected = expect(self.known, self.candidates)
 
     def leave_out(self, frame: FrameMessage, reason: str) -> None:
         """Count a frame that is not to be looked at, and its boxes."""
@@ -206,22 +212,25 @@ class Mapper:
         numbers = self._next_ray + np.arange(count)
         self._next_ray += count
         mine = best_of_label(rays) if self.by_label else np.arange(count)
-        some = rays.take(mine)
+        self._grown = []
         if self.by_label:
-            hit, missed = match_by_label(some, guess, known, doubt, settings.association.gate)
+            hit, missed = match_by_label(rays.take(mine), guess, known, doubt, settings.association.gate)
             lost = missed >= 0
             known.rejected[missed[lost]] += 1
             owner[mine[lost]] = known.id[missed[lost]]
             free = mine[(hit < 0) & ~lost]
         else:
             gate, number = settings.association.gate, len(self.labels)
-            hit = match(some, guess, known, self.candidates, doubt, number, gate, self.tracks, self.novelty)
-            new = float(((hit < 0) | (hit >= len(known))).mean())
-            self.novelty += _NOVEL * (new - self.novelty)
-            for i in np.flatnonzero(hit >= len(known)).tolist():
-                extend(self, self.candidates[hit[i] - len(known)], rays, i, numbers[i], k, stamp, doubt)
+            expected = self._expected or expect(known, self.candidates)
+            hit = match(rays, guess, expected, doubt, number, gate, self.tracks, self.novelty)
+            self._expected = None  # what follows changes it
+            waits = hit >= len(known)
+            self.novelty += _NOVEL * (float((waits | (hit < 0)).mean()) - self.novelty)
+            for i in np.flatnonzero(waits).tolist():
+                self._grown.append(self.candidates[hit[i] - len(known)])
+                extend(self, self._grown[-1], rays, i, numbers[i], k, stamp, doubt)
             free = mine[hit < 0]
-            hit = np.where(hit < len(known), hit, -1)
+            hit[waits] = -1
         matched = mine[hit >= 0]
         rows = hit[hit >= 0]
         owner[matched], used[matched] = known.id[rows], True
@@ -239,25 +248,20 @@ class Mapper:
             owner=owner,
             used=used,
         )
-        for i in free.tolist():
-            new_candidate(self, rays, i, numbers[i], k, stamp, doubt)
-        if not self.by_label:
-            leave_out_the_least(self)
+        self._grown += [new_candidate(self, rays, i, numbers[i], k, stamp, doubt) for i in free.tolist()]
         if len(matched):
             self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
-        give_birth(self, k)
+        self._grown = give_birth(self, self._grown)
         self.graph.update()
         self._lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, k)
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""
         rays = self.rays
-        share = np.zeros(len(at))
-        ranged = np.isfinite(rays.range[at])
-        if ranged.any():
+        sigma = rays.range_sigma[at]
+        if np.isfinite(sigma).any():
             row = self.rows_of(rays.owner[at])
-            share = np.where(ranged, self.known.seen[row] + 1, 0) * self.settings.depth.bias**2
-        sigma = np.sqrt(np.where(ranged, rays.range_sigma[at], 1.0) ** 2 + share)
+            sigma = np.sqrt(sigma**2 + (self.known.seen[row] + 1) * self.settings.depth.bias**2)
         return Bearings(
             number=rays.number[at],
             keyframe=rays.keyframe[at],
@@ -278,6 +282,7 @@ class Mapper:
 
     def move_candidates(self, new_T_old: Floats, since: float) -> None:
         """Candidates seen from a stamp on moved by a pose (4, 4), as the path was."""
+        self._expected = None
         for candidate in self.candidates:
             if candidate.last >= since:
                 candidate.move(new_T_old)

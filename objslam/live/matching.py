@@ -10,7 +10,7 @@ from objslam.association.assign import gate_limit
 from objslam.association.landmarks import RANGE_LOSS, Landmarks
 from objslam.association.matches import Edges, gated_edges
 from objslam.association.sightings import Sightings
-from objslam.live.candidates import Candidate
+from objslam.live.expected import Expected
 from objslam.live.known import HORIZON, covariances, gathered, levers, long_unseen, noise
 from objslam.live.meeting import sightings
 from objslam.live.returning import expected_unknown, trusted
@@ -71,51 +71,50 @@ class Doubt:
 def match(
     rays: FrameRays,
     map_T_camera: Floats,
-    known: Table,
-    candidates: list[Candidate],
+    expected: Expected,
     doubt: Doubt,
     labels: int,
     gate: float,
     tracks: dict[int, int],
     novelty: float = 1.0,
 ) -> Ints:
-    """For each ray (n,) the row of its landmark, len(known) + the index of its candidate, or -1.
+    """For each ray (n,) which of the expected it is of, or -1.
 
     Candidates that were not seen for long are none of them, unless the camera's place is known well. tracks: the landmark
     (id) that a detector's track was given last. novelty: the share of boxes that showed nothing known, of late.
     """
     s, origin = in_map(rays, map_T_camera), map_T_camera[:3, 3]
-    rows = _ahead(s, origin, known)
-    here = set(rays.label.tolist())
-    lately = -np.inf if doubt.placed else float(doubt.drift[2, 2]) - HORIZON**2
-    waiting = [i for i, c in enumerate(candidates) if c.label in here and not c.by_label and c.drift[2, 2] > lately]
-    if not len(rows) and not waiting:
+    rows = _possible(s, origin, expected, doubt)
+    if not len(rows):
         return np.full(len(rays), -1, dtype=np.int64)
-    places, own, then, label, noises = _expected(known, rows, [candidates[i] for i in waiting])
+    landmark, label, own, then = (
+        rows < expected.landmarks,
+        expected.label[rows],
+        expected.covariance[rows],
+        expected.drift[rows],
+    )
+    places, noises = expected.position[rows], expected.noise[rows]
     to = places - origin
     accepts = label[:, None] == np.arange(labels)
     limit = gate_limit(gate)
     edges = gated_edges(s, Landmarks(places, own + _doubtful(to, then, map_T_camera, doubt), noises, accepts), limit)
-    edges = _clear(edges, rays.sigma, to, len(rows))
+    edges = _clear(edges, rays.sigma, to, landmark)
     cost = edges.cost
     if tracks and (rays.track >= 0).any():
         before = np.array([tracks.get(t, -1) for t in rays.track.tolist()])
-        ids = np.append(known.id[rows], np.full(len(waiting), -2))
-        cost = cost - np.where(before[edges.ray] == ids[edges.landmark], 2.0, 0.0)
+        cost = cost - np.where(before[edges.ray] == expected.id[rows][edges.landmark], 2.0, 0.0)
     unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
     chosen = _best(edges, cost, len(rays), len(places), unmatched)
-    unseen = long_unseen(doubt.drift, then)
-    unseen[len(rows) :] = False
+    unseen = long_unseen(doubt.drift, then) & landmark
     back = np.flatnonzero((chosen >= 0) & unseen[chosen])
     if len(back):
         at, some = chosen[back], s.take(back)
         landmarks = Landmarks(places[at], own[at], noises[at], accepts[at])
         worst = _least(then[at], to[at], doubt)
-        sure = back[trusted(some, landmarks, worst, map_T_camera, expected_unknown(some, rows[at], known, novelty))]
+        sure = back[trusted(some, landmarks, worst, map_T_camera, expected_unknown(some, rows[at], expected, novelty))]
         keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
         chosen = _best(_some(edges, keep), cost[keep], len(rays), len(places), unmatched)
-    number = np.array([*rows.tolist(), *(len(known) + i for i in waiting), -1], dtype=np.int64)
-    return number[chosen]
+    return np.where(chosen >= 0, rows[chosen], -1)
 
 
 def match_by_label(rays: FrameRays, map_T_camera: Floats, known: Table, doubt: Doubt, gate: float) -> tuple[Ints, Ints]:
@@ -154,25 +153,17 @@ def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
     return sightings(origin, direction, rays.sigma, rays.range, rays.range_sigma, rays.label)
 
 
-def _ahead(s: Sightings, origin: Floats, known: Table) -> Ints:
-    """Rows (n,) of the landmarks that rays from one origin (3,) could show."""
-    wanted = np.flatnonzero((known.label[:, None] == s.label).any(axis=1))
-    to = known.position[wanted] - origin
-    off = (to @ s.direction.T).max(axis=1, initial=-np.inf)
+def _possible(s: Sightings, origin: Floats, expected: Expected, doubt: Doubt) -> Ints:
+    """Which of the expected (n,) the rays from one origin (3,) could show."""
+    wanted = np.flatnonzero((expected.label[:, None] == s.label).any(axis=1))
+    to = expected.position[wanted] - origin
     distance = np.sqrt((to * to).sum(axis=1))
-    furthest = max(_BEYOND * float(known.far.max(initial=0.0)), _NEAR)
-    return wanted[(off > _VIEW * distance) & (distance < furthest)]
-
-
-def _expected(known: Table, rows: Ints, ours: list[Candidate]) -> tuple[Floats, Floats, Floats, Ints, Floats]:
-    """What landmarks, and then candidates, are taken to be: position, covariance, drift when last seen, label, noise."""
-    columns = known.position[rows], covariances(known, rows), known.drift[rows], known.label[rows], noise(known, rows)
-    if not ours:
-        return columns
-    place, spread, drift, label = zip(*((c.position, c.covariance, c.drift, c.label) for c in ours), strict=True)
-    more = np.array(place), np.array(spread), np.array(drift), np.array(label, dtype=np.int64), np.ones(len(ours))
-    a, b, c, d, e = (np.concatenate(pair) for pair in zip(columns, more, strict=True))
-    return a, b, c, d, e
+    ahead = (to @ s.direction.T).max(axis=1, initial=-np.inf) > _VIEW * distance
+    ahead &= distance < max(_BEYOND * expected.far, _NEAR)
+    if doubt.placed:
+        return wanted[ahead | (wanted >= expected.landmarks)]
+    lately = expected.drift[wanted, 2, 2] > doubt.drift[2, 2] - HORIZON**2
+    return wanted[np.where(wanted < expected.landmarks, ahead, lately)]
 
 
 def _doubtful(to: Floats, then: Floats, map_T_camera: Floats, doubt: Doubt) -> Floats:
@@ -220,12 +211,13 @@ def _some(edges: Edges, keep: Bools) -> Edges:
     return Edges(edges.ray[keep], edges.landmark[keep], edges.deviation[keep], edges.vague[keep], edges.cost[keep])
 
 
-def _clear(edges: Edges, sigma: Floats, to: Floats, landmarks: int) -> Edges:
-    """Without the matches to landmarks that are expected only roughly, where it could as well be another; to: (N, 3) m.
+def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
+    """Without the matches to landmarks that are expected only roughly, where it could as well be another.
 
-    Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`).
+    Where no place at all is expected, a single box tells nothing: several landmarks must tell together (`loops`). to: (N, 3)
+    m, the way to each place; landmark: (N,) whether it is one.
     """
-    rough = (edges.vague > _VAGUE) & (edges.landmark < landmarks)
+    rough = (edges.vague > _VAGUE) & landmark[edges.landmark]
     if not rough.any():
         return edges
     away = np.linalg.norm(to[edges.landmark], axis=1)

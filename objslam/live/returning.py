@@ -12,7 +12,7 @@ from objslam.association.landmarks import Landmarks, variance
 from objslam.association.matches import across
 from objslam.association.sightings import Sightings
 from objslam.geometry import skew
-from objslam.live.table import Table
+from objslam.live.expected import Expected
 from objslam.types import Bools, Floats, Ints
 
 _ODDS = 4.5  # log odds of a landmark, given the others, against something not known yet
@@ -53,16 +53,17 @@ def trusted(s: Sightings, landmarks: Landmarks, doubt: Floats, map_T_camera: Flo
     return np.isin(each, left)
 
 
-def expected_unknown(s: Sightings, rows: Ints, known: Table, novelty: float) -> Floats:
+def expected_unknown(s: Sightings, rows: Ints, expected: Expected, novelty: float) -> Floats:
     """How many objects of the label of each landmark, rows (n,), not known yet, there are for each steradian along a ray.
 
     There are taken to be as many of them for each known one as there were boxes of something unknown, of late, for each box
     of a known one (novelty), spread evenly over the room: seen up to where the ray leaves it, or the eye gives out.
     """
-    low, high = known.position.min(axis=0), known.position.max(axis=0)
-    per_m3 = novelty * np.bincount(known.label)[known.label[rows]] / np.prod(np.maximum(high - low, [_REACH, _REACH, _TALL]))
+    position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
+    low, high = position.min(axis=0), position.max(axis=0)
+    per_m3 = novelty * np.bincount(label)[label[rows]] / np.prod(np.maximum(high - low, [_REACH, _REACH, _TALL]))
     ahead = s.direction[:, :2]
     ahead = np.where(np.abs(ahead) < _ALONG, np.copysign(_ALONG, ahead), ahead)
     wall = (np.where(ahead > 0, high[:2], low[:2]) - s.origin[:, :2]) / ahead
-    distance = np.linalg.norm(known.position[rows] - s.origin, axis=1)
-    return np.asarray(per_m3 * np.clip(wall.min(axis=1), distance, max(float(known.far.max()), _REACH)) ** 3 / 3)
+    distance = np.linalg.norm(position[rows] - s.origin, axis=1)
+    return np.asarray(per_m3 * np.clip(wall.min(axis=1), distance, max(expected.far, _REACH)) ** 3 / 3)

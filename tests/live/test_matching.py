@@ -6,6 +6,7 @@ import pytest
 from objslam.config import load_settings
 from objslam.geometry import adjoint, inverse
 from objslam.live.candidates import Candidate, ripe
+from objslam.live.expected import expect
 from objslam.live.known import new_landmarks
 from objslam.live.matching import Doubt, FrameRays, match
 from objslam.live.upkeep import _one
@@ -42,7 +43,7 @@ def doubt(heading, place=np.nan):
 
 def found(known, target, heading, place=np.nan, candidates=()):
     targets = [target] if np.ndim(target) == 1 else target
-    return match(rays(targets), AHEAD, known, list(candidates), doubt(heading, place), 2, 0.99, {}).tolist()
+    return match(rays(targets), AHEAD, expect(known, candidates), doubt(heading, place), 2, 0.99, {}).tolist()
 
 
 HALL = [(5.0, 0.0, 0.5), *((x, y, 0.5) for x in (-8.0, 0.0, 8.0, 14.0) for y in (-8.0, -5.0, 5.0, 8.0))]
