@@ -124,7 +124,7 @@ def box_rays(
 
 
 def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool) -> Ints:
-    of, size = settings.rays, np.array([camera.width, camera.height])
+    of, size = settings.rays, camera.size
     low, high = boxes[:, :2], boxes[:, 2:]
     centre = (low + high) / 2
     wrong = {
@@ -133,13 +133,14 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     }
     if of.border >= 0 and not whole:
         border = np.maximum(of.border, of.border_share * (high - low))
-        wrong["boxes cut off by the image's edge (rays.border)"] = ((low <= border) | (high >= size - 1 - border)).any(
-            axis=1
-        )
-    keep = np.ones(len(boxes), dtype=bool)
-    for reason, bad in wrong.items():
-        ledger.drop(reason, int((keep & bad).sum()), f"camera {camera.name}")
-        keep &= ~bad
+        cut = (low <= border) | (high >= size - 1 - border)
+        wrong["boxes cut off by the image's edge (rays.border)"] = cut.any(axis=1)
+    keep = ~np.logical_or.reduce(list(wrong.values()))
+    if not keep.all():
+        left = np.ones(len(boxes), dtype=bool)
+        for reason, bad in wrong.items():
+            ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}")
+            left &= ~bad
     return np.flatnonzero(keep)
 
 

@@ -75,6 +75,11 @@ class Camera:
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
 
     @cached_property
+    def size(self) -> Floats:
+        """(2,) width and height of the image, px."""
+        return np.array([self.width, self.height], dtype=np.float64)
+
+    @cached_property
     def inverse_matrix(self) -> Floats:
         """(3, 3), from homogeneous pixels to directions with z = 1."""
         return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)

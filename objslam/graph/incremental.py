@@ -53,6 +53,11 @@ class IncrementalGraph:
         """The camera motion (4, 4) with covariance (6, 6) from X(before) to X(after), by odometry."""
         self._add(self._kept.chain, after, factors.between(before, after, motion, covariance))
 
+    def before(self, k: int) -> int | None:
+        """The keyframe that the motion to X(k) comes from, if there is one."""
+        motion = self._kept.chain.get(k)
+        return None if motion is None else int(motion.keys()[0]) - X0
+
     def add_anchor(self, k: int, map_T_camera: Floats) -> None:
         """X(k) held where it is."""
         self._add(self._kept.absolute, k, gtsam.PriorFactorPose3(x_key(k), gtsam.Pose3(map_T_camera), _isotropic(6, 1e-4)))

@@ -87,6 +87,6 @@ def in_view(known: Table, camera: Camera, map_T_camera: Floats) -> Bools:
     ahead = np.flatnonzero((local[:, 2] > _NEAREST) & (local[:, 2] > 0.3 * distance) & (distance < _FURTHER * known.far))
     seen = np.zeros(len(known), dtype=bool)
     pixels = project(camera, local[ahead])
-    size = np.array([camera.width, camera.height])
-    seen[ahead] = ((pixels > _INNER * size) & (pixels < (1 - _INNER) * size)).all(axis=1)
+    inside = (pixels > _INNER * camera.size) & (pixels < (1 - _INNER) * camera.size)
+    seen[ahead] = inside.all(axis=1)
     return seen

@@ -7,7 +7,6 @@ the same map.
 from __future__ import annotations
 
 import bisect
-import math
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from objslam.graph.incremental import IncrementalGraph
 from objslam.graph.kept import Bearings
 from objslam.live import known as landmarks
 from objslam.live import upkeep
-from objslam.live.births import extend, give_birth, leave_out_the_least, new_candidate
+from objslam.live.associating import associate
+from objslam.live.births import leave_out_the_least
 from objslam.live.candidates import Candidate, place
 from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
@@ -28,15 +28,14 @@ from objslam.live.expected import Expected, expect
 from objslam.live.frame_reader import FrameReader
 from objslam.live.learning import Lesson, learn
 from objslam.live.localizing import localize
-from objslam.live.matching import Doubt, FrameRays, best_of_label, match, match_by_label
+from objslam.live.matching import Doubt
 from objslam.live.meeting import sightings
 from objslam.live.messages import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
+from objslam.live.pace import Pace
 from objslam.live.path import PathBuffer
 from objslam.types import Camera, Floats, Ints, Keyframes
 
 _KEPT = 3.0  # s besides live.max_late that the path is kept for
-_STANDING = 10  # keyframes from one place
-_NOVEL = 0.02  # weight of a frame in the share of boxes that show nothing known
 _ASK = 10  # keyframes after which the graph is asked how well it knows where it is
 
 
@@ -64,20 +63,18 @@ class Mapper:
         self.unsettled, self.unrest = False, 0
         self.tracks: dict[int, int] = {}
         self._frame_number: dict[int, int] = {}
-        self._last: dict[int, Floats] = {}
-        self._shown: set[int] = set()
-        self._standing = 0
+        self.pace = Pace(settings.live)
         self.unlocalized: list[int] = []
         self.localizations = 0
         self.flat = True
         self._doubts: dict[int, Floats] = {}
         self._last_floor: tuple[Floats | None, bool, Floats] = (None, True, np.zeros((6, 6)))
-        self._lesson: Lesson | None = None
-        self._grown: list[Candidate] = []
-        self._expected: Expected | None = None
+        self.lesson: Lesson | None = None
+        self.grown: list[Candidate] = []
+        self.expected: Expected | None = None
         self.doubt = np.full((6, 6), np.nan)
         self.novelty = 1.0
-        self._next_ray = self._next_keyframe = self._count = 0
+        self.next_ray = self._next_keyframe = self._count = 0
         self.next_object = self.next_candidate = 0
 
     @property
@@ -138,12 +135,8 @@ class Mapper:
         self._frame_number[camera] = number + 1
         rays = self.reader.rays(frame)
         start_T_camera = start_T_base @ base_T_camera
-        moved = self._moved(camera, start_T_camera)
         shown = set(rays.label.tolist())
-        if moved:
-            self._shown.clear()
-            self._standing = 0
-        elif shown <= self._shown and self._standing >= _STANDING:
+        if self.pace.skips(camera, start_T_camera, shown):
             self.counters.accept("frames between keyframes")
             return False
         if not len(rays) and not len(self.known):
@@ -171,9 +164,7 @@ class Mapper:
             self.known.expected[landmarks.in_view(self.known, self.cameras[camera], guess)] += 1
             return False
         self._next_keyframe += 1
-        self._last[camera] = start_T_camera
-        self._shown |= shown
-        self._standing += 1
+        self.pace.keeps(camera, start_T_camera, shown)
         self.keyframes.add(**{name: np.asarray(value)[None] for name, value in row.items()})
         self.graph.add_keyframe(k, guess)
         if motion is not None:
@@ -183,77 +174,24 @@ class Mapper:
             self.graph.add_anchor(k, guess)
         self.unlocalized.append(k)
         localize(self)
-        self._associate(rays, k, camera, guess, doubt, frame.stamp)
+        associate(self, rays, k, camera, guess, doubt, frame.stamp)
         return True
 
     def look_after(self) -> None:
         """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
-        if self._lesson is not None:
-            learn(self, self._lesson)
-            place([c for c in self._grown if not c.by_label])
-            self._lesson = None
+        if self.lesson is not None:
+            learn(self, self.lesson)
+            place([c for c in self.grown if not c.by_label])
+            self.lesson = None
         upkeep.after_keyframe(self)
         if not self.by_label:
             leave_out_the_least(self)
-            self._expected = expect(self.known, self.candidates)
+            self.expected = expect(self.known, self.candidates)
 
     def leave_out(self, frame: FrameMessage, reason: str) -> None:
         """Count a frame that is not to be looked at, and its boxes."""
         self.counters.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
         self.counters.drop(reason.replace("frames", "boxes", 1), count=len(frame))
-
-    def _associate(self, rays: FrameRays, k: int, camera: int, guess: Floats, doubt: Doubt, stamp: float) -> None:
-        known, count = self.known, len(rays)
-        settings = self.settings
-        owner, used = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=bool)
-        if self.by_label and settings.association.method == "auto" and len(set(rays.label.tolist())) < count:
-            self.by_label = False  # two boxes of one label: labels do not tell objects apart
-            self.candidates = [c for c in self.candidates if not c.by_label]
-        numbers = self._next_ray + np.arange(count)
-        self._next_ray += count
-        mine = best_of_label(rays) if self.by_label else np.arange(count)
-        self._grown = []
-        if self.by_label:
-            hit, missed = match_by_label(rays.take(mine), guess, known, doubt, settings.association.gate)
-            lost = missed >= 0
-            known.rejected[missed[lost]] += 1
-            owner[mine[lost]] = known.id[missed[lost]]
-            free = mine[(hit < 0) & ~lost]
-        else:
-            gate, number = settings.association.gate, len(self.labels)
-            expected = self._expected or expect(known, self.candidates)
-            hit = match(rays, guess, expected, doubt, number, gate, self.tracks, self.novelty)
-            self._expected = None  # what follows changes it
-            waits = hit >= len(known)
-            self.novelty += _NOVEL * (float((waits | (hit < 0)).mean()) - self.novelty)
-            for i in np.flatnonzero(waits).tolist():
-                self._grown.append(self.candidates[hit[i] - len(known)])
-                extend(self, self._grown[-1], rays, i, numbers[i], k, stamp, doubt)
-            free = mine[hit < 0]
-            hit[waits] = -1
-        matched = mine[hit >= 0]
-        rows = hit[hit >= 0]
-        owner[matched], used[matched] = known.id[rows], True
-        self.rays.add(
-            number=numbers,
-            keyframe=np.full(count, k),
-            direction=rays.direction,
-            sigma=rays.sigma,
-            range=rays.range,
-            range_sigma=rays.range_sigma,
-            label=rays.label,
-            score=rays.score,
-            box=rays.box,
-            track=rays.track,
-            owner=owner,
-            used=used,
-        )
-        self._grown += [new_candidate(self, rays, i, numbers[i], k, stamp, doubt) for i in free.tolist()]
-        if len(matched):
-            self.graph.add_rays(self.bearings(len(self.rays) - count + matched))
-        self._grown = give_birth(self, self._grown)
-        self.graph.update()
-        self._lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, k)
 
     def bearings(self, at: Ints) -> Bearings:
         """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""
@@ -282,7 +220,7 @@ class Mapper:
 
     def move_candidates(self, new_T_old: Floats, since: float) -> None:
         """Candidates seen from a stamp on moved by a pose (4, 4), as the path was."""
-        self._expected = None
+        self.expected = None
         for candidate in self.candidates:
             if candidate.last >= since:
                 candidate.move(new_T_old)
@@ -354,13 +292,3 @@ class Mapper:
             return len(stamps) - 1
         older = np.flatnonzero(stamps <= stamp)
         return int(older[stamps[older].argmax()]) if len(older) else None
-
-    def _moved(self, camera: int, start_T_camera: Floats) -> bool:
-        last = self._last.get(camera)
-        if last is None:
-            return True
-        live = self.settings.live
-        way = math.dist(last[:3, 3].tolist(), start_T_camera[:3, 3].tolist())
-        cosine = (float(np.vdot(last[:3, :3], start_T_camera[:3, :3])) - 1) / 2
-        turned = math.acos(min(1.0, max(-1.0, cosine)))
-        return way >= live.keyframe_distance or turned >= math.radians(live.keyframe_angle_deg)

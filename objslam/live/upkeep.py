@@ -47,13 +47,13 @@ _SLACK = 0.02  # m
 def after_keyframe(m: Mapper) -> None:
     """Every few keyframes, whatever is due."""
     m.graph.take_turn()
-    due = m.keyframes_so_far % _EVERY == 0
+    turn = m.keyframes_so_far % _EVERY
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    if (due or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
+    if (turn == 0 or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
         m.graph.update(relinearise=True)
         m.unrest = max(0, m.unrest - 1)
-    if not due:
+    if turn != 1:  # right after that, but not at once: no frame may wait for both
         return
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
@@ -264,12 +264,13 @@ def thin(m: Mapper) -> None:
 
 def _chain(m: Mapper) -> None:
     """The odometry between the keyframes that are left, in the order of time."""
+    if m.localized_only:
+        return
     k = m.keyframes
     order = np.argsort(k.stamp, kind="stable")
-    arrays = m.keyframe_arrays(order)
-    if arrays.odom_T_base is None:
-        return
-    motion, covariance = factors.motions(arrays, m.settings)
     ids = k.id[order].tolist()
-    for before, after, step, spread in zip(ids[:-1], ids[1:], motion, covariance, strict=True):
-        m.graph.add_motion(before, after, step, spread)
+    anew = [i for i in range(1, len(ids)) if m.graph.before(ids[i]) != ids[i - 1]]
+    pairs = np.array([[i - 1, i] for i in anew], dtype=np.int64).ravel()
+    motion, covariance = factors.motions(m.keyframe_arrays(order[pairs]), m.settings, m.odometry.planar)
+    for i, step, spread in zip(anew, motion[::2], covariance[::2], strict=True):
+        m.graph.add_motion(ids[i - 1], ids[i], step, spread)
