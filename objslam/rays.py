@@ -146,8 +146,8 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
 
 def _centre_sigma(boxes: Floats, settings: Settings) -> Floats:
     """One standard deviation (M,), px, of the centres of boxes (M, 4)."""
-    size = np.sqrt(np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0).prod(axis=1))
-    return np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * size)
+    size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
+    return np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
 
 
 def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: Floats) -> Floats:

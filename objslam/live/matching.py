@@ -84,7 +84,7 @@ def match(
     (id) that a detector's track was given last. novelty: the share of boxes that showed nothing known, of late.
     """
     s, origin = in_map(rays, map_T_camera), map_T_camera[:3, 3]
-    rows = _possible(s, origin, expected, doubt)
+    rows = _possible(s, origin, expected, doubt, labels)
     if not len(rows):
         return np.full(len(rays), -1, dtype=np.int64)
     landmark, label, own, then = (
@@ -153,9 +153,11 @@ def in_map(rays: FrameRays, map_T_camera: Floats) -> Sightings:
     return sightings(origin, direction, rays.sigma, rays.range, rays.range_sigma, rays.label)
 
 
-def _possible(s: Sightings, origin: Floats, expected: Expected, doubt: Doubt) -> Ints:
+def _possible(s: Sightings, origin: Floats, expected: Expected, doubt: Doubt, labels: int) -> Ints:
     """Which of the expected (n,) the rays from one origin (3,) could show."""
-    wanted = np.flatnonzero((expected.label[:, None] == s.label).any(axis=1))
+    shown = np.zeros(labels + 1, dtype=bool)  # the last one is that of label -1
+    shown[s.label] = True
+    wanted = np.flatnonzero(shown[expected.label])
     to = expected.position[wanted] - origin
     distance = np.sqrt((to * to).sum(axis=1))
     ahead = (to @ s.direction.T).max(axis=1, initial=-np.inf) > _VIEW * distance
