@@ -59,7 +59,7 @@ class Mapper:
         seconds = settings.live.max_late + _KEPT
         self.odometry = PathBuffer(settings.odometry, seconds)
         self.localization = PathBuffer(settings.odometry, seconds)
-        self.polished = self.frames = 0
+        self.polished = self.thinned = self.frames = 0
         self.unsettled, self.unrest = False, 0
         self.tracks: dict[int, int] = {}
         self._frame_number: dict[int, int] = {}

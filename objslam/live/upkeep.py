@@ -35,8 +35,10 @@ _GHOST, _GHOST_FRAMES = 0.1, 40  # seen in a smaller share of so many frames tha
 _NEWEST, _OLDEST = 1 / 3, 1 / 30
 """Of live.max_keyframes that are never left out: the newest, and the oldest, whose rays alone tell how the map lies to where
 the robot began."""
-_SHARE = 0.25  # of the keyframes that are left out at a time
-_FEWEST = 10  # rays that a landmark keeps
+_SHARE = 0.25  # of them that are left out at a time,
+_AGAIN = 0.1  # of them that must come until then, however many there are: other things are due, too
+_FEWEST = 10  # rays that a landmark keeps,
+_CROWDED, _LEAST = 1.2, 3  # or so few, where more than so many times live.max_keyframes would stay
 _HALF = 0.5  # of a landmark's rays; when fewer fit, it is looked for anew
 _MANY, _SECOND = 5, 0.25  # rays, and share of them, that disagree with a label's one object if there is a second,
 _VISITS = 6  # and so often it is one's turn after the other's: a drifted path, or a bad place, disagrees at one stretch
@@ -66,7 +68,9 @@ def after_keyframe(m: Mapper) -> None:
 
 
 def _thin_if_many(m: Mapper) -> None:
-    if len(m.keyframes) > m.settings.live.max_keyframes:
+    most = m.settings.live.max_keyframes
+    if len(m.keyframes) > most and m.keyframes_so_far >= m.thinned + _AGAIN * most:
+        m.thinned = m.keyframes_so_far
         thin(m)
 
 
@@ -218,33 +222,12 @@ def _drop_ghosts(m: Mapper) -> None:
 
 
 def thin(m: Mapper) -> None:
-    """Leave out a share of the older keyframes, where they are densest, never two in a row, and sum up the odometry."""
-    k = m.keyframes
+    """Leave out the older keyframes where they are densest, never two in a row, and sum up the odometry."""
+    k, most = m.keyframes, m.settings.live.max_keyframes
     order = np.argsort(k.stamp, kind="stable")
-    place = k.start_T_base[order][:, :3, 3]
-    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    span = np.full(len(order), np.inf)
-    span[1:-1] = step[:-1] + step[1:]
-    most = m.settings.live.max_keyframes
-    span[: int(_OLDEST * most)] = span[len(span) - int(_NEWEST * most) :] = np.inf
-    rays_of = np.bincount(m.rays.owner[m.rays.used], minlength=int(m.known.id.max(initial=0)) + 1)
-    out = np.zeros(len(order), dtype=bool)
-    wanted = int(_SHARE * most)
-    by_keyframe = np.argsort(m.rays.keyframe, kind="stable")
-    sorted_keyframe = m.rays.keyframe[by_keyframe]
-    for i in np.argsort(span, kind="stable").tolist():
-        if not wanted or not np.isfinite(span[i]):
-            break
-        if out[i - 1] or out[i + 1]:
-            continue
-        number = k.id[order[i]]
-        mine = by_keyframe[np.searchsorted(sorted_keyframe, number) : np.searchsorted(sorted_keyframe, number, "right")]
-        owners = m.rays.owner[mine][m.rays.used[mine]]
-        if (rays_of[owners] <= _FEWEST).any():
-            continue
-        np.subtract.at(rays_of, owners, 1)
-        out[i] = True
-        wanted -= 1
+    out = _dispensable(m, order, len(k) - int((1 - _SHARE) * most), _FEWEST)
+    if len(k) - out.sum() > _CROWDED * most:  # very many landmarks of few rays each
+        out = _dispensable(m, order, len(k) - int((1 - _SHARE) * most), _LEAST)
     leaving = k.id[order[out]]
     lost: Bools = np.isin(m.rays.keyframe, leaving)
     m.graph.drop_rays(m.rays.number[lost])
@@ -260,6 +243,33 @@ def thin(m: Mapper) -> None:
     m.counters.accept("keyframes left out", len(leaving))
     m.graph.rebuild_in_turns(m.in_order())
     m.known.position[:] = m.graph.points(m.known.id)
+
+
+def _dispensable(m: Mapper, order: Ints, wanted: int, fewest: int) -> Bools:
+    """Which keyframes, in their order (K,), can go, so many at the most, so that no landmark is left with fewer rays."""
+    k, rays, most = m.keyframes, m.rays, m.settings.live.max_keyframes
+    place = k.start_T_base[order][:, :3, 3]
+    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    span = np.full(len(order), np.inf)
+    span[1:-1] = step[:-1] + step[1:]
+    span[: int(_OLDEST * most)] = span[len(span) - int(_NEWEST * most) :] = np.inf
+    used = np.flatnonzero(rays.used)
+    used = used[np.argsort(rays.keyframe[used], kind="stable")]
+    owner = rays.owner[used].tolist()
+    begin, end = (np.searchsorted(rays.keyframe[used], k.id[order], side).tolist() for side in ("left", "right"))
+    left = np.bincount(owner, minlength=1).tolist()
+    out = [False] * len(order)
+    for i in np.argsort(span, kind="stable")[: int(np.isfinite(span).sum())].tolist():
+        if not wanted:
+            break
+        mine = owner[begin[i] : end[i]]
+        if out[i - 1] or out[i + 1] or any(left[j] <= fewest for j in mine):
+            continue
+        for j in mine:
+            left[j] -= 1
+        out[i] = True
+        wanted -= 1
+    return np.array(out)
 
 
 def _chain(m: Mapper) -> None:

@@ -210,6 +210,18 @@ def test_growth_is_bounded_and_the_map_stays(log):
     session.abort()
 
 
+def test_growth_is_bounded_where_objects_are_too_many_for_it():
+    """120 keyframes hold some ten rays of each of 60 objects: fewer than each would rather keep."""
+    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=120"))
+    session = drive(hall(), settings)
+    snapshot = session.snapshot()
+    session.abort()
+    assert len(snapshot.path) <= 1.35 * 120
+    assert snapshot.keyframes > 1000
+    assert 55 <= len(snapshot.map.resolved()) <= 65
+    assert snapshot.counters["merged objects"] > 0  # other things got their turn
+
+
 def test_what_was_pushed_in_disorder(log):
     rng = np.random.default_rng(0)
     pushes = list(events(log))
