@@ -251,7 +251,7 @@ class Live(Section):
     """m; a frame becomes a keyframe once its camera has moved so far since the last one,"""
     keyframe_angle_deg: NotNegative = 0.5
     """or turned so far, or shows a label that no keyframe since then has. Where it stands still, the first ten are taken."""
-    max_keyframes: Annotated[int, Field(ge=50)] = 1000
+    max_keyframes: Annotated[int, Field(ge=50)] = 1500
     """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them
     summed up: what memory and time an update take stays bounded."""
     max_lag: Positive = 0.4

@@ -139,7 +139,10 @@ def solve_joint(
         attempt = trace.aside() if trace is not None else None
         at = found.map_T_camera, found.positions, found.used
         other = settle(keyframes, rays, association, settings, *at, back, attempt)
-        if misfit(other, keyframes, rays, association, settings) < misfit(found, keyframes, rays, association, settings):
+        before, after = (
+            misfit(one.map_T_camera, one.positions, keyframes, rays, association, settings) for one in (found, other)
+        )
+        if after < before:
             iterations = found.iterations + other.iterations
             found = replace(other, cost_before=found.cost_before, iterations=iterations)
             if trace is not None and attempt is not None:

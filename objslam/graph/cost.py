@@ -8,7 +8,7 @@ from objslam.geometry import inverse, log_se3
 from objslam.rays import angles_off
 from objslam.types import Floats, Ints, Rays
 
-_STRAY = 13.8  # squared deviations that a ray costs at the most
+STRAY = 13.8  # squared deviations that a ray costs at the most
 FLOOR = 0.02  # m; landmarks are never taken to be known better than that
 
 
@@ -25,7 +25,7 @@ def truncated_cost(
     origins, directions = some.in_map(map_T_camera)
     off = angles_off(origins, directions, positions[owner[held]])
     distance = np.linalg.norm(positions[owner[held]] - origins, axis=1)
-    seen = np.minimum(off**2 / (some.sigma**2 + (FLOOR / distance) ** 2), _STRAY).sum()
+    seen = np.minimum(off**2 / (some.sigma**2 + (FLOOR / distance) ** 2), STRAY).sum()
     steps = len(map_T_camera) - 1
     twist = log_se3(inverse(motion[:steps]) @ inverse(map_T_camera[:-1]) @ map_T_camera[1:])
     return float(seen + (twist * np.linalg.solve(covariance[:steps], twist[..., None])[..., 0]).sum())

@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.config import Loss, Settings
 from objslam.graph import factors
-from objslam.graph.cost import truncated_cost
+from objslam.graph.cost import STRAY, truncated_cost
 from objslam.graph.grow import anchor, landmark_priors, range_factors, ray_factors
 from objslam.graph.optimise import (
     Optimum,
@@ -98,12 +98,18 @@ def rejected_stretches(rays: Rays, association: Association, found: Settled) -> 
     return back
 
 
-def misfit(state: Settled, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> float:
-    """What tells the better of two solutions of the same rays."""
-    placed = np.isfinite(state.positions[:, 0])
+def misfit(
+    map_T_camera: Floats, positions: Floats, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
+) -> float:
+    """What tells the better of two solutions of the same rays: camera poses (K, 4, 4) and places (N, 3), NaN where none is.
+
+    A ray whose object has no place counts as a stray.
+    """
+    placed = np.isfinite(positions[:, 0])
     owner = np.where((association.object >= 0) & placed[association.object], association.object, -1)
     motion, covariance = factors.motions(keyframes, settings)
-    return truncated_cost(rays, owner, state.positions, state.map_T_camera, motion, covariance)
+    strays = int(((association.object >= 0) & (owner < 0)).sum())
+    return STRAY * strays + truncated_cost(rays, owner, positions, map_T_camera, motion, covariance)
 
 
 def _second_opinion(

@@ -117,19 +117,28 @@ def ripe(candidate: Candidate, graph: IncrementalGraph, settings: Settings, rng:
         return None
     if len(candidate) < _AGAIN * candidate.tried and candidate.spread < _AGAIN * candidate.tried_spread:
         return None
-    full = np.radians(settings.joint.min_parallax_deg)
     ranged = any(np.isfinite(ray[4]) for ray in candidate.rays)
-    if not ranged and candidate.spread < _EARLY * full:
+    if not ranged and candidate.spread < _EARLY * np.radians(settings.joint.min_parallax_deg):
         return None
     candidate.tried, candidate.tried_spread = len(candidate), candidate.spread
-    s = candidate.sight(graph)
+    share = _AGREE_BY_LABEL if candidate.by_label else _AGREE
+    return carried_place(candidate.sight(graph), live.min_rays, share, settings, rng, early=True)
+
+
+def carried_place(
+    s: Sightings, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
+) -> Meeting | None:
+    """Where rays meet if that makes an object: so many of them and such a share agree, with enough parallax or ranges.
+
+    early: less parallax is enough for a place that is very sure.
+    """
     met = meet(s, rng, _SLACK)
-    if met is None or met.agree.sum() < live.min_rays:
+    if met is None or met.agree.sum() < least or met.agree.mean() < share:
         return None
-    if met.agree.mean() < (_AGREE_BY_LABEL if candidate.by_label else _AGREE):
-        return None
+    full = np.radians(settings.joint.min_parallax_deg)
     away = float(np.median(np.linalg.norm(met.position - s.origin[met.agree], axis=1)))
     sigma = np.sqrt(np.linalg.eigvalsh(met.covariance)[-1])
-    early = met.parallax >= _EARLY * full and sigma <= _SURE * away
-    wide = met.parallax >= full or ranged
-    return met if early or (wide and sigma <= settings.triangulation.max_rel_sigma * away) else None
+    if early and met.parallax >= _EARLY * full and sigma <= _SURE * away:
+        return met
+    wide = met.parallax >= full or bool(np.isfinite(s.range).any())
+    return met if wide and sigma <= settings.triangulation.max_rel_sigma * away else None

@@ -5,15 +5,21 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.description import describe, summarise
 from objslam.errors import SolveError
+from objslam.ledger import Ledger
 from objslam.live.mapper import Mapper
 from objslam.results import RunResult
 from objslam.rounds import Solution, seen_something, solve
 from objslam.types import Association, Floats, Ints, Keyframes, Rays, Trajectory
+
+if TYPE_CHECKING:
+    from objslam.graph.batch import Estimate
 
 
 def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
@@ -23,7 +29,6 @@ def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
 
     SolveError where nothing was seen.
     """
-    from objslam.graph import batch
     from objslam.graph.explore import Explored
 
     begin = time.perf_counter()
@@ -34,7 +39,7 @@ def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
         raise SolveError("nothing was seen that could be mapped", where=name, hint="; ".join(ledger.lines()) or None)
     cameras = tuple(mapper.cameras)
     if mapper.by_label or len(rays) > settings.live.reassociate:
-        estimate = batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+        estimate = _solve_joint(keyframes, rays, association, settings, ledger, poses)
         solution = Solution(keyframes, rays, association, estimate, ())
     else:
         start = Explored(poses, association, positions)
@@ -67,6 +72,29 @@ def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
         path=Trajectory(stamps, keyframes.map_T_base[first]),
         path_after=Trajectory(stamps, estimate.map_T_base[first]),
     )
+
+
+def _solve_joint(
+    keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
+) -> Estimate:
+    """The joint solve from the session's poses (K, 4, 4), or the one that offline would make, if that fits better.
+
+    What a session rejected early on, when little was known, it may never have looked at in a better light.
+    """
+    from objslam.graph import batch
+    from objslam.graph.settle import misfit
+
+    if keyframes.odom_T_base is None or keyframes.localized_every or len(rays) > settings.live.reassociate:
+        return batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+    tried: list[tuple[float, int, Estimate, Ledger]] = []
+    for start in (poses, None):
+        said = Ledger()
+        one = batch.solve_joint(keyframes, rays, association, settings, said, start=start)
+        at = one.map_T_base @ keyframes.base_T_camera
+        tried.append((misfit(at, one.positions, keyframes, rays, association, settings), len(tried), one, said))
+    _, _, best, said = min(tried)
+    ledger.add(said)
+    return best
 
 
 def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats, Floats]:

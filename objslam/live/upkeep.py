@@ -8,9 +8,11 @@ import numpy as np
 
 from objslam.association.constellation import densities
 from objslam.association.extent import grouped_median
+from objslam.association.sightings import Sightings
 from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
 from objslam.graph import factors
+from objslam.live.candidates import carried_place
 from objslam.live.joining import join, without
 from objslam.live.known import carried, covariances, gathered, noise
 from objslam.live.loops import close_loop
@@ -42,6 +44,7 @@ _CROWDED, _LEAST = 1.2, 3  # or so few, where more than so many times live.max_k
 _HALF = 0.5  # of a landmark's rays; when fewer fit, it is looked for anew
 _MANY, _SECOND = 5, 0.25  # rays, and share of them, that disagree with a label's one object if there is a second,
 _VISITS = 6  # and so often it is one's turn after the other's: a drifted path, or a bad place, disagrees at one stretch
+_AGREE = 0.7  # share of them that make another place
 _DISTANT = 60.0  # s; how long something seen from afar is waited for
 _SLACK = 0.02  # m
 
@@ -49,13 +52,13 @@ _SLACK = 0.02  # m
 def after_keyframe(m: Mapper) -> None:
     """Every few keyframes, whatever is due."""
     m.graph.take_turn()
-    turn = m.keyframes_so_far % _EVERY
+    due = m.keyframes_so_far % _EVERY == 0
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    if (turn == 0 or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
+    if (due or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
         m.graph.update(relinearise=True)
         m.unrest = max(0, m.unrest - 1)
-    if turn != 1:  # right after that, but not at once: no frame may wait for both
+    if not due:
         return
     m.known.position[:] = m.graph.points(m.known.id)
     _forget(m)
@@ -110,7 +113,7 @@ def _reconsider(m: Mapper) -> bool:
     support = _support(off, row, rays.used[held], len(known))
     if m.by_label:
         number, fits = np.bincount(row, minlength=len(known)), np.bincount(row[support], minlength=len(known))
-        if m.settings.association.method == "auto" and _two_of_a_label(row, support, number, fits):
+        if m.settings.association.method == "auto" and _two_of_a_label(m, s, row, support):
             m.by_label = False
             m.candidates = [c for c in m.candidates if not c.by_label]
         for j in np.flatnonzero((fits < _HALF * number) & (number >= _MANY)).tolist():
@@ -128,10 +131,19 @@ def _reconsider(m: Mapper) -> bool:
     return bool(len(out) or len(back))
 
 
-def _two_of_a_label(row: Ints, support: Bools, number: Ints, fits: Ints) -> bool:
-    """Whether the rays (R,) in the order of time show that some label has two objects."""
-    for j in np.flatnonzero((number - fits >= _MANY) & (number - fits > _SECOND * number)).tolist():
-        if (np.diff(support[row == j].astype(np.int64)) != 0).sum() >= _VISITS:
+def _two_of_a_label(m: Mapper, s: Sightings, row: Ints, support: Bools) -> bool:
+    """Whether the rays (R,), in the order of time, show that some label has two objects.
+
+    Many disagree with the one that it has, in turns with those that do not, and would make another one by themselves.
+    """
+    against = np.bincount(row[~support], minlength=len(m.known))
+    number = np.bincount(row, minlength=len(m.known))
+    for j in np.flatnonzero((against >= _MANY) & (against > _SECOND * number)).tolist():
+        mine = np.flatnonzero(row == j)
+        if (np.diff(support[mine].astype(np.int64)) != 0).sum() < _VISITS:
+            continue
+        other = s.take(mine[~support[mine]])
+        if carried_place(other, _MANY, _AGREE, m.settings, m.rng) is not None:
             return True
     return False
 

@@ -1,5 +1,7 @@
 """Who a box may be of: near what was seen just now, and after a long way only where no other could be meant."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from objslam.live.candidates import Candidate, ripe
 from objslam.live.expected import expect
 from objslam.live.known import new_landmarks
 from objslam.live.matching import Doubt, FrameRays, match
-from objslam.live.upkeep import _one
+from objslam.live.meeting import sightings
+from objslam.live.upkeep import _one, _two_of_a_label
 
 AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 SIGMA = 0.004
@@ -120,3 +123,30 @@ def test_landmarks_are_one_where_they_are_near_and_few():
     assert not _one(np.array([0.1, 0.0, 0.0]), spread, 3.0)
     assert not _one(np.array([0.5, 0.0, 0.0]), spread, 0.03)
     assert not _one(np.array([0.5, 0.0, 0.0]), spread * 100, 0.5)
+
+
+def lines(targets, sigma=0.004, reach=6.0):
+    """One ray to each of the targets (n, 3), from a place on the way from -reach to reach along y, with noise."""
+    rng = np.random.default_rng(0)
+    origin = np.column_stack([np.zeros(len(targets)), np.linspace(-reach, reach, len(targets)), np.zeros(len(targets))])
+    to = np.asarray(targets) - origin
+    direction = to / np.linalg.norm(to, axis=1, keepdims=True) + rng.normal(scale=sigma, size=to.shape)
+    nothing = np.full(len(to), np.nan)
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return sightings(origin, unit, np.full(len(to), sigma), nothing, nothing)
+
+
+def two(s, support):
+    session = SimpleNamespace(known=[0], settings=load_settings(None, ()), rng=np.random.default_rng(0))
+    return _two_of_a_label(session, s, np.zeros(len(support), dtype=np.int64), np.array(support))
+
+
+def test_a_label_has_two_objects_where_what_disagrees_makes_another_one():
+    one, other = (3.0, 0.0, 0.5), (5.0, 2.0, 0.5)
+    in_turns = np.arange(40) // 5 % 2 == 0
+    turns = [one if here else other for here in in_turns]
+    assert two(lines(turns), in_turns)
+    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20)  # at one stretch: the path may have drifted
+    assert not two(lines(turns, reach=0.1), in_turns)  # from one place it has no distance: the one of the label may be wrong
+    strays = np.random.default_rng(1).uniform([1, -8, -8], [17, 8, 8], (40, 3))
+    assert not two(lines(np.where(in_turns[:, None], one, strays)), in_turns)
