@@ -254,7 +254,7 @@ class Live(Section):
     max_keyframes: Annotated[int, Field(ge=50)] = 1500
     """when there are more, a quarter of the older ones is left out, with their boxes, and the odometry across them
     summed up: what memory and time an update take stays bounded."""
-    max_lag: Positive = 0.4
+    max_lag: Positive = 0.35
     """s; frames that had to wait for longer are dropped and counted."""
     max_late: Positive = 2.0
     """s; how far behind the newest pose a frame's stamp may be."""
