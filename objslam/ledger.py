@@ -21,7 +21,7 @@ class Ledger:
             return
         self.dropped[reason] = self.dropped.get(reason, 0) + int(count)
         places = self.examples.setdefault(reason, [])
-        if where is not None and len(places) < _EXAMPLES:
+        if where is not None and where not in places and len(places) < _EXAMPLES:
             places.append(where)
 
     def warn(self, message: str) -> None:

@@ -133,6 +133,19 @@ def write_result(
     return replace_files(out, _FILES, _writers(result, truth, detected))
 
 
+def clear_result(out: Path) -> tuple[str, ...]:
+    """Take away what an earlier run wrote, but for its objects.json, in whose place a session writes; the names of it.
+
+    What stayed would be taken for the session's own. Where there is a summary.json, it goes last: until then the folder is
+    known as a result.
+    """
+    names = tuple(name for name in reversed(_FILES.names(out)) if name != OBJECTS and (out / name).is_file())
+    with disk_errors(out):
+        for name in names:
+            (out / name).unlink(missing_ok=True)
+    return names
+
+
 def load_map(out: Path) -> ObjectMap:
     """The object map of the result in the folder `out`; OutputError says what is missing or malformed."""
     return read_objects(_existing(out, OBJECTS))

@@ -558,7 +558,7 @@ def test_rays_that_place_nothing_place_nothing(objslam, variant, tmp_path, mode,
 def test_options_of_another_source_are_named(objslam, log_folder, tmp_path):
     run = objslam("run", log_folder, "-o", tmp_path, "--robot", 3, "--anonymous", *LEAN)
     assert run.code == 0
-    run.says_somewhere("option robot has no meaning", "option anonymous has no meaning")
+    run.says_somewhere("--robot has no meaning", "--anonymous has no meaning")
 
 
 # Results that cannot be written or read

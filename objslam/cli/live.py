@@ -100,7 +100,7 @@ def live(
     view: View = None,
 ) -> None:
     """Map objects while the robot drives: objects.json follows, and at the end (Ctrl-C) there is a whole result folder."""
-    from objslam.errors import OutputError
+    from objslam.errors import ConfigError, OutputError
     from objslam.live.adapters import ADAPTERS, LiveOptions
     from objslam.live.journal import NAME
     from objslam.live.session import Session
@@ -108,12 +108,15 @@ def live(
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
         raise OutputError("the recording of the result goes there", where=view, hint="name another file with --view")
+    if resume and not journal:
+        raise ConfigError("--resume goes on with the journal that --no-journal does without", hint="leave out one of them")
     settings = settings_of("joint", config, set_)
     options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
+    _say_what_is_not_used(source, options, detector, domain, interface, speed, publish)
     recording = None if source in ADAPTERS else _read(Path(source), options)  # first, for it may be the journal in OUT
     with output_folder(out), ExitStack() as stack:
         if journal:
-            _look_for_journal(out / NAME, resume)
+            _look_for_journal(out / NAME, resume, stack)
         session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=speed == 0)
         stack.callback(session.abort)
         truth = None
@@ -135,30 +138,79 @@ def live(
             image = feed.image if recording is None else of_log(recording[0])
             feed = replace(feed, views=(*feed.views, stack.enter_context(open_view(view, say, image)).show))
         session.start()
+        if resume:
+            kept = session.counters.accepted()
+            say(f"{out / NAME} gone on with: {', '.join(f'{n} {kind}' for kind, n in kept.items())}", stderr=True)
         _drive(session, feed, out, interval)
         _finish(session, feed, out, truth)
 
 
+def _say_what_is_not_used(
+    source: str,
+    options: SourceOptions,
+    detector: Path | None,
+    domain: int | None,
+    interface: str | None,
+    speed: float,
+    publish: bool,
+) -> None:
+    """Warn of options that mean nothing for a source; `sources.read` does so for what concerns recordings alone."""
+    from objslam.live.adapters import ADAPTERS
+
+    ros, network = source in ("dds", "rclpy"), publish or source == "dds"
+    bags = {
+        "--topic": options.topics,
+        "--camera-info": options.camera_info,
+        "--base-frame": options.base_frame,
+        "--rectified": options.rectified,
+        "--label": options.label,
+    }
+    unused = {
+        "--detector": None if ros else detector,
+        "--domain": None if network else domain,
+        "--interface": None if network else interface,
+        "--speed": speed if source in ADAPTERS and speed != 1.0 else None,
+        **(bags if source in ADAPTERS and not ros else {}),
+    }
+    for option, value in unused.items():
+        if value:
+            say(f"warning: {option} has no meaning for {source if source in ADAPTERS else 'a recording'}", stderr=True)
+
+
 def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
+    from objslam.errors import LogError
     from objslam.ledger import Ledger
     from objslam.sources import read
 
+    if not path.exists():
+        raise LogError("there is no such recording", where=str(path), hint="SOURCE is dds, rclpy, stdin, or a log or bag")
     ledger = Ledger()
     return read(path, ledger, options), ledger
 
 
-def _look_for_journal(file: Path, resume: bool) -> None:
-    """Nothing that a session kept is lost: what is there is gone on with, or set aside."""
+def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
+    """Nothing that a session kept is lost: what is there is gone on with, or set aside until the new one holds anything."""
     from objslam.errors import OutputError
-    from objslam.live.journal import set_aside
+    from objslam.live.journal import put_back, set_aside
 
     if resume:
         if not file.is_file():
             raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
         return
     aside = set_aside(file)
-    if aside is not None:
-        say(f"warning: kept the journal of an earlier session as {aside} (--resume goes on with a journal)", stderr=True)
+    if aside is None:
+        return
+    say(
+        f"warning: kept the journal of an earlier session as {aside} (`objslam run` maps it; to go on with it, name it "
+        f"{file.name} again and --resume)",
+        stderr=True,
+    )
+
+    def end() -> None:
+        if put_back(aside, file):
+            say(f"nothing came: {file} is the journal of the earlier session again", stderr=True)
+
+    stack.callback(end)
 
 
 def _replay(
@@ -178,7 +230,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
     """Run the adapter until it ends or Ctrl-C, with a status line and objects.json."""
     from objslam.atomic_files import write_file
     from objslam.objects_file import dump_objects
-    from objslam.results import OBJECTS
+    from objslam.results import OBJECTS, clear_result
 
     sys.setswitchinterval(_HAND_OVER)
     stop, failure = threading.Event(), list[BaseException]()
@@ -190,7 +242,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
             failure.append(error)
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
-    told = 0
+    told, begun = 0, False
     with _ends_by_signal(stop), _status() as show:
         bringing.start()
         due = time.monotonic() + interval
@@ -202,7 +254,12 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 snapshot = session.snapshot()
-                write_file(out / OBJECTS, dump_objects(snapshot.map).encode())
+                if snapshot.keyframes and not begun:
+                    begun = True
+                    if removed := clear_result(out):
+                        say(f"removed from {out}, for it was of an older result: {', '.join(removed)}", stderr=True)
+                if begun:
+                    write_file(out / OBJECTS, dump_objects(snapshot.map).encode())
                 for view in feed.views:
                     view(snapshot)
                 show(snapshot)
@@ -226,9 +283,12 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
     report(ledger)
     console().print(objects_table(result.map))
     counts = result.summary["counts"]
+    resolved, thinned = counts["objects"] - counts["unresolved"], last.counters.get("keyframes left out", 0)
+    more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
     say(
-        f"{counts['objects'] - counts['unresolved']} objects ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"in {counts['keyframes']} keyframes; {_times(last, ', ')}{last.rebuilds} rebuilds"
+        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}; {_times(last, ', ')}"
+        f"{last.rebuilds} rebuilds"
     )
     say_written(out, removed)
 

@@ -39,19 +39,24 @@ Topics = Annotated[
     typer.Option(
         "--topic",
         metavar="ROLE=/NAME",
-        help="ROS bags: the topic for a role (odometry, localization, detections, image, depth, camera_info; with several "
-        "cameras CAMERA.ROLE=/NAME). none: no topic. tf: the path from the transforms. May be repeated.",
+        help="ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info; "
+        "with several cameras CAMERA.ROLE=/NAME). none: no topic. tf: the path from the transforms. May be repeated.",
     ),
 ]
 CameraInfo = Annotated[
     Path | None,
-    typer.Option("--camera-info", help="ROS bags: calibration, as in camera.yaml; several cameras below `cameras:`."),
+    typer.Option(
+        "--camera-info", help="ROS bags, dds, rclpy: calibration, as in camera.yaml; several cameras below `cameras:`."
+    ),
 ]
-BaseFrame = Annotated[str | None, typer.Option("--base-frame", help="ROS bags: the frame that is the robot's base.")]
+BaseFrame = Annotated[
+    str | None, typer.Option("--base-frame", help="ROS bags, dds, rclpy: the frame that is the robot's base.")
+]
 Rectified = Annotated[
     bool | None,
     typer.Option(
-        "--rectified/--raw", help="ROS bags: images and boxes are those of the rectified image, or not. [default: by name]"
+        "--rectified/--raw",
+        help="ROS bags, dds, rclpy: images and boxes are those of the rectified image, or not. [default: by name]",
     ),
 ]
 

@@ -36,7 +36,12 @@ def finish(mapper: Mapper, name: str, path: Path | None) -> RunResult:
     ledger = mapper.counters.ledger
     keyframes, rays, association, poses, positions = collected(mapper)
     if not len(rays):
-        raise SolveError("nothing was seen that could be mapped", where=name, hint="; ".join(ledger.lines()) or None)
+        kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
+        came = mapper.counters.accepted()
+        came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
+        missing = [f"no {what} came" for what, kind in kinds.items() if not came.get(kind)]
+        hint = "; ".join(missing + ledger.lines())
+        raise SolveError("nothing was seen that could be mapped", where=name, hint=hint or None)
     cameras = tuple(mapper.cameras)
     if mapper.by_label or len(rays) > settings.live.reassociate:
         estimate = _solve_joint(keyframes, rays, association, settings, ledger, poses)
@@ -107,6 +112,11 @@ def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats, Flo
     k, r = mapper.keyframes, mapper.rays
     order = np.argsort(k.stamp, kind="stable")
     if k.localized.any():
+        off = order[~k.localized[order]]
+        if len(off):
+            boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
+            mapper.counters.drop("keyframes that the localisation does not cover", where, len(off))
+            mapper.counters.drop("boxes that the localisation does not cover", where, boxes)
         order = order[k.localized[order]]
     number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
     number[k.id[order]] = np.arange(len(order))

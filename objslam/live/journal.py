@@ -111,12 +111,16 @@ class Journal:
 def set_aside(file: Path) -> Path | None:
     """Rename a journal that holds anything to NAME.1.objslam or the next free number; what it is called now, else None.
 
-    OutputError where a session writes it, or the disk refuses.
+    OutputError where a session writes it, it is another kind of file, or the disk refuses.
     """
     try:
-        if not file.is_file() or file.stat().st_size <= len(MAGIC):
+        if not file.is_file():
             return None
         with file.open("rb") as stream:
+            if not MAGIC.startswith(stream.read(len(MAGIC))):
+                raise OutputError("this is no journal, and stands where one goes", where=str(file), hint="move it away")
+            if file.stat().st_size <= len(MAGIC):
+                return None
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
             return file.rename(next(other for other in others if not other.exists()))
@@ -124,6 +128,14 @@ def set_aside(file: Path) -> Path | None:
         raise OutputError("another session writes this journal", where=str(file)) from error
     except OSError as error:
         raise OutputError(f"cannot set the journal aside: {error.strerror}", where=str(file)) from error
+
+
+def put_back(aside: Path, file: Path) -> bool:
+    """A journal that was set aside, where it was, if the session that took its place never kept anything; whether it is."""
+    if file.is_file() and file.stat().st_size > len(MAGIC):
+        return False
+    aside.replace(file)
+    return True
 
 
 def is_journal(path: Path) -> bool:

@@ -120,6 +120,10 @@ SOURCES: tuple[Source, ...] = (
 )
 
 
+_FLAGS = {"topics": "--topic", "with_range": "--without-range"}
+"""What the command line calls an option, where that is not its name here."""
+
+
 def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
     """Read a recording of any kind that `SOURCES` lists; the kind is guessed from what the path holds unless it is given.
 
@@ -131,7 +135,8 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     default = SourceOptions()
     for option in (field.name for field in fields(options) if field.name != "format"):
         if option not in source.takes and getattr(options, option) != getattr(default, option):
-            ledger.warn(f"{path}: the option {option} has no meaning for a {source.name} recording")
+            flag = _FLAGS.get(option, f"--{option.replace('_', '-')}")
+            ledger.warn(f"{path}: {flag} has no meaning for a {source.name} recording")
     return replace(source.reads(path, ledger, options), path=path.resolve())
 
 

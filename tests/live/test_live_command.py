@@ -78,6 +78,28 @@ def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
     assert not (tmp_path / "out" / "journal.objslam").exists()
 
 
+def test_a_session_does_not_stand_beside_an_older_result(log, tmp_path):
+    out = tmp_path / "out"
+    done = subprocess.run(command(log, out, "--speed", "0", "--no-journal"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    older = {f.name for f in out.iterdir()}
+    (out / "mine.txt").touch()
+    process = subprocess.Popen(
+        command(log, out, "--speed", "3", "--interval", "0.1", "--no-journal"), stderr=subprocess.PIPE
+    )
+    end = time.monotonic() + 40
+    while time.monotonic() < end and (out / "summary.json").exists():
+        time.sleep(0.02)
+    time.sleep(0.5)
+    os.kill(process.pid, signal.SIGKILL)
+    _, told = process.communicate()
+    assert {f.name for f in out.iterdir()} == {"objects.json", "mine.txt"}
+    assert all(name in told.decode() for name in older - {"objects.json"})
+    done = subprocess.run(command(log, out, "--speed", "0", "--no-journal"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert older <= {f.name for f in out.iterdir()}
+
+
 def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -117,3 +139,42 @@ def test_nothing_to_go_on_with(log, tmp_path):
     assert done.returncode == 1
     assert "no journal" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    session = Session(load_settings(None, ()), out / "journal.objslam")
+    assert session.push_odometry(1.0, np.eye(4))
+    session.abort()
+    kept = (out / "journal.objslam").read_bytes()
+    done = subprocess.run(command("stdin", out), input="", capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "no camera came; no odometry or localisation came; no detections came" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
+
+
+@pytest.mark.parametrize("more", [(), ("--resume",)])
+def test_a_file_that_is_no_journal_stays_as_it_is(log, tmp_path, more):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "journal.objslam").write_text("my notes about journals")
+    done = subprocess.run(command(log, out, "--speed", "0", *more), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "no journal" in done.stderr
+    assert (out / "journal.objslam").read_text() == "my notes about journals"
+    assert len(list(out.iterdir())) == 1
+
+
+def test_what_a_source_cannot_be_and_what_an_option_cannot_do(log, tmp_path):
+    done = subprocess.run(command("dsd", tmp_path / "a"), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "SOURCE is dds, rclpy, stdin" in done.stderr
+    both = command(log, tmp_path / "a", "--resume", "--no-journal")
+    assert "--no-journal" in subprocess.run(both, capture_output=True, text=True, timeout=60).stderr
+    assert not (tmp_path / "a").exists()
+    more = ("--detector", "none.onnx", "--topic", "odometry=/odom", "--domain", "3", "--speed", "2")
+    done = subprocess.run(command("stdin", tmp_path / "b", *more), input="", capture_output=True, text=True, timeout=60)
+    for option in more[::2]:
+        assert f"warning: {option} has no meaning for stdin" in done.stderr

@@ -151,6 +151,20 @@ def test_a_hall_of_objects_that_look_alike_from_odometry_alone():
     assert snapshot.counters["loops closed"] >= 1
 
 
+def test_keyframes_that_the_localisation_does_not_cover_are_counted():
+    log = make_log(localization=preset("demo").localization)
+    stamps = log.localization.stamps
+    half = len(stamps) // 2
+    session = drive(replace(log, localization=Trajectory(stamps[:half], log.localization.poses[:half])))
+    result = session.stop()
+    dropped = session.counters.dropped()
+    lost = dropped["boxes that the localisation does not cover"]
+    assert dropped["keyframes that the localisation does not cover"] > 10
+    assert lost + result.summary["counts"]["rays"] == len(session._mapper.rays)
+    assert result.keyframes.stamps[-1] <= stamps[half - 1]
+    assert result.summary["dropped"]["boxes that the localisation does not cover"] == lost
+
+
 def test_localization_that_comes_late_moves_the_map():
     log = make_log(localization=preset("demo").localization)
     turned = lift_se2(np.array([5.0, -3.0, 1.0]))

@@ -68,8 +68,8 @@ def test_options_without_a_meaning_are_named(tmp_path):
     ledger = Ledger()
     read(_log(tmp_path), ledger, SourceOptions(robot=3, label="x", anonymous=True, with_range=False))
     assert [
-        f"option {name} has no meaning" in w
-        for name, w in zip(("robot", "with_range", "anonymous", "label"), ledger.warnings, strict=True)
+        f": {flag} has no meaning" in w
+        for flag, w in zip(("--robot", "--without-range", "--anonymous", "--label"), ledger.warnings, strict=True)
     ] == [True] * 4
     ledger = Ledger()
     read(tmp_path, ledger, SourceOptions(format="log"))

@@ -118,6 +118,8 @@ def _name(message: dict[str, Any], key: str) -> str:
 def _pose(message: dict[str, Any]) -> Floats:
     if "yaw" in message:
         return lift_se2(np.array(_finite([message.get(key) for key in ("x", "y", "yaw")], "x, y, yaw", 3)))
+    if "translation" not in message:
+        raise Malformed("no pose: x, y and yaw, or translation and rotation_xyzw")
     place = _finite(message.get("translation"), "translation", 3)
     xyzw = _finite(message.get("rotation_xyzw"), "rotation_xyzw", 4)
     if not abs(float(np.linalg.norm(xyzw)) - 1) < 0.01:
