@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from objslam import offline
+from objslam.cli.live import HAND_OVER
 from objslam.config import Odometry, Settings, load_settings
 from objslam.geometry import align, inverse
 from objslam.ledger import Ledger
@@ -374,6 +375,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=10_000)
     parser.add_argument("--classes", type=int, default=10)
     arguments = parser.parse_args()
+    sys.setswitchinterval(HAND_OVER)  # as `objslam live` does
     for part in arguments.parts:
         if part == "realtime":
             realtime(arguments.keyframes, arguments.classes)

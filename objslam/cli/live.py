@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
     from objslam.types import Log, Truth
 
-_HAND_OVER = 5e-4  # s; a message does not wait Python's 5 ms, several times over, for the thread that makes the map
+HAND_OVER = 5e-4  # s; a message does not wait Python's 5 ms, several times over, for the thread that makes the map
 _POLL = 0.1  # s; how soon the end of a source is seen
 _LINES = 10.0  # s between status lines where there is no terminal
 
@@ -232,7 +232,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
     from objslam.objects_file import dump_objects
     from objslam.results import OBJECTS, clear_result
 
-    sys.setswitchinterval(_HAND_OVER)
+    sys.setswitchinterval(HAND_OVER)
     stop, failure = threading.Event(), list[BaseException]()
 
     def bring() -> None:
