@@ -117,7 +117,8 @@ def live(
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)
-        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=speed == 0)
+        patient = recording is not None and speed == 0
+        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=patient)
         stack.callback(session.abort)
         truth = None
         if recording is None:
@@ -165,15 +166,22 @@ def _say_what_is_not_used(
         "--rectified": options.rectified,
         "--label": options.label,
     }
+    recorded = {
+        "--format": options.format,
+        "--robot": options.robot,
+        "--without-range": None if options.with_range else True,
+        "--anonymous": options.anonymous or None,
+    }
     unused = {
         "--detector": None if ros else detector,
         "--domain": None if network else domain,
         "--interface": None if network else interface,
         "--speed": speed if source in ADAPTERS and speed != 1.0 else None,
         **(bags if source in ADAPTERS and not ros else {}),
+        **(recorded if source in ADAPTERS else {}),
     }
     for option, value in unused.items():
-        if value:
+        if value is not None and value != ():
             say(f"warning: {option} has no meaning for {source if source in ADAPTERS else 'a recording'}", stderr=True)
 
 

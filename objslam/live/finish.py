@@ -89,17 +89,24 @@ def _solve_joint(
     from objslam.graph import batch
     from objslam.graph.settle import misfit
 
-    if keyframes.odom_T_base is None or keyframes.localized_every or len(rays) > settings.live.reassociate:
-        return batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
-    tried: list[tuple[float, int, Estimate, Ledger]] = []
-    for start in (poses, None):
-        said = Ledger()
-        one = batch.solve_joint(keyframes, rays, association, settings, said, start=start)
-        at = one.map_T_base @ keyframes.base_T_camera
-        tried.append((misfit(at, one.positions, keyframes, rays, association, settings), len(tried), one, said))
-    _, _, best, said = min(tried)
+    found = batch.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+    if not association.count or len(rays) > settings.live.reassociate:
+        return found
+    if keyframes.odom_T_base is None or keyframes.localized_every:
+        return found
+    said = Ledger()
+    try:
+        other = batch.solve_joint(keyframes, rays, association, settings, said)
+    except SolveError:  # then there is nothing to choose from
+        return found
+    before, after = (
+        misfit(one.map_T_base @ keyframes.base_T_camera, one.positions, keyframes, rays, association, settings)
+        for one in (found, other)
+    )
+    if not after < before:
+        return found
     ledger.add(said)
-    return best
+    return other
 
 
 def collected(mapper: Mapper) -> tuple[Keyframes, Rays, Association, Floats, Floats]:

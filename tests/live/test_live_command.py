@@ -174,7 +174,7 @@ def test_what_a_source_cannot_be_and_what_an_option_cannot_do(log, tmp_path):
     both = command(log, tmp_path / "a", "--resume", "--no-journal")
     assert "--no-journal" in subprocess.run(both, capture_output=True, text=True, timeout=60).stderr
     assert not (tmp_path / "a").exists()
-    more = ("--detector", "none.onnx", "--topic", "odometry=/odom", "--domain", "3", "--speed", "2")
+    more = ("--detector", "none.onnx", "--topic", "odometry=/odom", "--domain", "0", "--speed", "2", "--robot", "1", "--raw")
     done = subprocess.run(command("stdin", tmp_path / "b", *more), input="", capture_output=True, text=True, timeout=60)
-    for option in more[::2]:
+    for option in (*more[:-1:2], "--rectified"):
         assert f"warning: {option} has no meaning for stdin" in done.stderr

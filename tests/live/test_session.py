@@ -165,6 +165,30 @@ def test_keyframes_that_the_localisation_does_not_cover_are_counted():
     assert result.summary["dropped"]["boxes that the localisation does not cover"] == lost
 
 
+def test_a_session_that_saw_too_little_for_an_object_ends_with_none():
+    log = make_log()
+    session = drive(log, pushes=list(events(log))[:3])
+    result = session.stop()
+    assert len(result.rays) > 0
+    assert len(result.map) == 0
+
+
+def test_where_the_second_solve_fails_the_first_one_counts(log, monkeypatch):
+    from objslam.graph import batch
+
+    solve = batch.solve_joint
+
+    def only_from_a_start(*problem, start=None, **more):
+        if start is None:
+            raise SolveError("the graph does not grow")
+        return solve(*problem, start=start, **more)
+
+    session = drive(log)
+    assert session._mapper.by_label
+    monkeypatch.setattr(batch, "solve_joint", only_from_a_start)
+    assert max(errors(session.stop().map, log).values()) < 0.15
+
+
 def test_localization_that_comes_late_moves_the_map():
     log = make_log(localization=preset("demo").localization)
     turned = lift_se2(np.array([5.0, -3.0, 1.0]))
