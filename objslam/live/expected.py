@@ -36,9 +36,6 @@ class Expected:
     noise: Floats
     far: float
 
-    def __len__(self) -> int:
-        return len(self.id)
-
 
 def expect(known: Table, candidates: Sequence[Candidate]) -> Expected:
     """What is known by now, and the candidates."""

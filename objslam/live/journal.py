@@ -132,9 +132,12 @@ def set_aside(file: Path) -> Path | None:
 
 def put_back(aside: Path, file: Path) -> bool:
     """A journal that was set aside, where it was, if the session that took its place never kept anything; whether it is."""
-    if file.is_file() and file.stat().st_size > len(MAGIC):
-        return False
-    aside.replace(file)
+    try:
+        if file.is_file() and file.stat().st_size > len(MAGIC):
+            return False
+        aside.replace(file)
+    except OSError as error:
+        raise OutputError(f"cannot put {aside} back: {error.strerror}", where=str(file)) from error
     return True
 
 

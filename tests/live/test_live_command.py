@@ -34,6 +34,15 @@ def command(log, out, *more):
     return [sys.executable, "-m", "objslam", "live", str(log), "-o", str(out), *QUIET, *more]
 
 
+def journal_in(out):
+    """A folder with the journal of a session that heard one message; its bytes."""
+    out.mkdir()
+    session = Session(load_settings(None, ()), out / "journal.objslam")
+    assert session.push_odometry(1.0, np.eye(4))
+    session.abort()
+    return (out / "journal.objslam").read_bytes()
+
+
 def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
     done = subprocess.run(command(log, whole, "--speed", "0"), capture_output=True, text=True, timeout=60)
@@ -102,11 +111,7 @@ def test_a_session_does_not_stand_beside_an_older_result(log, tmp_path):
 
 def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
-    session = Session(load_settings(None, ()), out / "journal.objslam")
-    assert session.push_odometry(1.0, np.eye(4))
-    session.abort()
-    kept = (out / "journal.objslam").read_bytes()
+    kept = journal_in(out)
     done = subprocess.run(command(log, out, "--speed", "0"), capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert "--resume" in done.stderr
@@ -143,11 +148,7 @@ def test_nothing_to_go_on_with(log, tmp_path):
 
 def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
     out = tmp_path / "out"
-    out.mkdir()
-    session = Session(load_settings(None, ()), out / "journal.objslam")
-    assert session.push_odometry(1.0, np.eye(4))
-    session.abort()
-    kept = (out / "journal.objslam").read_bytes()
+    kept = journal_in(out)
     done = subprocess.run(command("stdin", out), input="", capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert "no camera came; no odometry or localisation came; no detections came" in done.stderr
