@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.live.births import extend, give_birth, new_candidate
+from objslam.live.births import extend, new_candidate
 from objslam.live.expected import expect
 from objslam.live.learning import Lesson
 from objslam.live.matching import Doubt, FrameRays, best_of_label, match, match_by_label
@@ -70,6 +70,5 @@ def associate(m: Mapper, rays: FrameRays, k: int, camera: int, guess: Floats, do
     m.grown += [new_candidate(m, rays, i, numbers[i], k, stamp, doubt) for i in free.tolist()]
     if len(matched):
         m.graph.add_rays(m.bearings(len(m.rays) - count + matched))
-    m.grown = give_birth(m, m.grown)
     m.graph.update()
     m.lesson = Lesson(rays, matched, rows, camera, doubt.drift, stamp, k)

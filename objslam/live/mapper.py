@@ -20,7 +20,7 @@ from objslam.graph.kept import Bearings
 from objslam.live import known as landmarks
 from objslam.live import upkeep
 from objslam.live.associating import associate
-from objslam.live.births import leave_out_the_least
+from objslam.live.births import give_birth, leave_out_the_least
 from objslam.live.candidates import Candidate, place
 from objslam.live.columns import new_keyframes, new_rays
 from objslam.live.counters import Counters
@@ -181,8 +181,8 @@ class Mapper:
         """After a frame that became a keyframe: what its landmarks learn from it, and what is due now and then."""
         if self.lesson is not None:
             learn(self, self.lesson)
-            place([c for c in self.grown if not c.by_label])
-            self.lesson = None
+            place([c for c in give_birth(self, self.grown) if not c.by_label])
+            self.lesson, self.grown = None, []
         upkeep.after_keyframe(self)
         if not self.by_label:
             leave_out_the_least(self)

@@ -71,9 +71,11 @@ def meet(s: Sightings, rng: np.random.Generator, slack: float = 0.0) -> Meeting 
     for _ in range(2):
         if agree.sum() < 2:
             return None
-        held = np.flatnonzero(agree)
+        held, before = np.flatnonzero(agree), agree
         start = refit(s, held, np.zeros(len(held), dtype=np.int64), start[None], np.ones(1))[0]
         agree = misses(s, start, slack) < _MISS
+        if (agree == before).all():
+            break
     if agree.sum() < 2:
         return None
     held = np.flatnonzero(agree)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from objslam.live.mapper import Mapper
 
 _EVERY = 10  # keyframes
-_TURNS = 3  # updates that the graph is given when a loop has closed
+_GROWING, _CLOSING = 3, 6  # of these; what is due does not come all at once, for no frame may wait for long
+_TURNS, _BREATH = 3, 2  # updates that the graph is given when a loop has closed, and at every which keyframe
 _FIRST, _GROWTH = 20, 1.5  # keyframes; the graph is solved as a whole when there are so many, then so many times more
 _ITERATIONS, _LARGE = 8, 400  # iterations, for so many keyframes at the most: no frame may wait for long
 _MISS = 4.0  # standard deviations by which a ray may miss its landmark
@@ -45,21 +47,23 @@ _SLACK = 0.02  # m
 def after_keyframe(m: Mapper) -> None:
     """Every few keyframes, whatever is due."""
     m.graph.take_turn()
-    due = m.keyframes_so_far % _EVERY == 0
+    number = m.keyframes_so_far
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    if (due or m.unrest) and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
+    due = number % _EVERY == 0 or (m.unrest and number % _BREATH == 0)
+    if due and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
         m.graph.update(relinearise=True)
         m.unrest = max(0, m.unrest - 1)
-    if not due:
-        return
+    if number % _EVERY == _GROWING:
+        _look_at(m, (_forget, thin_if_many, _polish_if_grown))
+    elif number % _EVERY == _CLOSING and not m.by_label:
+        _look_at(m, (close_loop, _merge, _drop_ghosts))
+
+
+def _look_at(m: Mapper, tasks: tuple[Callable[[Mapper], None], ...]) -> None:
     m.known.position[:] = m.graph.points(m.known.id)
-    _forget(m)
-    tasks = [thin_if_many, _polish_if_grown]
-    if not m.by_label:
-        tasks += [close_loop, _merge, _drop_ghosts]
     for task in tasks:
-        if not m.graph.in_turns:  # one thing after the other: no frame may wait for long
+        if not m.graph.in_turns:
             task(m)
 
 
