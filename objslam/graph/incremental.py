@@ -20,6 +20,7 @@ from objslam.types import Floats, Ints
 
 _AT_ONCE = 400  # keyframes; a larger graph is built anew in turns,
 _TURN = 100  # keyframes each
+_FRESH = 10  # updates; a landmark that none of these was about has sunk in the tree
 _HELD = 1.0  # m; a prior on every landmark for a graph that is indeterminate without
 _HELD_POSE = (0.5, 2.0)  # rad, m; and on every pose, for one that is even then
 
@@ -40,11 +41,13 @@ class IncrementalGraph:
         self._new = gtsam.NonlinearFactorGraph()
         self._values = gtsam.Values()
         self._stale = self._unfinished = False
+        self._newest, self._updates = -1, 0
+        self._touched: dict[int, int] = {}
         self.rebuilds = 0
 
     def add_keyframe(self, k: int, map_T_camera: Floats) -> None:
         """X(k) at its first guess (4, 4). Something must hold it before the next update: a motion or an absolute pose."""
-        self._poses[k] = map_T_camera
+        self._poses[k], self._newest = map_T_camera, k
         self._values.insert(x_key(k), gtsam.Pose3(map_T_camera))
         if self._turns is not None:
             self._turns.add_keyframe(k)
@@ -81,18 +84,29 @@ class IncrementalGraph:
         ids = (rays.number.tolist(), rays.keyframe.tolist(), rays.landmark.tolist())
         for number, k, j, group in zip(*ids, groups, strict=True):
             self._kept.rays[number] = KeptRay(k, j, group)
+            self._touched[j] = self._updates + 1
             for factor in group:
                 self._push(factor)
 
-    def update(self, relinearise: bool = False) -> None:
-        """Work in what was added. relinearise: look for variables that moved, now rather than some time."""
-        try:
-            self._update(relinearise)
-        except RuntimeError:  # indeterminate: counted, and the graph goes on from the factors kept
-            self.rebuilds += 1
-            self._rescue()
-        self._clear()
-        self._stale = True
+    def update(self) -> None:
+        """Work in what was added."""
+        self._updates += 1
+        self._work_in(None, False)
+
+    def prepare(self, coming: Ints, relinearise: bool = False) -> None:
+        """Work in what was added, and lay the tree out for a keyframe that may show landmarks coming (n,), where it is not.
+
+        What lies between an observed variable and the root is eliminated anew, so they go near to the root, and nearest
+        what the last keyframe showed, which the next one most likely shows, too. relinearise: look for variables that moved.
+        """
+        sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
+        if relinearise or sunk or self._new.size():
+            shown = [j for j, number in self._touched.items() if number == self._updates]
+            self._work_in(coming.tolist(), relinearise)
+            self._work_in(shown, False)
+            self._touched.update(dict.fromkeys(coming.tolist(), self._updates))
+        if self._newest in self._poses:
+            self.pose(self._newest)  # solves for what the updates left unsolved
 
     def pose(self, k: int) -> Floats:
         """map_T_camera (4, 4) of X(k) as of now."""
@@ -198,6 +212,7 @@ class IncrementalGraph:
         except RuntimeError:  # all at once, which knows what to do then
             self.rebuild()
             return
+        self._clear()  # what was not worked in yet came in turns, too
         self._isam, self._stale = self._turns.isam, True
         self._turns, self._unfinished = None, False
 
@@ -215,6 +230,7 @@ class IncrementalGraph:
         for j in landmarks.tolist():
             self._kept.landmarks.pop(j, None)
             self._points.pop(j, None)
+            self._touched.pop(j, None)
 
     def drop_keyframes(self, keyframes: Ints) -> None:
         """Keyframes that are to go; their rays and the motions from them must go too, and `rebuild` makes it so."""
@@ -245,8 +261,26 @@ class IncrementalGraph:
         self._turns = None
         self._points[j] = position
 
-    def _update(self, relinearise: bool) -> None:
-        self._isam.update(self._new, self._values, [], None, None, None, relinearise)
+    def _work_in(self, top: list[int] | None, relinearise: bool) -> None:
+        try:
+            self._update(top, relinearise)
+        except RuntimeError:  # indeterminate: counted, and the graph goes on from the factors kept
+            self.rebuilds += 1
+            self._rescue()
+        self._clear()
+        self._stale = True
+
+    def _update(self, top: list[int] | None, relinearise: bool) -> None:
+        """top: landmarks that are eliminated last, with the newest keyframe; without, it is what the new factors are of."""
+        last = anew = None
+        if top is not None:
+            last, anew = gtsam.KeyGroupMap(), gtsam.KeyList()
+            for key in (*(l_key(j) for j in top), x_key(self._newest)):
+                if self._isam.valueExists(key):
+                    anew.push_back(key)
+                if self._isam.valueExists(key) or self._values.exists(key):
+                    last.insert2(key, 1)
+        self._isam.update(self._new, self._values, [], last, None, anew, relinearise)
 
     def _add(self, kept: dict[int, gtsam.NonlinearFactor], key: int, factor: gtsam.NonlinearFactor) -> None:
         kept[key] = factor

@@ -19,7 +19,8 @@ _CANDIDATES = 150  # at the most
 def give_birth(m: Mapper, grown: list[Candidate]) -> list[Candidate]:
     """Of the candidates that have a ray more, those become landmarks whose rays carry it; the others are left.
 
-    After the frame that brought the ray: whether rays meet takes as long to find out as working in a whole frame.
+    After the frame that brought the ray: whether rays meet takes as long to find out as working in a whole frame. The
+    graph works them in when it is next asked to.
     """
     born: list[Candidate] = []
     for candidate in grown:
@@ -51,8 +52,6 @@ def give_birth(m: Mapper, grown: list[Candidate]) -> list[Candidate]:
         )
         m.graph.add_landmark(j, met.position)
         m.graph.add_rays(m.bearings(at[met.agree]))
-    if born:
-        m.graph.update()
     for candidate in born:
         m.candidates.remove(candidate)
     return [candidate for candidate in grown if candidate not in born]

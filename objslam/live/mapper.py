@@ -187,6 +187,8 @@ class Mapper:
         if not self.by_label:
             leave_out_the_least(self)
             self.expected = expect(self.known, self.candidates)
+        if not self.localized_only:  # the next frame asks that, and need not wait for it
+            self._ask_doubt(int(self.keyframes.id[-1]))
 
     def leave_out(self, frame: FrameMessage, reason: str) -> None:
         """Count a frame that is not to be looked at, and its boxes."""
@@ -246,13 +248,17 @@ class Mapper:
         motion = inverse(of.start_T_base[before] @ of.base_T_camera[before]) @ start_T_camera
         floor = self._floor(row["base_T_camera"])
         covariance = factors.motion_covariance(row["drift"] - of.drift[before], camera_from_drift, floor)
-        if k not in self._doubts:  # asked for now and then: between, the odometry adds to it
-            self._doubts = {k: self.graph.pose_covariance(k)}
+        self._ask_doubt(k)
         back = adjoint(inverse(motion))
         self.doubt = back @ self._doubts[k] @ back.T + covariance
         if self._next_keyframe % _ASK:
             self._doubts[self._next_keyframe] = self.doubt
         return self.graph.pose(k) @ motion, self.doubt, (motion, covariance)
+
+    def _ask_doubt(self, k: int) -> None:
+        """How well the graph knows keyframe k; asked for now and then: between, the odometry adds to it."""
+        if k not in self._doubts:
+            self._doubts = {k: self.graph.pose_covariance(k)}
 
     def _floor(self, base_T_camera: Floats) -> Floats:
         """`factors.motion_floor`, which is the same as long as the mount and the plane are."""

@@ -14,7 +14,7 @@ from objslam.errors import SolveError
 from objslam.geometry import adjoint, inverse
 from objslam.live.candidates import carried_place
 from objslam.live.joining import join, without
-from objslam.live.known import carried, covariances, gathered, noise
+from objslam.live.known import carried, covariances, gathered, in_view, noise
 from objslam.live.loops import close_loop
 from objslam.live.meeting import meet, misses
 from objslam.live.thinning import thin_if_many
@@ -42,6 +42,7 @@ _VISITS = 6  # and so often it is one's turn after the other's: a drifted path, 
 _AGREE = 0.7  # share of them that make another place
 _DISTANT = 60.0  # s; how long something seen from afar is waited for
 _SLACK = 0.02  # m
+_AROUND = 0.15  # share of the image: what stands so close beside it may soon be in it
 
 
 def after_keyframe(m: Mapper) -> None:
@@ -51,13 +52,20 @@ def after_keyframe(m: Mapper) -> None:
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
     due = number % _EVERY == 0 or (m.unrest and number % _BREATH == 0)
-    if due and not m.graph.in_turns:  # what comes of them is linearised where the estimate is now anyway
-        m.graph.update(relinearise=True)
-        m.unrest = max(0, m.unrest - 1)
+    relinearise = bool(due) and not m.graph.in_turns  # what comes of turns is linearised where the estimate is now anyway
+    m.unrest = max(0, m.unrest - relinearise)
+    m.graph.prepare(_coming(m), relinearise)
     if number % _EVERY == _GROWING:
         _look_at(m, (_forget, thin_if_many, _polish_if_grown))
     elif number % _EVERY == _CLOSING and not m.by_label:
         _look_at(m, (close_loop, _merge, _drop_ghosts))
+
+
+def _coming(m: Mapper) -> Ints:
+    """The landmarks (n,) that the camera of the newest keyframe shows, or soon may."""
+    newest = len(m.keyframes) - 1
+    pose, camera = m.graph.pose(int(m.keyframes.id[newest])), m.cameras[int(m.keyframes.camera[newest])]
+    return np.asarray(m.known.id[in_view(m.known, camera, pose, -_AROUND, np.full(len(m.known), m.known.far.max(initial=0.0)))])
 
 
 def _look_at(m: Mapper, tasks: tuple[Callable[[Mapper], None], ...]) -> None:

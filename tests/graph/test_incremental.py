@@ -54,7 +54,8 @@ def grown(drive):
                 known.add(j)
                 graph.add_landmark(j, met.position)
                 graph.add_rays(b)
-        graph.update(relinearise=k % 10 == 0)
+        graph.update()
+        graph.prepare(np.arange(0), relinearise=k % 10 == 0)
     assert len(known) >= 10
     return graph, np.array(sorted(known))
 
@@ -68,7 +69,7 @@ def batch(drive, graph, landmarks):
 def test_it_ends_where_the_batch_solve_does(drive):
     graph, landmarks = grown(drive)
     for _ in range(8):
-        graph.update(relinearise=True)
+        graph.prepare(np.arange(0), relinearise=True)
     graph.refresh()
     _, values = batch(drive, graph, landmarks)
     np.testing.assert_allclose(graph.points(landmarks), read_points(values), atol=0.02)
@@ -165,7 +166,7 @@ def test_built_anew_in_turns_is_built_anew(drive, monkeypatch):
     assert graph._isam.getFactorsUnsafe().size() == whole._kept.graph().size()
     for g in (graph, whole):
         for _ in range(3):
-            g.update(relinearise=True)
+            g.prepare(np.arange(0), relinearise=True)
         g.refresh()
     np.testing.assert_allclose(graph.points(rest), whole.points(rest), atol=2e-3)
     every = np.arange(last + 2)
