@@ -96,15 +96,14 @@ class IncrementalGraph:
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Work in what was added, and lay the tree out for a keyframe that may show landmarks coming (n,), where it is not.
 
-        What lies between an observed variable and the root is eliminated anew, so they go near to the root, and nearest
-        what the last keyframe showed, which the next one most likely shows, too. relinearise: look for variables that moved.
+        The cliques between an observed variable and the root are eliminated anew, so what may be observed goes near to the
+        root. relinearise: look for variables that moved, too.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():
-            shown = [j for j, number in self._touched.items() if number == self._updates]
-            self._work_in(coming.tolist(), relinearise)
-            self._work_in(shown, False)
-            self._touched.update(dict.fromkeys(coming.tolist(), self._updates))
+            self._work_in(self._layout(coming), relinearise)
+            for j in coming.tolist():
+                self._touched[j] = max(self._updates - 1, self._touched.get(j, 0))
         if self._newest in self._poses:
             self.pose(self._newest)  # solves for what the updates left unsolved
 
@@ -261,26 +260,36 @@ class IncrementalGraph:
         self._turns = None
         self._points[j] = position
 
-    def _work_in(self, top: list[int] | None, relinearise: bool) -> None:
+    def _work_in(self, layout: dict[int, int] | None, relinearise: bool) -> None:
         try:
-            self._update(top, relinearise)
+            self._update(layout or {}, relinearise)
         except RuntimeError:  # indeterminate: counted, and the graph goes on from the factors kept
             self.rebuilds += 1
             self._rescue()
         self._clear()
         self._stale = True
 
-    def _update(self, top: list[int] | None, relinearise: bool) -> None:
-        """top: landmarks that are eliminated last, with the newest keyframe; without, it is what the new factors are of."""
-        last = anew = None
-        if top is not None:
-            last, anew = gtsam.KeyGroupMap(), gtsam.KeyList()
-            for key in (*(l_key(j) for j in top), x_key(self._newest)):
-                if self._isam.valueExists(key):
-                    anew.push_back(key)
-                if self._isam.valueExists(key) or self._values.exists(key):
-                    last.insert2(key, 1)
-        self._isam.update(self._new, self._values, [], last, None, anew, relinearise)
+    def _layout(self, coming: Ints) -> dict[int, int]:
+        """Keys that are to be eliminated last, the higher their number the later.
+
+        The last keyframe and what it showed make the root, and the one before it belongs there, too: then nothing else is
+        about the last one, and no clique that is as large as the root otherwise becomes one with it.
+        """
+        chain = [self._newest]
+        while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
+            chain.append(before)
+        keys = dict.fromkeys([*(l_key(j) for j in coming.tolist()), *(x_key(k) for k in chain)], 1)
+        shown = [l_key(j) for j, number in self._touched.items() if number == self._updates]
+        keys.update(dict.fromkeys([*shown, *(x_key(k) for k in chain[:2])], 2))
+        return {key: group for key, group in keys.items() if self._isam.valueExists(key) or self._values.exists(key)}
+
+    def _update(self, layout: dict[int, int], relinearise: bool) -> None:
+        last, anew = gtsam.KeyGroupMap(), gtsam.KeyList()
+        for key, group in layout.items():
+            last.insert2(key, group)
+            if self._isam.valueExists(key):
+                anew.push_back(key)
+        self._isam.update(self._new, self._values, [], last if layout else None, None, anew, relinearise)
 
     def _add(self, kept: dict[int, gtsam.NonlinearFactor], key: int, factor: gtsam.NonlinearFactor) -> None:
         kept[key] = factor

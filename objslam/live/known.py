@@ -78,19 +78,18 @@ def long_unseen(now: Floats, then: Floats) -> Bools:
     return np.asarray(now[2, 2] - then[:, 2, 2] > HORIZON**2)
 
 
-def in_view(
-    known: Table, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: Floats | None = None
-) -> Bools:
+def in_view(known: Table, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: float = 0.0) -> Bools:
     """Which landmarks (N,) should be seen: well inside the image, and from no further than they were seen.
 
-    margin: the share of the image along its edge that does not count; negative, one around it that does. reach: (N,) m,
-    from how far, instead.
+    margin: the share of the image along its edge that does not count; negative, one around it that does. reach: m,
+    from how far all of them should be seen, even if they were not.
     """
     from objslam.rays import project
 
     local = (known.position - map_T_camera[:3, 3]) @ map_T_camera[:3, :3]
     distance = np.linalg.norm(local, axis=1)
-    ahead = np.flatnonzero((local[:, 2] > _NEAREST) & (local[:, 2] > 0.3 * distance) & (distance < (_FURTHER * known.far if reach is None else reach)))
+    near = distance < _FURTHER * np.maximum(known.far, reach)
+    ahead = np.flatnonzero(near & (local[:, 2] > _NEAREST) & (local[:, 2] > 0.3 * distance))
     seen = np.zeros(len(known), dtype=bool)
     pixels = project(camera, local[ahead])
     inside = (pixels > margin * camera.size) & (pixels < (1 - margin) * camera.size)

@@ -42,7 +42,8 @@ _VISITS = 6  # and so often it is one's turn after the other's: a drifted path, 
 _AGREE = 0.7  # share of them that make another place
 _DISTANT = 60.0  # s; how long something seen from afar is waited for
 _SLACK = 0.02  # m
-_AROUND = 0.15  # share of the image: what stands so close beside it may soon be in it
+_AROUND = 0.15  # share of the image: what stands so close beside it may soon be in it,
+_USUAL = 0.75  # and what is no further away than so many landmarks were seen from
 
 
 def after_keyframe(m: Mapper) -> None:
@@ -65,7 +66,8 @@ def _coming(m: Mapper) -> Ints:
     """The landmarks (n,) that the camera of the newest keyframe shows, or soon may."""
     newest = len(m.keyframes) - 1
     pose, camera = m.graph.pose(int(m.keyframes.id[newest])), m.cameras[int(m.keyframes.camera[newest])]
-    return np.asarray(m.known.id[in_view(m.known, camera, pose, -_AROUND, np.full(len(m.known), m.known.far.max(initial=0.0)))])
+    reach = float(np.quantile(m.known.far, _USUAL)) if len(m.known) else 0.0
+    return np.asarray(m.known.id[in_view(m.known, camera, pose, -_AROUND, reach)])
 
 
 def _look_at(m: Mapper, tasks: tuple[Callable[[Mapper], None], ...]) -> None:
