@@ -102,8 +102,8 @@ class IncrementalGraph:
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():
             self._work_in(self._layout(coming), relinearise)
-            for j in coming.tolist():
-                self._touched[j] = max(self._updates - 1, self._touched.get(j, 0))
+            shown = {j: number for j, number in self._touched.items() if number == self._updates}
+            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # the others may have sunk
         if self._newest in self._poses:
             self.pose(self._newest)  # solves for what the updates left unsolved
 
@@ -148,6 +148,7 @@ class IncrementalGraph:
     def restore(self, saved: tuple[object, ...]) -> None:
         """The graph as it was when it was saved."""
         self._kept, self._poses, self._points = saved  # type: ignore[assignment]
+        self._newest, self._touched = max(self._poses, default=-1), {}
         self._stale = False
         self._fill(self._kept.graph())
         self._clear()
@@ -272,16 +273,21 @@ class IncrementalGraph:
     def _layout(self, coming: Ints) -> dict[int, int]:
         """Keys that are to be eliminated last, the higher their number the later.
 
-        The last keyframe and what it showed make the root, and the one before it belongs there, too: then nothing else is
-        about the last one, and no clique that is as large as the root otherwise becomes one with it.
+        The last keyframe and what it showed make the root, what is coming the clique below it. A clique becomes one with
+        the one above where it is about all of it, and what lies below is dense; so each gets a pose that nothing below is
+        about: of three in a row, where the second is above the first, only the first is tied to what is older.
         """
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
             chain.append(before)
-        keys = dict.fromkeys([*(l_key(j) for j in coming.tolist()), *(x_key(k) for k in chain)], 1)
-        shown = [l_key(j) for j, number in self._touched.items() if number == self._updates]
-        keys.update(dict.fromkeys([*shown, *(x_key(k) for k in chain[:2])], 2))
-        return {key: group for key, group in keys.items() if self._isam.valueExists(key) or self._values.exists(key)}
+        keys = {x_key(k): 1 for k in chain}
+        keys.update((l_key(j), 2) for j in coming.tolist())
+        keys.update((l_key(j), 3) for j, number in self._touched.items() if number == self._updates)
+        keys.update((x_key(k), 3) for k in chain[:2])
+        known = {key: group for key, group in keys.items() if self._isam.valueExists(key) or self._values.exists(key)}
+        numbers = {group: i for i, group in enumerate(sorted(set(known.values())), start=1)}
+        most = len(known) - 1  # of numbers that many variables may have
+        return {key: numbers[group] for key, group in known.items()} if len(numbers) <= most else {}
 
     def _update(self, layout: dict[int, int], relinearise: bool) -> None:
         last, anew = gtsam.KeyGroupMap(), gtsam.KeyList()

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import ODOMETRY_ALONE, make_drive
+from drives import ODOMETRY_ALONE, drive_of, make_drive
 
+from objslam.config import load_settings
 from objslam.geometry import exp_se3, inverse
 from objslam.graph import factors
 from objslam.graph.incremental import IncrementalGraph
@@ -14,6 +15,7 @@ from objslam.graph.marginals import marginal_covariances
 from objslam.graph.optimise import levenberg_marquardt, make_values, read_points, read_poses
 from objslam.ledger import Ledger
 from objslam.live.meeting import meet, sightings
+from objslam.simulation import preset, simulate
 
 
 @pytest.fixture(scope="module")
@@ -171,3 +173,86 @@ def test_built_anew_in_turns_is_built_anew(drive, monkeypatch):
     np.testing.assert_allclose(graph.points(rest), whole.points(rest), atol=2e-3)
     every = np.arange(last + 2)
     np.testing.assert_allclose(graph.poses(every), whole.poses(every), atol=2e-3)
+
+
+def test_what_came_while_built_in_turns_is_there_once(drive, monkeypatch):
+    monkeypatch.setattr("objslam.graph.incremental._AT_ONCE", 50)
+    monkeypatch.setattr("objslam.graph.incremental._TURN", 100)
+    graph, landmarks = grown(drive)
+    last, new = len(drive.keyframes) - 1, int(landmarks[-1]) + 1
+    graph.rebuild_in_turns(np.arange(last + 1))
+    graph.take_turn()
+    graph.take_turn()
+    ahead = replace(bearings(drive, np.flatnonzero(drive.rays.keyframe == last)[:1]), number=np.array([10_000]))
+    graph.add_landmark(new, (graph.pose(last) @ [*(3.0 * ahead.direction[0]), 1.0])[:3])
+    graph.add_rays(replace(ahead, landmark=np.array([new])))
+    graph.take_turn()  # the last, while these are not worked in
+    assert not graph.in_turns
+    graph.prepare(np.array([new]))
+    assert graph.rebuilds == 0
+    assert graph._isam.getFactorsUnsafe().size() == graph._kept.graph().size()
+
+
+class Counting:
+    """An iSAM2 that tells how many variables an update eliminated anew."""
+
+    def __init__(self, isam):
+        self._isam, self.count = isam, 0.0
+
+    def update(self, *given):
+        result = self._isam.update(*given)
+        self.count = result.getVariablesReeliminated() or np.inf  # it says 0 where it was nearly all of them
+        return result
+
+    def __getattr__(self, name):
+        return getattr(self._isam, name)
+
+
+def one_more(graph, drive, landmarks):
+    """One more keyframe, which shows some landmarks where they are; how many variables it takes."""
+    motion, covariance = factors.motions(drive.keyframes, drive.settings)
+    last = len(drive.keyframes) - 1
+    pose = graph.pose(last) @ motion[-1]
+    local = (graph.points(landmarks) - pose[:3, 3]) @ pose[:3, :3]
+    some = bearings(drive, np.arange(len(landmarks)))
+    graph.add_keyframe(last + 1, pose)
+    graph.add_motion(last, last + 1, motion[-1], covariance[-1])
+    direction = local / np.linalg.norm(local, axis=1)[:, None]
+    number, keyframe = 10_000 + np.arange(len(landmarks)), np.full(len(landmarks), last + 1)
+    graph.add_rays(replace(some, number=number, keyframe=keyframe, landmark=landmarks, direction=direction))
+    graph._isam = counting = Counting(graph._isam)
+    graph.update()
+    return counting.count
+
+
+@pytest.fixture(scope="module")
+def round_trip():
+    """A drive that comes back to what it has not seen for long."""
+    room = {"room": (16.0, 12.0), "path": (2, 3), "objects": 60, "classes": 60, "laps": None, "min_view_share": 0.01}
+    changes = {**room, **ODOMETRY_ALONE, "frames": 500, "frame_rate": 10.0, "speed": 0.8, "false": 0.0}
+    return drive_of(simulate(preset("large", **changes), 5), load_settings(None, ("mode=joint", "rays.pixel_sigma=2")))
+
+
+def test_what_is_prepared_for_takes_little(round_trip):
+    drive = round_trip
+    graph, landmarks = grown(drive)
+    graph.refresh()
+    saved = graph.save()
+    owner, keyframe, last = drive.association.object, drive.rays.keyframe, len(drive.keyframes) - 1
+    latest = np.array([keyframe[owner == j].max() for j in landmarks])
+    long_ago = landmarks[np.argsort(latest)[:5]]
+    assert latest[np.argsort(latest)[4]] < last - 150
+    coming = np.union1d(long_ago, landmarks[latest >= last - 20])
+
+    def count(prepared, shown):
+        one = IncrementalGraph(drive.settings)
+        one.restore(saved)
+        if prepared:
+            one.prepare(coming, relinearise=True)
+        before = one.points(landmarks)
+        result = one_more(one, drive, shown)
+        np.testing.assert_allclose(one.points(landmarks), before, atol=5e-3)
+        return result
+
+    for j in range(5):
+        assert count(True, long_ago[[j]]) <= len(coming) + 6 < count(False, long_ago[[j]]) / 3
