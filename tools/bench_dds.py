@@ -57,10 +57,11 @@ def compare(options: argparse.Namespace) -> None:
     """Run all three at once and print what came of it."""
     from objslam.live.adapters.dds import DdsAdapter
     from objslam.live.dds_network import open_network
+    from objslam.live.promptness import be_prompt
     from objslam.live.ros_messages import RosMessages
     from objslam.live.topic_choice import TopicChoice
 
-    sys.setswitchinterval(5e-4)  # as objslam live does
+    be_prompt()  # as `objslam live` is
     with tempfile.TemporaryDirectory() as folder:
         sink = Timed(session(Path(folder)) if options.sink == "session" else None)
         adapter = DdsAdapter(open_network(options.domain), RosMessages(sink), TopicChoice())

@@ -25,11 +25,11 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from objslam import offline
-from objslam.cli.live import HAND_OVER
 from objslam.config import Odometry, Settings, load_settings
 from objslam.geometry import align, inverse
 from objslam.ledger import Ledger
 from objslam.live.adapters.replay import ReplayAdapter, events
+from objslam.live.promptness import be_prompt
 from objslam.live.session import Session
 from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions, read
@@ -151,6 +151,7 @@ def realtime(keyframes: int, classes: int) -> None:
     count = session.counters.updated
     session.counters.updated = lambda seconds: (updates.append(seconds), count(seconds))[1]  # type: ignore[method-assign]
     session.start()
+    be_prompt()  # as `objslam live` is once the log is read
     stop = threading.Event()
     adapter = ReplayAdapter(session, log, 1.0)
     bringing = threading.Thread(target=adapter.run, args=(stop,))
@@ -375,7 +376,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=10_000)
     parser.add_argument("--classes", type=int, default=10)
     arguments = parser.parse_args()
-    sys.setswitchinterval(HAND_OVER)  # as `objslam live` does
+    be_prompt()
     for part in arguments.parts:
         if part == "realtime":
             realtime(arguments.keyframes, arguments.classes)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import signal
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from objslam import offline
 from objslam.config import load_settings
 from objslam.ledger import Ledger
 from objslam.live.interface import Snapshot
+from objslam.live.promptness import be_prompt
 from objslam.results import RunResult
 from objslam.scene import ray_ends
 from objslam.simulation import preset, simulate
@@ -37,7 +37,6 @@ from objslam.viewer.rays import kind_colours
 
 REPEAT = 3
 LIVE_SECONDS = 5.0
-HAND_OVER = 5e-4  # s, as objslam live has it: so soon a thread gives way to another
 WORK = 20_000  # of a step that stands for a session's: it holds the interpreter, as much of a session's work does
 
 
@@ -113,7 +112,7 @@ def one_by_one(result: RunResult, file: Path) -> None:
 
 def live(result: RunResult) -> None:
     """Work like a session's, ten snapshots a second shown to a viewer that is well, frozen or killed, and to none."""
-    sys.setswitchinterval(HAND_OVER)
+    be_prompt()  # as `objslam live` is
     print(f"\nlive: {LIVE_SECONDS:g} s each, snapshots of {len(result.map)} objects ten times a second")
     path = Trajectory(
         *(a[np.unique(result.keyframes.stamps, return_index=True)[1]] for a in (result.keyframes.stamps, result.map_T_base))

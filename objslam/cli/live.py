@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import console, report, say
+from objslam.cli.live_status import status_line, times
 from objslam.cli.options import (
     Anonymous,
     BaseFrame,
@@ -37,14 +37,11 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.ledger import Ledger
     from objslam.live.adapters import Feed
-    from objslam.live.interface import Snapshot
     from objslam.live.session import Session
     from objslam.sources import SourceOptions
     from objslam.types import Log, Truth
 
-HAND_OVER = 5e-4  # s; a message does not wait Python's 5 ms, several times over, for the thread that makes the map
 _POLL = 0.1  # s; how soon the end of a source is seen
-_LINES = 10.0  # s between status lines where there is no terminal
 
 Speed = Annotated[
     float, typer.Option("--speed", min=0.0, help="Replay so many times as fast as it was driven; 0: as fast as it can be.")
@@ -237,10 +234,11 @@ def _replay(
 def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
     """Run the adapter until it ends or Ctrl-C, with a status line and objects.json."""
     from objslam.atomic_files import write_file
+    from objslam.live.promptness import be_prompt
     from objslam.objects_file import dump_objects
     from objslam.results import OBJECTS, clear_result
 
-    sys.setswitchinterval(HAND_OVER)
+    be_prompt()
     stop, failure = threading.Event(), list[BaseException]()
 
     def bring() -> None:
@@ -251,7 +249,7 @@ def _drive(session: Session, feed: Feed, out: Path, interval: float) -> None:
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
     told, begun = 0, False
-    with _ends_by_signal(stop), _status() as show:
+    with _ends_by_signal(stop), status_line() as show:
         bringing.start()
         due = time.monotonic() + interval
         while bringing.is_alive() and not stop.is_set() and not session.failed:
@@ -295,16 +293,10 @@ def _finish(session: Session, feed: Feed, out: Path, truth: Truth | None) -> Non
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
     say(
         f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}; {_times(last, ', ')}"
+        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}; {times(last, ', ')}"
         f"{last.rebuilds} rebuilds"
     )
     say_written(out, removed)
-
-
-def _times(snapshot: Snapshot, then: str) -> str:
-    """How long updates took, and what stands between that and the rest; nothing where none was measured."""
-    median, most = snapshot.update
-    return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""
 
 
 @contextmanager
@@ -322,48 +314,3 @@ def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def _status() -> Iterator[Callable[[Snapshot], None]]:
-    """A line that is kept up to date on stderr; where that is no terminal, one line every ten seconds."""
-    from rich.live import Live as Line
-
-    screen = console(stderr=True)
-    counts = _Rates()
-    if screen.is_terminal:
-        with Line(console=screen, refresh_per_second=4, transient=True) as line:
-            yield lambda snapshot: line.update(counts.line(snapshot))
-        return
-    told = time.monotonic()
-
-    def tell(snapshot: Snapshot) -> None:
-        nonlocal told
-        if time.monotonic() - told >= _LINES:
-            told = time.monotonic()
-            say(counts.line(snapshot), stderr=True)
-
-    yield tell
-
-
-class _Rates:
-    """The status line, with rates since the last one."""
-
-    def __init__(self) -> None:
-        self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
-
-    def line(self, snapshot: Snapshot) -> str:
-        now, then, before = time.monotonic(), *self._before
-        self._before = (now, snapshot.counters)
-        rates = {
-            kind: (snapshot.counters.get(kind, 0) - before.get(kind, 0)) / max(now - then, 1e-3)
-            for kind in ("odometry", "localization", "frames")
-            if kind in snapshot.counters
-        }
-        shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
-        resolved = len(snapshot.map.resolved())
-        return (
-            f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
-            f"{snapshot.keyframes} keyframes | {_times(snapshot, ' | ')}"
-            f"{resolved} objects, {len(snapshot.map) - resolved} unresolved"
-        )

@@ -236,8 +236,6 @@ def round_trip():
 def test_what_is_prepared_for_takes_little(round_trip):
     drive = round_trip
     graph, landmarks = grown(drive)
-    graph.refresh()
-    saved = graph.save()
     owner, keyframe, last = drive.association.object, drive.rays.keyframe, len(drive.keyframes) - 1
     latest = np.array([keyframe[owner == j].max() for j in landmarks])
     long_ago = landmarks[np.argsort(latest)[:5]]
@@ -246,7 +244,7 @@ def test_what_is_prepared_for_takes_little(round_trip):
 
     def count(prepared, shown):
         one = IncrementalGraph(drive.settings)
-        one.restore(saved)
+        one.restore(graph.save())
         if prepared:
             one.prepare(coming, relinearise=True)
         before = one.points(landmarks)

@@ -1,0 +1,66 @@
+"""The status line of `objslam live`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from objslam.cli.console import console, say
+
+if TYPE_CHECKING:
+    from objslam.live.interface import Snapshot
+
+_LINES = 10.0  # s between status lines where there is no terminal
+
+
+@contextmanager
+def status_line() -> Iterator[Callable[[Snapshot], None]]:
+    """A line that is kept up to date on stderr; where that is no terminal, one line every ten seconds."""
+    from rich.live import Live as Line
+
+    screen = console(stderr=True)
+    counts = _Rates()
+    if screen.is_terminal:
+        with Line(console=screen, refresh_per_second=4, transient=True) as line:
+            yield lambda snapshot: line.update(counts.line(snapshot))
+        return
+    told = time.monotonic()
+
+    def tell(snapshot: Snapshot) -> None:
+        nonlocal told
+        if time.monotonic() - told >= _LINES:
+            told = time.monotonic()
+            say(counts.line(snapshot), stderr=True)
+
+    yield tell
+
+
+class _Rates:
+    """The status line, with rates since the last one."""
+
+    def __init__(self) -> None:
+        self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
+
+    def line(self, snapshot: Snapshot) -> str:
+        now, then, before = time.monotonic(), *self._before
+        self._before = (now, snapshot.counters)
+        rates = {
+            kind: (snapshot.counters.get(kind, 0) - before.get(kind, 0)) / max(now - then, 1e-3)
+            for kind in ("odometry", "localization", "frames")
+            if kind in snapshot.counters
+        }
+        shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
+        resolved = len(snapshot.map.resolved())
+        return (
+            f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
+            f"{snapshot.keyframes} keyframes | {times(snapshot, ' | ')}"
+            f"{resolved} objects, {len(snapshot.map) - resolved} unresolved"
+        )
+
+
+def times(snapshot: Snapshot, then: str) -> str:
+    """How long updates took, and what stands between that and the rest; nothing where none was measured."""
+    median, most = snapshot.update
+    return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""
