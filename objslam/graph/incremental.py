@@ -14,6 +14,7 @@ from objslam.errors import SolveError
 from objslam.graph import factors
 from objslam.graph.factors import L0, X0, l_key, x_key
 from objslam.graph.kept import Bearings, Kept, KeptRay, ray_groups
+from objslam.graph.layout import elimination_groups
 from objslam.graph.optimise import levenberg_marquardt, read_points, read_poses
 from objslam.graph.turns import Turns, new_isam
 from objslam.types import Floats, Ints
@@ -91,7 +92,7 @@ class IncrementalGraph:
     def update(self) -> None:
         """Work in what was added."""
         self._updates += 1
-        self._work_in(None, False)
+        self._work_in()
 
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Work in what was added, and lay the tree out for a keyframe that may show landmarks coming (n,), where it is not.
@@ -101,7 +102,7 @@ class IncrementalGraph:
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():
-            self._work_in(self._layout(coming), relinearise)
+            self._work_in(relinearise, self._layout(coming))
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
             self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # the others may have sunk
         if self._newest in self._poses:
@@ -261,35 +262,25 @@ class IncrementalGraph:
         self._turns = None
         self._points[j] = position
 
-    def _work_in(self, layout: dict[int, int] | None, relinearise: bool) -> None:
+    def _work_in(self, relinearise: bool = False, layout: dict[int, int] | None = None) -> None:
         try:
-            self._update(layout or {}, relinearise)
-        except RuntimeError:  # indeterminate: counted, and the graph goes on from the factors kept
+            self._update(relinearise, layout or {})
+        except (RuntimeError, ValueError):  # indeterminate: counted, and the graph goes on from the factors kept
             self.rebuilds += 1
             self._rescue()
         self._clear()
         self._stale = True
 
     def _layout(self, coming: Ints) -> dict[int, int]:
-        """Keys that are to be eliminated last, the higher their number the later.
-
-        The last keyframe and what it showed make the root, what is coming the clique below it. A clique becomes one with
-        the one above where it is about all of it, and what lies below is dense; so each gets a pose that nothing below is
-        about: of three in a row, where the second is above the first, only the first is tied to what is older.
-        """
+        """`elimination_groups` as of now."""
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
             chain.append(before)
-        keys = {x_key(k): 1 for k in chain}
-        keys.update((l_key(j), 2) for j in coming.tolist())
-        keys.update((l_key(j), 3) for j, number in self._touched.items() if number == self._updates)
-        keys.update((x_key(k), 3) for k in chain[:2])
-        known = {key: group for key, group in keys.items() if self._isam.valueExists(key) or self._values.exists(key)}
-        numbers = {group: i for i, group in enumerate(sorted(set(known.values())), start=1)}
-        most = len(known) - 1  # of numbers that many variables may have
-        return {key: numbers[group] for key, group in known.items()} if len(numbers) <= most else {}
+        shown = (j for j, number in self._touched.items() if number == self._updates)
+        isam, new = self._isam, self._values
+        return elimination_groups(chain, coming.tolist(), shown, lambda key: isam.valueExists(key) or new.exists(key))
 
-    def _update(self, layout: dict[int, int], relinearise: bool) -> None:
+    def _update(self, relinearise: bool, layout: dict[int, int]) -> None:
         last, anew = gtsam.KeyGroupMap(), gtsam.KeyList()
         for key, group in layout.items():
             last.insert2(key, group)

@@ -57,8 +57,9 @@ def grown(drive):
                 graph.add_landmark(j, met.position)
                 graph.add_rays(b)
         graph.update()
-        graph.prepare(np.arange(0), relinearise=k % 10 == 0)
+        graph.prepare(np.array(sorted(known), dtype=np.int64), relinearise=k % 10 == 0)
     assert len(known) >= 10
+    assert graph.rebuilds == 0
     return graph, np.array(sorted(known))
 
 

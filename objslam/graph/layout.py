@@ -1,0 +1,32 @@
+"""Where in iSAM2's tree variables go, so that the next keyframe has little of it eliminated anew.
+
+An update eliminates anew all cliques between the variables that it observes and the root.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from objslam.graph.factors import l_key, x_key
+
+
+def elimination_groups(
+    keyframes: list[int], coming: Iterable[int], shown: Iterable[int], known: Callable[[int], bool]
+) -> dict[int, int]:
+    """Keys that are to be eliminated last, the higher their number the later; those that are not known are left out.
+
+    keyframes: the last three or fewer, the newest first, each tied to the next by a motion. coming: landmarks that may soon
+    be observed. shown: those that the newest keyframe observes.
+
+    The newest keyframe and what it shows make the root, what is coming the clique below it. A clique becomes one with the
+    one above where it is about all of that, and what lies below is dense; so each gets a pose that nothing below is about:
+    of three in a row, the second of which is above the first, only the first is tied to what is older.
+    """
+    groups = {x_key(k): 1 for k in keyframes}
+    groups.update((l_key(j), 2) for j in coming)
+    groups.update((l_key(j), 3) for j in shown)
+    groups.update((x_key(k), 3) for k in keyframes[:2])
+    groups = {key: group for key, group in groups.items() if known(key)}
+    number = {group: i for i, group in enumerate(sorted(set(groups.values())), start=1)}
+    # CCOLAMD wants them in a row, from 0 for all others, and less than there are variables
+    return {key: number[group] for key, group in groups.items()} if len(number) < len(groups) else {}
