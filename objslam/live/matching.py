@@ -112,8 +112,9 @@ def match(
         landmarks = Landmarks(places[at], own[at], noises[at], accepts[at])
         worst = _least(then[at], to[at], doubt)
         sure = back[trusted(some, landmarks, worst, map_T_camera, expected_unknown(some, rows[at], expected, novelty))]
-        keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
-        chosen = _best(_some(edges, keep), cost[keep], len(rays), len(places), unmatched)
+        if len(sure) < len(back):  # what is best of all stays so without what was not chosen
+            keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
+            chosen = _best(_some(edges, keep), cost[keep], len(rays), len(places), unmatched)
     return np.where(chosen >= 0, rows[chosen], -1)
 
 
