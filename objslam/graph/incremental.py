@@ -265,7 +265,7 @@ class IncrementalGraph:
     def _work_in(self, relinearise: bool = False, layout: dict[int, int] | None = None) -> None:
         try:
             self._update(relinearise, layout or {})
-        except (RuntimeError, ValueError):  # indeterminate: counted, and the graph goes on from the factors kept
+        except (RuntimeError, ValueError):  # indeterminate, or no such layout: counted, and goes on from the factors kept
             self.rebuilds += 1
             self._rescue()
         self._clear()

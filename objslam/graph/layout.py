@@ -18,9 +18,9 @@ def elimination_groups(
     keyframes: the last three or fewer, the newest first, each tied to the next by a motion. coming: landmarks that may soon
     be observed. shown: those that the newest keyframe observes.
 
-    The newest keyframe and what it shows make the root, what is coming the clique below it. A clique becomes one with the
-    one above where it is about all of that, and what lies below is dense; so each gets a pose that nothing below is about:
-    of three in a row, the second of which is above the first, only the first is tied to what is older.
+    The newest keyframe k and what it shows make the root, what is coming the clique below it. GTSAM makes a clique one with
+    its parent where it is about all of the parent's variables, and what lies below these two is dense; so each has a pose
+    that nothing below it is about: X(k) in the root, tied to X(k-1) alone, and X(k-1), tied to X(k-2), in what is coming.
     """
     groups = {x_key(k): 1 for k in keyframes}
     groups.update((l_key(j), 2) for j in coming)

@@ -52,9 +52,10 @@ def after_keyframe(m: Mapper) -> None:
     number = m.keyframes_so_far
     if m.unsettled:
         m.unsettled, m.unrest = False, _TURNS
-    due = number % _EVERY == 0 or (m.unrest and number % _BREATH == 0)
-    relinearise = bool(due) and not m.graph.in_turns  # what comes of turns is linearised where the estimate is now anyway
-    m.unrest = max(0, m.unrest - relinearise)
+    due = number % _EVERY == 0 or (m.unrest > 0 and number % _BREATH == 0)
+    relinearise = due and not m.graph.in_turns  # what comes of turns is linearised where the estimate is now anyway
+    if relinearise:
+        m.unrest = max(0, m.unrest - 1)
     m.graph.prepare(_coming(m), relinearise)
     if number % _EVERY == _GROWING:
         _look_at(m, (_forget, thin_if_many, _polish_if_grown))
@@ -71,6 +72,7 @@ def _coming(m: Mapper) -> Ints:
 
 
 def _look_at(m: Mapper, tasks: tuple[Callable[[Mapper], None], ...]) -> None:
+    """One task after the other, until one has the graph built anew in turns."""
     m.known.position[:] = m.graph.points(m.known.id)
     for task in tasks:
         if not m.graph.in_turns:
