@@ -183,7 +183,7 @@ def test_what_came_while_built_in_turns_is_there_once(drive, monkeypatch):
     last, new = len(drive.keyframes) - 1, int(landmarks[-1]) + 1
     graph.rebuild_in_turns(np.arange(last + 1))
     graph.take_turn()
-    graph.take_turn()
+    assert graph.in_turns
     ahead = replace(bearings(drive, np.flatnonzero(drive.rays.keyframe == last)[:1]), number=np.array([10_000]))
     graph.add_landmark(new, (graph.pose(last) @ [*(3.0 * ahead.direction[0]), 1.0])[:3])
     graph.add_rays(replace(ahead, landmark=np.array([new])))
