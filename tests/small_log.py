@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from objslam.config import Odometry
+from objslam.core.types import Detections, Log
 from objslam.simulation import DriveSettings, PoseNoise, make_camera, simulate
-from objslam.types import Log
 
 THINGS = (
     ("cup", (1.0, 0.5, 0.5)),
@@ -36,3 +38,26 @@ def small_log(seed: int = 0, **changes: Any) -> Log:
         "localization": PoseNoise(xy=0.02, yaw=0.005),
     }
     return simulate(DriveSettings(**{**drive, **changes}), seed)
+
+
+def crowded(log: Log, frames: NDArray[np.int64], count: int, label: str = "leaf") -> Log:
+    """The log with so many more boxes of a label anywhere in the image of each of the frames of its first camera."""
+    rng, first = np.random.default_rng(0), log.cameras[0]
+    assert first.detections is not None
+    names = (*first.detections.label_names, label)
+    frame = np.repeat(frames, count)
+    centre = rng.uniform(12, first.camera.size - 13, (len(frame), 2))
+    more = Detections(
+        frame_stamps=first.detections.frame_stamps,
+        frame=frame,
+        boxes=np.hstack([centre - 6, centre + 6]),
+        label=np.full(len(frame), names.index(label)),
+        scores=rng.uniform(0.3, 0.8, len(frame)),
+        depths=np.full(len(frame), np.nan),
+        track_ids=np.full(len(frame), -1),
+        label_names=names,
+    )
+    order = np.argsort(np.concatenate([first.detections.frame, frame]), kind="stable")
+    columns = ("frame", "boxes", "label", "scores", "depths", "track_ids")
+    both = {name: np.concatenate([getattr(first.detections, name), getattr(more, name)])[order] for name in columns}
+    return replace(log, cameras=(replace(first, detections=replace(more, **both)), *log.cameras[1:]))

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from objslam.config import Settings
-from objslam.geometry import inverse, lift_se2, make_pose
-from objslam.results import RunResult
-from objslam.types import Association, Camera, Floats, Keyframes, MapObject, ObjectMap, Rays, Trajectory, Truth, TruthObject
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.core.geometry import inverse, lift_se2, make_pose
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.result import RunResult
+from objslam.core.types import Association, Keyframes, Rays, Trajectory, Truth, TruthObject
 
 OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.0, 0.4]))
 

@@ -11,15 +11,16 @@ import pytest
 from scipy.optimize import minimize
 
 from objslam.config import Settings, load_settings
-from objslam.evaluation import ObjectScores, evaluate
-from objslam.geometry import exp_se3
-from objslam.ledger import Ledger
-from objslam.matching import Alignment
-from objslam.offline import run
-from objslam.results import RunResult
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import exp_se3
+from objslam.core.result import RunResult
+from objslam.core.types import Log, Trajectory, Truth
+from objslam.evaluation.alignment import Alignment
+from objslam.evaluation.evaluate import ObjectScores, evaluate
+from objslam.mapping.pipeline import run
 from objslam.simulation import preset, simulate
 from objslam.simulation.settings import DepthNoise
-from objslam.types import Floats, Log, Trajectory, Truth
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 NAMES = sorted(file.name for file in CONFIGS.glob("*.yaml"))

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from waiting import LIMIT
 
 from objslam import ObjectMap
 from objslam.cli import app
@@ -69,7 +70,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
             env={**os.environ, "PATH": path},
             capture_output=True,
             text=True,
-            timeout=240,
+            timeout=LIMIT,
             check=False,
         )
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"

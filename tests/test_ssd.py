@@ -90,7 +90,7 @@ def test_default_boxes_cover_the_image_and_come_in_the_order_of_the_network():
     assert offsets.shape == (1, len(boxes), 4)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_decode_undoes_encode(seed):
     rng = np.random.default_rng(seed)

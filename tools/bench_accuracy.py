@@ -18,13 +18,14 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from objslam import offline
 from objslam.config import Odometry, load_settings
-from objslam.evaluation import evaluate
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Trajectory
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions, read
-from objslam.types import ObjectMap, Trajectory
 
 RADIUS = 2.0
 """m; labels say who is whom here, so that no error is hidden by calling the object missed."""
@@ -33,7 +34,7 @@ CABINET = np.array([-1.520, 0.454])
 """m; the centre of the depth images fused with the true poses, seen from above."""
 
 
-def solved_path(result: offline.RunResult) -> Trajectory:
+def solved_path(result: pipeline.RunResult) -> Trajectory:
     """The path at the keyframes, after the solve."""
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     return Trajectory(stamps, result.map_T_base[first])
@@ -54,7 +55,7 @@ def simulated(drives: int) -> None:
         begin = time.perf_counter()
         for seed in range(drives):
             log = simulate(drive, seed)
-            result = offline.run(log, settings, Ledger())
+            result = pipeline.run(log, settings, Ledger())
             found = evaluate(result.map, log.truth, solved_path(result), radius=RADIUS)
             assert found.objects is not None
             for match in found.objects.matches:
@@ -86,7 +87,7 @@ def mrclam(data: Path) -> None:
         for with_range in (False, True):
             log = read(data, Ledger(), SourceOptions(robot=robot, with_range=with_range))
             begin = time.perf_counter()
-            result = offline.run(log, load_settings(None, ("mode=joint",)), Ledger())
+            result = pipeline.run(log, load_settings(None, ("mode=joint",)), Ledger())
             seconds = time.perf_counter() - begin
             path, counts = solved_path(result), result.summary["counts"]
             found = evaluate(result.map, log.truth, path, align="se2", radius=RADIUS).to_dict()
@@ -108,7 +109,7 @@ def cube(data: Path) -> None:
     for use in ("true", "false"):
         log = read(data, Ledger(), SourceOptions(label="cabinet"))
         begin = time.perf_counter()
-        result = offline.run(log, load_settings(None, (f"depth.use={use}",)), Ledger())
+        result = pipeline.run(log, load_settings(None, (f"depth.use={use}",)), Ledger())
         seconds = time.perf_counter() - begin
         for cabinet in result.map.resolved():
             off = np.linalg.norm(cabinet.position[:2] - CABINET)

@@ -17,20 +17,22 @@ from pathlib import Path
 
 import numpy as np
 
-from objslam import offline
-from objslam.association.search import associate
+from objslam.association.global_association import associate_globally
 from objslam.config import Settings
-from objslam.evaluation import evaluate
-from objslam.geometry import widest_angle
-from objslam.keyframes import build_keyframes
-from objslam.ledger import Ledger
-from objslam.matching import lay_truth, match
-from objslam.picture import draw_map
-from objslam.rays import build_rays
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import widest_angle
+from objslam.core.types import Association, Keyframes, Log, Rays
+from objslam.evaluation.alignment import lay_truth, match_points
+from objslam.evaluation.evaluate import evaluate
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping import pipeline
+from objslam.output.plot.map_plot import draw_map
 from objslam.simulation import DriveSettings, pair, preset, simulate
 from objslam.sources import SourceOptions, read
-from objslam.triangulation import triangulate
-from objslam.types import Association, Camera, Floats, Ints, Keyframes, Log, Rays
+from objslam.triangulation.triangulate import triangulate
 
 PARTS = ("scenes", "speed", "drift", "mrclam")
 STEP_DRIFT = {
@@ -80,7 +82,7 @@ def solve(scene: Scene, exact_poses: bool = True) -> Association:
     sigma, place = scene.rays.sigma, 0.0
     if not exact_poses:
         sigma, place = np.hypot(sigma, LOCALIZATION["yaw"]), LOCALIZATION["xy"]
-    return associate(
+    return associate_globally(
         scene.rays,
         scene.keyframes,
         scene.cameras,
@@ -97,7 +99,7 @@ def score(scene: Scene, association: Association, radius: float) -> tuple[int, i
     settings = Settings().triangulation
     placed = triangulate(origins, directions, association.object, association.count, scene.rays.sigma, settings)
     same = association.label[placed.ok, None] == scene.labels
-    found, true = match(placed.positions[placed.ok], scene.points, same, radius)
+    found, true = match_points(placed.positions[placed.ok], scene.points, same, radius)
     mine = [directions[scene.whose == i] for i in range(len(scene.points))]
     well = np.array([len(d) >= 10 and widest_angle(d) >= np.radians(10) for d in mine])
     errors = np.linalg.norm(placed.positions[placed.ok][found] - scene.points[true], axis=1)
@@ -141,7 +143,7 @@ def drift(seeds: int, picture: Path | None) -> None:
         log = simulate(preset("drift"), seed)
         settings = Settings.model_validate({"mode": "joint", "rays": {"pixel_sigma": 3.0}, "odometry": STEP_DRIFT})
         begin = time.perf_counter()
-        result = offline.run(log, settings, Ledger())
+        result = pipeline.run(log, settings, Ledger())
         seconds = time.perf_counter() - begin
         assert log.odometry is not None
         assert log.truth is not None
@@ -171,7 +173,7 @@ def mrclam() -> None:
     for robot, with_range in ((1, True), (3, True), (5, True), (1, False), (5, False)):
         log = read(folder, Ledger(), SourceOptions(robot=robot, anonymous=True, with_range=with_range))
         begin = time.perf_counter()
-        result = offline.run(log, Settings.model_validate({"mode": "joint"}), Ledger())
+        result = pipeline.run(log, Settings.model_validate({"mode": "joint"}), Ledger())
         seconds = time.perf_counter() - begin
         assert log.truth is not None
         found = evaluate(result.map, log.truth, result.path_after, align="se2", radius=0.3).objects

@@ -22,10 +22,11 @@ from pathlib import Path
 import numpy as np
 from rosbags.highlevel import AnyReader
 
-from objslam.geometry import lift_se2
-from objslam.ledger import Ledger
-from objslam.sources.ros import BagOptions, read_bag
-from objslam.types import Camera
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.options import BagOptions
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "sources" / "ros"))
 from bag_writer import Maker, Raw, serialize, write_bag

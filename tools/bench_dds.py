@@ -24,7 +24,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from objslam.types import Camera
+from objslam.core.camera import Camera
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "sources" / "ros"))
 from bag_writer import Maker, serialize
@@ -56,12 +56,12 @@ def main() -> None:
 def compare(options: argparse.Namespace) -> None:
     """Run all three at once and print what came of it."""
     from objslam.live.adapters.dds import DdsAdapter
-    from objslam.live.dds_network import open_network
-    from objslam.live.promptness import be_prompt
-    from objslam.live.ros_messages import RosMessages
-    from objslam.live.topic_choice import TopicChoice
+    from objslam.live.dds.network import open_network
+    from objslam.live.ros.message_handler import RosMessages
+    from objslam.live.ros.topic_discovery import TopicChoice
+    from objslam.live.session import low_latency
 
-    be_prompt()  # as `objslam live` is
+    low_latency.configure()  # as `objslam live` is
     with tempfile.TemporaryDirectory() as folder:
         sink = Timed(session(Path(folder)) if options.sink == "session" else None)
         adapter = DdsAdapter(open_network(options.domain), RosMessages(sink), TopicChoice())
@@ -100,7 +100,7 @@ def delays(sent: list[float], arrived: dict[str, float]) -> np.ndarray:
 def session(folder: Path) -> object:
     """A session as `objslam live` starts one, journal included."""
     from objslam.config import load_settings
-    from objslam.live.session import Session
+    from objslam.live.session.session import Session
 
     return Session(load_settings(None, ("mode=joint",)), folder / "journal").start()
 
@@ -155,9 +155,9 @@ def read_bare(options: argparse.Namespace) -> dict[str, dict[str, float]]:
     from cyclonedds.topic import Topic
     from cyclonedds.util import duration
 
-    from objslam.live.dds_network import open_network
-    from objslam.live.dds_types import layouts_of
-    from objslam.sources.ros.decode import read_head
+    from objslam.live.dds.network import open_network
+    from objslam.live.dds.types import layouts_of
+    from objslam.ros.messages.decode import read_head
 
     participant = open_network(options.domain).participant
     qos = Qos(
@@ -187,8 +187,8 @@ def drive(options: argparse.Namespace) -> dict[str, list[float]]:
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
 
-    from objslam.live.dds_network import open_network
-    from objslam.live.dds_types import layouts_of
+    from objslam.live.dds.network import open_network
+    from objslam.live.dds.types import layouts_of
 
     participant = open_network(options.domain).participant
     reliable = Policy.Reliability.Reliable(10**8)

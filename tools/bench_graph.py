@@ -18,14 +18,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "graph
 from custom_factor import eq1_factor
 
 from objslam.config import Settings
-from objslam.geometry import exp_se3, inverse, lift_se2
-from objslam.graph import factors
-from objslam.graph.batch import solve_fixed, solve_joint
-from objslam.graph.optimise import build_graph, make_values
-from objslam.graph.placing import triangulate_at
-from objslam.keyframes import gathered_drift
-from objslam.ledger import Ledger
-from objslam.types import Association, Keyframes, Rays, Trajectory
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import exp_se3, inverse, lift_se2
+from objslam.core.types import Association, Keyframes, Rays, Trajectory
+from objslam.frontend.odometry_drift import gathered_drift
+from objslam.graph.batch_solver import solve_fixed, solve_joint
+from objslam.graph.factors.bearing import bearings, point_to_line
+from objslam.graph.factors.noise import robust
+from objslam.graph.factors.odometry import betweens, motions
+from objslam.graph.fixed_pose_triangulation import triangulate_at
+from objslam.graph.optimizers import build_graph
+from objslam.graph.variables import L0, X0, make_values
 
 RAYS_A_FRAME = 5
 PIXEL = 3.0 / 500
@@ -98,20 +101,20 @@ def against_custom(rays_total: int, iterations: int = 3) -> float:
     """Seconds of the CustomFactor over those of the compiled factor: the same graph, start and number of LM iterations."""
     keyframes, rays, association, points = drive(rays_total)
     noise = [gtsam.noiseModel.Isotropic.Sigma(2, 0.05)] * len(rays)
-    between = factors.betweens(*factors.motions(keyframes, Settings()), 0)
+    between = betweens(*motions(keyframes, Settings()), 0)
     seconds = []
     for custom in (False, True):
         begin = time.perf_counter()
         if custom:
             sigma = gtsam.noiseModel.Isotropic.Sigma(3, 0.05)
             made = [
-                eq1_factor(factors.x_key(k), factors.l_key(j), n, sigma)
+                eq1_factor((X0 + k), (L0 + j), n, sigma)
                 for k, j, n in zip(rays.keyframe, association.object, rays.direction, strict=True)
             ]
         else:
-            made = factors.point_to_line(rays.keyframe, rays.direction, association.object, noise)
+            made = point_to_line(rays.keyframe, rays.direction, association.object, noise)
         prior = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
-        first = gtsam.PriorFactorPose3(factors.x_key(0), gtsam.Pose3(keyframes.map_T_camera[0]), prior)
+        first = gtsam.PriorFactorPose3((X0 + 0), gtsam.Pose3(keyframes.map_T_camera[0]), prior)
         seen = np.unique(association.object)
         graph = build_graph(made, between, [first])
         values = make_values(keyframes.map_T_camera, points, seen)
@@ -140,13 +143,13 @@ def growth() -> None:
         error = np.linalg.norm(estimate.positions - points, axis=1)[estimate.solved]
         begin = time.perf_counter()
         # one solve alone, from the poses that the first one found
-        noise = factors.robust("huber", rays.sigma, 2)
+        noise = robust("huber", rays.sigma, 2)
         graph = build_graph(
-            factors.bearing(rays.keyframe, rays.direction, association.object, noise),
-            factors.betweens(*factors.motions(keyframes, settings), 0),
+            bearings(rays.keyframe, rays.direction, association.object, noise),
+            betweens(*motions(keyframes, settings), 0),
             [
                 gtsam.PriorFactorPose3(
-                    factors.x_key(0), gtsam.Pose3(keyframes.map_T_camera[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+                    (X0 + 0), gtsam.Pose3(keyframes.map_T_camera[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
                 )
             ],
         )

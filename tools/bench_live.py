@@ -24,16 +24,17 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from objslam import offline
 from objslam.config import Odometry, Settings, load_settings
-from objslam.geometry import align, inverse
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import align, inverse
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Log
 from objslam.live.adapters.replay import ReplayAdapter, events
-from objslam.live.promptness import be_prompt
-from objslam.live.session import Session
+from objslam.live.session import low_latency
+from objslam.live.session.session import Session
+from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions, read
-from objslam.types import Log, ObjectMap
 
 ONLY_ODOMETRY = {"localization": None, "odometry": Odometry()}
 QUIET = ("output.recording=false", "output.picture=false")
@@ -117,7 +118,7 @@ def same() -> None:
         last = session.snapshot().map
         live = session.stop()
         between = time.perf_counter()
-        reference = offline.run(log, settings, Ledger())
+        reference = pipeline.run(log, settings, Ledger())
         end = time.perf_counter()
         both, mine, theirs, rmse, aligned = compare(live.map, reference.map)
         also, more, fewer, error, _ = compare(last, reference.map)
@@ -151,7 +152,7 @@ def realtime(keyframes: int, classes: int) -> None:
     count = session.counters.updated
     session.counters.updated = lambda seconds: (updates.append(seconds), count(seconds))[1]  # type: ignore[method-assign]
     session.start()
-    be_prompt()  # as `objslam live` is once the log is read
+    low_latency.configure()  # as `objslam live` is once the log is read
     stop = threading.Event()
     adapter = ReplayAdapter(session, log, 1.0)
     bringing = threading.Thread(target=adapter.run, args=(stop,))
@@ -211,13 +212,13 @@ def kill(times: int = 20) -> None:
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         source, out, whole = (Path(folder) / name for name in ("log", "out", "whole"))
-        from objslam.sources.folder import write_log_folder
+        from objslam.sources.log_folder import write_log_folder
 
         write_log_folder(log, source)
         quiet = [f"--set={change}" for change in (*QUIET, "rays.pixel_sigma=2")]
         command = [sys.executable, "-m", "objslam", "live", str(source), "-o"]
         subprocess.run([*command, str(whole), "--speed", "0", *quiet], check=True, capture_output=True)
-        from objslam.live.journal import messages
+        from objslam.sources.journal.file import messages
 
         done, killed, torn, length, sizes = False, 0, 0, 0, [0]
         while not done:
@@ -246,7 +247,7 @@ def kill(times: int = 20) -> None:
             else:
                 assert process.wait() == 0
                 done = True
-        from objslam.results import load_map
+        from objslam.results.read import load_map
 
         both, mine, theirs, rmse, _ = compare(load_map(out), load_map(whole))
         here, there = (list(messages(f, Ledger())) for f in (out, whole))
@@ -376,7 +377,7 @@ def main() -> None:
     parser.add_argument("--keyframes", type=int, default=10_000)
     parser.add_argument("--classes", type=int, default=10)
     arguments = parser.parse_args()
-    be_prompt()
+    low_latency.configure()
     for part in arguments.parts:
         if part == "realtime":
             realtime(arguments.keyframes, arguments.classes)

@@ -22,15 +22,16 @@ import numpy as np
 import open3d as o3d
 from mesh_view import Picture, View, save
 
-from objslam import offline
 from objslam.config import Settings, load_settings
-from objslam.geometry import align, interpolate, make_pose
-from objslam.ledger import Ledger
-from objslam.reconstruction import Grid, Lens, choose_shots, load_shot, reconstruct
-from objslam.simulation.rendered import RenderSettings, drive_room
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import align, interpolate, make_pose
+from objslam.core.types import Log, Surface, Trajectory
+from objslam.io.detections_jsonl import read_detections
+from objslam.mapping import pipeline
+from objslam.mapping.reconstruction import Grid, Lens, choose_shots, load_shot, reconstruct
+from objslam.simulation.render import RenderSettings, drive_room
 from objslam.sources import read
-from objslam.sources.detections_file import read_detections
-from objslam.types import Floats, Log, Surface, Trajectory
 
 BAR_DISTANCE, BAR_TIME = 15.0, 10.0  # mm, ms
 
@@ -69,7 +70,7 @@ def surfaces(log: Log, demo: Path) -> dict[str, Surface]:
         with_boxes = replace(log, cameras=(replace(log.cameras[0], detections=boxes),))
         own = poses == "odometry"
         change = (f"reconstruction.before={str(own).lower()}",)
-        result = offline.run(with_boxes, load_settings(demo / mode / "config.yaml", change), Ledger())
+        result = pipeline.run(with_boxes, load_settings(demo / mode / "config.yaml", change), Ledger())
         assert result.surface is not None
         found[f"{mode}, from {poses}"] = moved(result.surface, laid(result.path_after, truth)) if own else result.surface
         if result.surface_before is not None:

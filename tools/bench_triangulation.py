@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from objslam import config
-from objslam.triangulation import closed_form, solve_eq1, triangulate
+from objslam.triangulation.triangulate import closed_form, solve_eq1, triangulate
 
 
 def scene(objects: int, rays: int, outliers: float, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -20,20 +20,21 @@ from typing import Any
 
 import numpy as np
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.ledger import Ledger
-from objslam.live.interface import Snapshot
-from objslam.live.promptness import be_prompt
-from objslam.results import RunResult
-from objslam.scene import ray_ends
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.core.snapshot import Snapshot
+from objslam.core.types import Log, Trajectory
+from objslam.live.session import low_latency
+from objslam.mapping import pipeline
+from objslam.output.plot.style import ray_ends
+from objslam.output.viewer import application
+from objslam.output.viewer.cameras import box_colours
+from objslam.output.viewer.live.live_view import LiveView
+from objslam.output.viewer.rays import kind_colours
+from objslam.output.viewer.recording import write_recording
 from objslam.simulation import preset, simulate
 from objslam.sources import read
-from objslam.types import Log, Trajectory
-from objslam.viewer import program, write_recording
-from objslam.viewer.cameras import box_colours
-from objslam.viewer.live import LiveView
-from objslam.viewer.rays import kind_colours
 
 REPEAT = 3
 LIVE_SECONDS = 5.0
@@ -50,7 +51,7 @@ def main() -> None:
     settings = load_settings(None, (f"mode={options.mode}", "reconstruction.use=false", *options.set))
     result: RunResult | None = None
     for log in [read(path, Ledger()) for path in options.logs] or [long_drive()]:
-        result = offline.run(log, settings, Ledger())
+        result = pipeline.run(log, settings, Ledger())
         print(f"\n{log.name}: {len(result.keyframes)} keyframes, {len(result.rays)} rays, {images_of(result)} images")
         row("recording", *best(result, lambda r, f: write_recording(r, f)), len(result.keyframes))
         if images_of(result):
@@ -112,18 +113,16 @@ def one_by_one(result: RunResult, file: Path) -> None:
 
 def live(result: RunResult) -> None:
     """Work like a session's, ten snapshots a second shown to a viewer that is well, frozen or killed, and to none."""
-    be_prompt()  # as `objslam live` is
+    low_latency.configure()  # as `objslam live` is
     print(f"\nlive: {LIVE_SECONDS:g} s each, snapshots of {len(result.map)} objects ten times a second")
     path = Trajectory(
         *(a[np.unique(result.keyframes.stamps, return_index=True)[1]] for a in (result.keyframes.stamps, result.map_T_base))
     )
     snapshot = Snapshot(float(path.stamps[-1]), result.map, path, len(path))
     for how in ("well", "frozen", "killed"):
-        port = program.free_port()
-        viewer = program.start("--serve-grpc", "--port", str(port))
-        program.wait_for(viewer, port)
-        program.let_go(viewer)
-        view = LiveView(address=program.address(port))
+        port = application.free_port()
+        viewer = application.start_listening(port, "--serve-grpc", "--port", str(port))
+        view = LiveView(address=application.address(port))
         view.show(snapshot)
         while not view.shown:
             time.sleep(0.05)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from objslam import config
-from objslam.triangulation import triangulate
+from objslam.triangulation.triangulate import triangulate
 
 MEETING = np.array([0.0, 0.0, 1.0])
 GOOD = 7

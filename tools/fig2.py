@@ -19,13 +19,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from mesh_view import Picture, View, save
+from mesh_view import Picture, View, read_mesh, save
 
-from objslam.ply_file import read_mesh
-from objslam.proximity import Field, Slice, field, pulling
-from objslam.rays_file import RaysTable
-from objslam.results import SURFACE, load_map, load_rays
-from objslam.types import Floats, MapObject, Surface
+from objslam.core.arrays import Floats
+from objslam.core.object_map import MapObject
+from objslam.core.types import Surface
+from objslam.io.rays_parquet import RaysTable
+from objslam.results.files import SURFACE
+from objslam.results.read import load_map, load_rays
+from objslam.triangulation.proximity_field import FieldSlice, ProximityField, proximity_field, supporting_rays
 
 BLUE, BLACK, INK = (38, 110, 205), (12, 12, 14), "#282c34"
 HEAT = colormaps["turbo_r"]
@@ -43,7 +45,7 @@ def overview(surface: Surface, o: MapObject) -> View:
     return View(eye, np.array([*(middle[:2] + 0.04 * span * away), low[2] + 0.03 * span]), 55.0, *SIZE)
 
 
-def close(o: MapObject, f: Field, origins: Floats, reach: float) -> View:
+def close(o: MapObject, f: ProximityField, origins: Floats, reach: float) -> View:
     """An object from the side from which its rays come, a little from above."""
     towards = origins.mean(axis=0)[:2] - o.position[:2]
     towards /= max(float(np.linalg.norm(towards)), 1e-9)
@@ -57,7 +59,7 @@ def radius(o: MapObject) -> float:
     return max(SMALL, 0.6 * max(o.extent)) if o.extent else SMALL
 
 
-def draw_slice(picture: Picture, s: Slice, norm: Normalize) -> None:
+def draw_slice(picture: Picture, s: FieldSlice, norm: Normalize) -> None:
     """A slice of the field, fading where the cost is high."""
     value = np.clip(norm(s.cost), 0, 1)
     cells = (value[:-1, :-1] + value[1:, 1:]) / 2
@@ -81,9 +83,9 @@ def main() -> None:
 def figure(surface: Surface, objects: tuple[MapObject, ...], rays: RaysTable, chosen: MapObject, out: Path) -> None:
     """Draw both pictures into one PNG."""
     used = rays.weight >= 0.5
-    mine = pulling(rays.weight, rays.object == chosen.id)
+    mine = supporting_rays(rays.weight, rays.object == chosen.id)
     reach = 2.0 * radius(chosen)
-    f = field(rays.origin[mine], rays.direction[mine], 81, reach)
+    f = proximity_field(rays.origin[mine], rays.direction[mine], 81, reach)
     norm = Normalize(f.cost, float(np.quantile(f.horizontal.cost, 0.8)))
 
     room = Picture(surface, overview(surface, chosen))

@@ -11,14 +11,27 @@ import cv2
 import numpy as np
 import open3d as o3d
 
-from objslam.geometry import inverse, make_pose
-from objslam.types import Floats, Surface
+from objslam.core.arrays import Floats
+from objslam.core.geometry import inverse, make_pose
+from objslam.core.types import Surface
 
 BACKGROUND = (255, 255, 255)
 _PASSES = 6  # walls seen from behind that a ray may go through
 _NEAR = 0.05  # m in front of the eye is not drawn
 _HIDDEN = 0.22  # share of a line's opacity that is left behind a surface
 _FINE = 2  # times the pixels of the picture, for smooth edges
+
+
+def read_mesh(file: Path) -> Surface:
+    """The surface in a PLY file; the program ends where there is none."""
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        mesh = o3d.io.read_triangle_mesh(file)
+    if not len(mesh.triangles):
+        raise SystemExit(f"{file}: no surface can be read")
+    mesh.compute_vertex_normals()
+    colours = np.rint(255 * np.asarray(mesh.vertex_colors)).astype(np.uint8) if mesh.has_vertex_colors() else None
+    vertices, normals = (np.asarray(part, dtype=np.float32) for part in (mesh.vertices, mesh.vertex_normals))
+    return Surface(vertices, normals, colours, np.asarray(mesh.triangles, dtype=np.int32))
 
 
 @dataclass(frozen=True)

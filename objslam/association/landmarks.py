@@ -1,28 +1,24 @@
-"""What is believed at a moment: objects as points, and which ray is whose."""
+"""What association believes at one moment: landmarks as points, and the landmark of each ray."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 
-from objslam.association.extent import grouped_median
-from objslam.association.sightings import Sightings
-from objslam.types import Bools, Floats, Ints
-
-RANGE_GAIN, RANGE_LOSS = 6.0, 4.0
-"""What a range that fits perfectly takes off a match's cost, and the most that a wrong one adds: a box of something else
-has its range anywhere within some metres, a right box has a wrong range one time in ten or so."""
-
-BEHIND = 1e6
-"""Standard deviations that count for infinitely many: a point behind the camera."""
+from objslam.association.observations import Observations
+from objslam.association.refinement import BEHIND, normalised_residuals, variance
+from objslam.association.visibility import CameraFrames, DetectionHistory, detection_history
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_CLASS, RAYLEIGH_MEDIAN, grouped_median
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Objects as points: position (N, 3) m, covariance (N, 3, 3) m^2, noise (N,) factor on the rays' noise, accepts (N, L)
-    whether a box of a label may be theirs."""
+    """Objects as points: position (N, 3) m, covariance (N, 3, 3) m^2, noise (N,) factor on the promised noise of their rays,
+    accepts (N, L) whether a box of a label may be theirs."""
 
     position: Floats
     covariance: Floats
@@ -34,7 +30,7 @@ class Landmarks:
 
     @classmethod
     def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
-        """Landmarks of one label each, label: (N,) of `labels`, where they are taken to be."""
+        """Landmarks at exact positions that accept one label each: (N,), of the `labels` that there are."""
         accepts = np.zeros((len(position), labels), dtype=bool)
         accepts[np.arange(len(position)), label] = True
         return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
@@ -44,84 +40,138 @@ class Landmarks:
         return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
 
     def and_also(self, other: Self) -> Self:
-        """These, and then the others."""
+        """These landmarks, then the others."""
         pairs = ((getattr(self, name), getattr(other, name)) for name in ("position", "covariance", "noise", "accepts"))
         return type(self)(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
-class State:
-    """Landmarks, and matched (R,): the landmark of each sighting, -1 none."""
+class PredictedLandmarks:
+    """What the boxes of a session's next frame may be of: its landmarks in their order, then its candidates in theirs.
 
+    landmarks: how many of the n are landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate that
+    only its label ties together. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) of the odometry when each
+    was last seen. noise: (n,) factor on that of its rays. far: m, the greatest distance from which a landmark was seen.
+    """
+
+    landmarks: int
+    id: Ints
+    label: Ints
+    position: Floats
+    covariance: Floats
+    drift: Floats
+    noise: Floats
+    far: float
+
+
+@dataclass(frozen=True)
+class State:
+    """Landmarks, and matched (R,): the landmark of each observation, -1 none; view: the frames that were looked at.
+
+    What follows from these is computed when it is first asked for, and kept. P of the R rays have a landmark.
+    """
+
+    obs: Observations
+    view: CameraFrames
     landmarks: Landmarks
     matched: Ints
 
-    @property
-    def number(self) -> Ints:
+    @cached_property
+    def count(self) -> int:
+        """Number of landmarks, N."""
+        return len(self.landmarks.position)
+
+    @cached_property
+    def assigned(self) -> Ints:
+        """(P,) indices of the rays that have a landmark."""
+        return np.flatnonzero(self.matched >= 0)
+
+    @cached_property
+    def owner(self) -> Ints:
+        """(P,) the landmark of each of these rays."""
+        return self.matched[self.assigned]
+
+    @cached_property
+    def distance(self) -> Floats:
+        """(P,) m, from each of these rays' camera to its landmark."""
+        return np.asarray(np.linalg.norm(self.landmarks.position[self.owner] - self.obs.origin[self.assigned], axis=1))
+
+    @cached_property
+    def variance(self) -> Floats:
+        """(P,) m^2 per axis across, of the landmark's offset from the ray."""
+        return variance(self.obs, self.distance, self.landmarks.noise[self.owner], self.assigned)
+
+    @cached_property
+    def deviation(self) -> Floats:
+        """(P,) by how many of the promised standard deviations the ray passes its landmark."""
+        return np.minimum(normalised_residuals(self.obs, self.landmarks.position[self.owner], of=self.assigned), BEHIND)
+
+    @cached_property
+    def ray_count(self) -> Ints:
         """(N,) rays of each landmark."""
-        return np.bincount(self.matched[self.matched >= 0], minlength=len(self.landmarks))
+        return np.bincount(self.owner, minlength=self.count)
 
-    def labels(self, s: Sightings) -> Ints:
-        """How many rays of each label each landmark has, (N, L)."""
+    @cached_property
+    def label_count(self) -> Ints:
+        """(N, L) how many rays of each label each landmark has."""
         count, labels = self.landmarks.accepts.shape
-        held = self.matched >= 0
-        return np.bincount(self.matched[held] * labels + s.label[held], minlength=count * labels).reshape(count, labels)
+        flat = np.bincount(self.owner * labels + self.obs.label[self.assigned], minlength=count * labels)
+        return flat.reshape(count, labels)
 
-    def kind(self, s: Sightings) -> Ints:
-        """The label (N,) that most rays of each landmark have."""
-        return self.labels(s).argmax(axis=1)
+    @cached_property
+    def label(self) -> Ints:
+        """(N,) the label that most rays of each landmark have."""
+        return self.label_count.argmax(axis=1)
+
+    @cached_property
+    def unassigned(self) -> Ints:
+        """(L,) how many rays of each label have no landmark."""
+        return np.bincount(self.obs.label[self.matched < 0], minlength=self.landmarks.accepts.shape[1])
+
+    @cached_property
+    def class_noise(self) -> Floats:
+        """(L,) by what factor the rays of each label are noisier than promised, drawn to 1 where they are few."""
+        labels, label = len(self.unassigned), self.label[self.owner]
+        number = np.bincount(label, minlength=labels)
+        middle = np.nan_to_num(grouped_median(self.deviation, label, labels)) / RAYLEIGH_MEDIAN
+        return np.clip((number * middle + POOLED_WITH_CLASS) / (number + POOLED_WITH_CLASS), *NOISE_FACTORS)
+
+    @cached_property
+    def noise(self) -> Floats:
+        """(N,) the same factor for each landmark, drawn to that of its class."""
+        middle = np.nan_to_num(grouped_median(self.deviation, self.owner, self.count)) / RAYLEIGH_MEDIAN
+        own, number = np.minimum(middle, NOISE_FACTORS[1]), self.ray_count
+        pooled = number * own + POOLED_WITH_CLASS * self.class_noise[self.label]
+        return np.clip(pooled / (number + POOLED_WITH_CLASS), *NOISE_FACTORS)
+
+    @cached_property
+    def size(self) -> Floats:
+        """(N,) m, geometric mean of width and height, the median over its boxes; 0 without any."""
+        size = np.sqrt(self.obs.size[self.assigned].prod(axis=1)) * self.distance
+        return np.nan_to_num(grouped_median(size, self.owner, self.count))
+
+    @cached_property
+    def ray_sigma(self) -> Floats:
+        """(N,) m, the median standard deviation across of each landmark's rays at its distance; 0 without any."""
+        return np.nan_to_num(grouped_median(np.sqrt(self.variance), self.owner, self.count))
+
+    @cached_property
+    def history(self) -> DetectionHistory:
+        """Where the landmarks were detected or should have been."""
+        return detection_history(self.obs, self.matched, self.landmarks.position, self.label, self.view)
 
     def keep(self, which: Bools) -> State:
-        """Only some of the landmarks (N,); the rays of the others go free."""
+        """Keep some of the landmarks (N,) bool; the rays of the others have none."""
+        if which.all():
+            return self
         number = np.append(np.cumsum(which) - 1, -1)
         kept = np.append(which, False)
-        return State(self.landmarks.take(which), np.where(kept[self.matched], number[self.matched], -1))
+        matched = np.where(kept[self.matched], number[self.matched], -1)
+        return replace(self, landmarks=self.landmarks.take(which), matched=matched)
 
     def merge(self, target: Ints) -> State:
-        """Each landmark made part of another, or of itself: target (N,)."""
+        """Make each landmark part of another one, or leave it: target (N,) says of which, itself to leave it."""
         accepts = np.zeros_like(self.landmarks.accepts)
         np.logical_or.at(accepts, target, self.landmarks.accepts)
-        merged = State(replace(self.landmarks, accepts=accepts), np.append(target, -1)[self.matched])
-        return merged.keep(target == np.arange(len(target)))
-
-
-def variance(s: Sightings, distance: Floats, noise: Floats, of: Ints | slice = slice(None)) -> Floats:
-    """Variance (E,), m^2 per axis across, of the offset of a landmark at `distance` (E,) m from its ray; of: (E,) which."""
-    return np.asarray(noise**2 * ((s.sigma[of] * distance) ** 2 + s.place**2))
-
-
-def offsets(s: Sightings, position: Floats) -> tuple[Floats, Floats]:
-    """How far each ray passes its point (R, 3), squared (inf where that is behind), and how far away that is: (R,), m."""
-    to = position - s.origin
-    depth = np.einsum("ri,ri->r", to, s.direction)
-    distance2 = np.einsum("ri,ri->r", to, to)
-    return np.where(depth > 0, np.maximum(distance2 - depth**2, 0.0), np.inf), np.sqrt(distance2)
-
-
-def range_costs(
-    s: Sightings, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
-) -> Floats:
-    """What the range of a ray adds to the cost of a landmark at `distance` (E,) m, 0 where there is none; of: (E,) which."""
-    measured = s.range[of]
-    if not np.isfinite(measured).any():
-        return np.zeros(len(distance))
-    with np.errstate(invalid="ignore"):
-        wrong = (distance - measured) ** 2 / (s.range_sigma[of] ** 2 + variance_along) - RANGE_GAIN
-    return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
-
-
-def sizes(s: Sightings, state: State) -> Floats:
-    """The size (N,) of each landmark, m: geometric mean of width and height, the median over its boxes; 0 without any."""
-    held = np.flatnonzero(state.matched >= 0)
-    index = state.matched[held]
-    distance = np.linalg.norm(state.landmarks.position[index] - s.origin[held], axis=1)
-    return np.nan_to_num(grouped_median(np.sqrt(s.size[held].prod(axis=1)) * distance, index, len(state.landmarks)))
-
-
-def blurs(s: Sightings, state: State) -> Floats:
-    """One standard deviation (N,), m, of the rays of each landmark at its distance; 0 without any."""
-    held = np.flatnonzero(state.matched >= 0)
-    index, r = state.matched[held], s.take(held)
-    distance = np.linalg.norm(state.landmarks.position[index] - r.origin, axis=1)
-    spread = np.sqrt(variance(r, distance, state.landmarks.noise[index]))
-    return np.nan_to_num(grouped_median(spread, index, len(state.landmarks)))
+        landmarks, matched = replace(self.landmarks, accepts=accepts), np.append(target, -1)[self.matched]
+        return replace(self, landmarks=landmarks, matched=matched).keep(target == np.arange(len(target)))

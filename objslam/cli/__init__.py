@@ -18,7 +18,7 @@ from objslam.cli.live import live
 from objslam.cli.report import report_result
 from objslam.cli.run import run
 from objslam.cli.view import view
-from objslam.errors import ObjslamError
+from objslam.errors import ObjslamError, one_line
 
 app = typer.Typer(
     name="objslam",
@@ -78,9 +78,7 @@ def main() -> NoReturn:
     except Exception as error:  # the last resort: no traceback reaches a user
         if debug:
             raise
-        say(
-            f"objslam: internal error, {type(error).__name__}: {error} (please report it; objslam --debug shows where)",
-            stderr=True,
-        )
+        said = f"{type(error).__name__}: {one_line(error)}"
+        say(f"objslam: internal error, {said} (please report it; objslam --debug shows where)", stderr=True)
         sys.exit(1)
     sys.exit(0)

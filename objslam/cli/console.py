@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from objslam.ledger import Ledger
+    from objslam.core.diagnostics import Ledger
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import typer
 
 import objslam
 from objslam.cli.console import progress_bar, say
-from objslam.cli.evaluate import evaluate_folder
+from objslam.cli.evaluate import print_evaluation
 from objslam.cli.options import Out, settings_of
 from objslam.cli.run import run_log
 
@@ -25,12 +25,12 @@ def demo(
 
     The drive is rendered: a furnished room, RGB-D images, seven objects that the detector shipped with objslam knows.
     """
+    from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError
-    from objslam.ledger import Ledger
-    from objslam.results import prepare_output
+    from objslam.output.result_folder import prepare_output
     from objslam.simulation import preset, simulate
     from objslam.sources import read
-    from objslam.sources.folder import write_log_folder
+    from objslam.sources.log_folder import write_log_folder
 
     prepare_output(out)
     log, model = out / "log", None
@@ -41,7 +41,7 @@ def demo(
     if boxes:
         write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
     else:
-        from objslam.simulation.rendered import RenderSettings, render_drive
+        from objslam.simulation.render import RenderSettings, render_drive
 
         model = Path(objslam.__file__).parent / "models" / "ssd7.onnx"
         with progress_bar() as show:
@@ -58,5 +58,5 @@ def demo(
         say(f"\n[bold]{shown}{f' --detector {model}' if model else ''}[/]", markup=True)
         run_log(read(log, ledger), settings, ledger, out / mode, model)
         # a map from odometry alone begins where the odometry does: how it lies in the room is not its to say
-        evaluate_folder(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
+        print_evaluation(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
     say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: objslam view {out / 'joint'}")

@@ -11,7 +11,7 @@ from objslam.cli.console import console
 from objslam.cli.options import Align, Radius
 
 if TYPE_CHECKING:
-    from objslam.matching import Alignment
+    from objslam.evaluation.alignment import Alignment
 
 
 def evaluate_result(
@@ -24,14 +24,14 @@ def evaluate_result(
     radius: Radius = 0.5,
 ) -> None:
     """Compare a result with ground truth: matched, missed and false objects, position errors, path error."""
-    evaluate_folder(out, truth, align, radius)
+    print_evaluation(out, truth, align, radius)
 
 
-def evaluate_folder(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
+def print_evaluation(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
     """Evaluate a result folder, write evaluation.json into it and print the table."""
-    from objslam import evaluation
-    from objslam.evaluation_table import evaluation_table
+    from objslam.evaluation.evaluate import evaluate_folder, write_evaluation
+    from objslam.evaluation.table import evaluation_table
 
-    found = evaluation.evaluate_folder(out, truth, align=align, radius=radius)
-    evaluation.write_evaluation(found, out)
+    found = evaluate_folder(out, truth, align=align, radius=radius)
+    write_evaluation(found, out)
     console().print(evaluation_table(found))

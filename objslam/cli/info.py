@@ -10,48 +10,31 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import report, say
-from objslam.cli.options import (
-    Anonymous,
-    BaseFrame,
-    CameraInfo,
-    Format,
-    Label,
-    Rectified,
-    Robot,
-    Topics,
-    WithoutRange,
-    source_options,
-)
+from objslam.cli.options import with_options
+from objslam.sources import SourceOptions, choose, read
 
 if TYPE_CHECKING:
+    from objslam.core.arrays import Floats
+    from objslam.core.camera import Camera
     from objslam.sources import SourceOptions
-    from objslam.sources.contents import Contents, Timing
-    from objslam.sources.ros import BagInfo
-    from objslam.types import Camera, Floats
+    from objslam.sources.ros_bag.info import BagInfo
+    from objslam.sources.summary import Contents, Timing
 
-_EPOCH = 1e8  # s; stamps above it count from 1970
-_NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")
+_EPOCH = 1e8  # s; stamps above it count from 1970: no drive lasts 3 years, and no recording is of 1973
+_NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # the columns of numbers, which are flush right
 
 
+@with_options
 def info(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or a data set that is read.")],
-    format_: Format = None,
-    robot: Robot = None,
-    without_range: WithoutRange = False,
-    anonymous: Anonymous = False,
-    label: Label = None,
-    topic: Topics = None,
-    camera_info: CameraInfo = None,
-    base_frame: BaseFrame = None,
-    rectified: Rectified = None,
+    *,
+    options: SourceOptions,
 ) -> None:
     """Say what is inside a recording: streams, rates, gaps, times, the role of each topic, and what a run would miss."""
-    from objslam.ledger import Ledger
-    from objslam.sources import choose, read
-    from objslam.sources.contents import contents
+    from objslam.core.diagnostics import Ledger
+    from objslam.sources.summary import contents
 
-    options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
-    kind = choose(source, format_)
+    kind = choose(source, options.format)
     if kind.name == "ros":
         _show_bag(source, options)
         return
@@ -74,9 +57,9 @@ def _show_log(found: Contents, kind: str) -> None:
 
 
 def _show_bag(source: Path, options: SourceOptions) -> None:
-    from objslam.sources.ros import describe
+    from objslam.sources.ros_bag.info import describe
 
-    bag = describe(source, options.of_bag())
+    bag = describe(source, options)
     files = f"{len(bag.files)} file{'s' if len(bag.files) > 1 else ''}"
     lost = f" ({bag.lost} lost)" if bag.lost else ""
     say(f"{bag.name}: {bag.format}, {files}, {bag.messages} messages{lost}; {_span(bag.start, bag.end)}")
@@ -113,7 +96,7 @@ def _show_places(bag: BagInfo) -> None:
 
 
 def _place(pose: Floats) -> str:
-    from objslam.geometry import quaternion
+    from objslam.core.geometry import quaternion
 
     x, y, z = pose[:3, 3]
     turn = ", ".join(f"{value + 0.0:.4f}" for value in quaternion(pose[None])[0])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from objslam.cli.console import console, say
 
 if TYPE_CHECKING:
-    from objslam.live.interface import Snapshot
+    from objslam.core.snapshot import Snapshot
 
 _LINES = 10.0  # s between status lines where there is no terminal
 

@@ -1,15 +1,21 @@
-"""Options that several commands take."""
+"""Options that several commands take. Those of the sources are declared with the sources, and come in by `with_options`."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from types import GenericAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
+from objslam.sources.options import DETECTOR, Option, flags
+
 if TYPE_CHECKING:
     from objslam.config import Settings
-    from objslam.sources import SourceOptions
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")]
@@ -25,40 +31,7 @@ Align = Annotated[
 Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="An object within this many metres of the truth matches it.")
 ]
-Format = Annotated[str | None, typer.Option("--format", help="What the recording is; guessed if not given.")]
-Robot = Annotated[int | None, typer.Option("--robot", help="MRCLAM: which robot.")]
-WithoutRange = Annotated[bool, typer.Option("--without-range", help="MRCLAM: bearings only.")]
-Anonymous = Annotated[bool, typer.Option("--anonymous", help="MRCLAM: every landmark gets the same label.")]
-DetectorModel = Annotated[
-    Path | None,
-    typer.Option("--detector", help="ONNX model that finds the boxes in the rgb images, in place of those of the log."),
-]
-Label = Annotated[str | None, typer.Option("--label", help="Label for boxes that come without one.")]
-Topics = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        metavar="ROLE=/NAME",
-        help="ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info; "
-        "with several cameras CAMERA.ROLE=/NAME). none: no topic. tf: the path from the transforms. May be repeated.",
-    ),
-]
-CameraInfo = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera-info", help="ROS bags, dds, rclpy: calibration, as in camera.yaml; several cameras below `cameras:`."
-    ),
-]
-BaseFrame = Annotated[
-    str | None, typer.Option("--base-frame", help="ROS bags, dds, rclpy: the frame that is the robot's base.")
-]
-Rectified = Annotated[
-    bool | None,
-    typer.Option(
-        "--rectified/--raw",
-        help="ROS bags, dds, rclpy: images and boxes are those of the rectified image, or not. [default: by name]",
-    ),
-]
+DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
 
 
 def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -> Settings:
@@ -68,28 +41,44 @@ def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -
     return load_settings(config, ((f"mode={mode}",) if mode else ()) + tuple(set_ or ()))
 
 
-def source_options(
-    format_: str | None,
-    robot: int | None,
-    without_range: bool,
-    anonymous: bool,
-    label: str | None,
-    topics: list[str] | None,
-    camera_info: Path | None,
-    base_frame: str | None,
-    rectified: bool | None,
-) -> SourceOptions:
-    """What the options of a command say of a recording."""
-    from objslam.sources import SourceOptions
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Spread the parameter `options` of a command, a class of options, into a flag for each field that has an `Option`."""
+    signature = inspect.signature(command, eval_str=True)
+    kind = signature.parameters["options"].annotation
+    declared = [_Flag(name, type_, option, getattr(kind, name)) for name, (type_, option) in flags(kind).items()]
 
-    return SourceOptions(
-        format=format_,
-        robot=robot,
-        with_range=not without_range,
-        anonymous=anonymous,
-        label=label,
-        topics=tuple(topics or ()),
-        base_frame=base_frame,
-        camera_info=camera_info,
-        rectified=rectified,
-    )
+    @functools.wraps(command)
+    def call(**given: Any) -> None:
+        said = {flag.name: flag.value(given.pop(flag.name)) for flag in declared}
+        command(**given, options=kind(**said))
+
+    parameters: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        parameters += [flag.parameter() for flag in declared] if parameter.name == "options" else [parameter]
+    vars(call)["__signature__"] = signature.replace(parameters=parameters)
+    return call
+
+
+@dataclass(frozen=True)
+class _Flag:
+    """A field of a class of options as a parameter that typer understands, and the value that it stands for."""
+
+    name: str
+    type: Any
+    option: Option
+    default: Any
+
+    def parameter(self) -> inspect.Parameter:
+        annotation, default = self.type, False if self._says_no() else self.default
+        if isinstance(default, tuple):  # typer repeats lists alone
+            annotation, default = GenericAlias(list, get_args(annotation)[0]) | None, None
+        said = typer.Option(default, self.option.flag, help=self.option.help, metavar=self.option.metavar)
+        return inspect.Parameter(self.name, inspect.Parameter.KEYWORD_ONLY, default=said, annotation=annotation)
+
+    def value(self, given: Any) -> Any:
+        if isinstance(self.default, tuple):
+            return tuple(given or ())
+        return not given if self._says_no() else given
+
+    def _says_no(self) -> bool:
+        return self.default is True and "/" not in self.option.flag

@@ -14,12 +14,12 @@ def report_result(
     out: Annotated[Path, typer.Argument(help="A result folder.")],
     log: Annotated[
         Path | None,
-        typer.Option("--log", help="The log that it is from, for the pictures; where it was if not given."),
+        typer.Option("--log", help="The log, for the pictures; by default where it was when it was mapped."),
     ] = None,
     crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Pictures of each object.")] = 4,
 ) -> None:
     """Write report.html into a result folder: map, objects, residuals, evaluation, settings; one file, no network needed."""
-    from objslam.report import write_report
+    from objslam.output.report import write_report
 
     with progress_bar() as show:
         file = write_report(out, log=log, crops=crops, progress=show)

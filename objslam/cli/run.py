@@ -8,58 +8,35 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import console, progress_bar, report, say
-from objslam.cli.options import (
-    Anonymous,
-    BaseFrame,
-    CameraInfo,
-    Config,
-    DetectorModel,
-    Format,
-    Label,
-    Mode,
-    Out,
-    Rectified,
-    Robot,
-    Set,
-    Topics,
-    WithoutRange,
-    settings_of,
-    source_options,
-)
+from objslam.cli.options import Config, DetectorModel, Mode, Out, Set, settings_of, with_options
+from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from objslam.config import Settings
-    from objslam.ledger import Ledger
-    from objslam.types import Log, ObjectMap
+    from objslam.core.diagnostics import Ledger
+    from objslam.core.object_map import ObjectMap
+    from objslam.core.types import Log
 
 
+@with_options
 def run(
     log: Annotated[Path, typer.Argument(help="A log folder, a ROS bag, or anything that `objslam info` knows.")],
     out: Out = Path("out"),
     mode: Mode = None,
     config: Config = None,
     set_: Set = None,
-    format_: Format = None,
-    robot: Robot = None,
-    without_range: WithoutRange = False,
-    anonymous: Anonymous = False,
-    label: Label = None,
-    topic: Topics = None,
-    camera_info: CameraInfo = None,
-    base_frame: BaseFrame = None,
-    rectified: Rectified = None,
+    *,
+    options: SourceOptions,
     detector: DetectorModel = None,
 ) -> None:
     """Map the objects of a log and write the result to a folder."""
-    from objslam.ledger import Ledger
-    from objslam.results import output_folder
-    from objslam.sources import read
+    from objslam.core.diagnostics import Ledger
+    from objslam.output.result_folder import output_folder
 
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
-    options = source_options(format_, robot, without_range, anonymous, label, topic, camera_info, base_frame, rectified)
     with output_folder(out):
         run_log(read(log, ledger, options), settings, ledger, out, detector)
 
@@ -68,8 +45,8 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
     """Map the objects of a log, write the result folder, and say what came of it."""
     import time
 
-    from objslam import offline
-    from objslam.results import write_result
+    from objslam.mapping import pipeline
+    from objslam.output.result_folder import write_result
 
     with progress_bar() as show:
         if detector is not None:
@@ -77,7 +54,7 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
 
             network = load_detector(detector, settings.detector)
             log = detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
-        result = offline.run(log, settings, ledger, show)
+        result = pipeline.run(log, settings, ledger, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
         removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
@@ -102,14 +79,13 @@ def say_written(out: Path, removed: tuple[str, ...]) -> None:
 
 
 def objects_table(objects: ObjectMap) -> Table:
-    import numpy as np
     from rich.table import Table
 
     table = Table(title="objects")
     for name in ("id", "label", "x m", "y m", "z m", "sigma m", "rays", "parallax deg", "rms deg", "status"):
         table.add_column(name, justify="left" if name in ("label", "status") else "right")
     for o in objects.objects:
-        sigma = "" if o.covariance is None else f"{np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.3f}"
+        sigma = "" if o.sigma is None else f"{o.sigma:.3f}"
         place = (f"{x:.3f}" for x in o.position)
         numbers = (str(o.rays), f"{o.parallax_deg:.1f}", f"{o.rms_deg:.2f}")
         table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")

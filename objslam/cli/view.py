@@ -28,22 +28,23 @@ def view(
 ) -> None:
     """Look at a result: the drive, its objects, and how they came about."""
     from objslam.errors import ConfigError
-    from objslam.viewer import program
-    from objslam.viewer.field import write_field
+    from objslam.output.viewer import application
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the viewer must not outlive us
     if web and screenshot is not None:
         raise ConfigError("--web and --screenshot at a time")
     with tempfile.TemporaryDirectory(prefix="objslam-view-") as folder:
         if object_ is None:
-            recording = program.find_recording(out)
+            recording = application.find_rrd(out)
         else:
+            from objslam.output.viewer.field import write_field
+
             recording = Path(folder) / "field.rrd"
             write_field(out, object_, recording)
         if screenshot is not None:
-            program.screenshot([recording], screenshot, at=at)
+            application.screenshot([recording], screenshot, at=at)
             say(f"wrote {screenshot}")
         elif web:
-            program.serve([recording], say)
+            application.serve([recording], say)
         else:
-            program.show([recording])
+            application.show([recording])

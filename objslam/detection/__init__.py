@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from objslam.detection.cache import default_cache
+from objslam.detection.detect_log import detect_log
 from objslam.detection.detector import Boxes, Detector, load_detector
-from objslam.detection.on_log import detect_log
 
 __all__ = ["Boxes", "Detector", "default_cache", "detect_log", "load_detector"]

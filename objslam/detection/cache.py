@@ -1,7 +1,7 @@
 """What a detector found in an image, kept on disk: a second run does not detect again.
 
 One file a detector (its key: model and recipe), one line an image: a checksum, and as JSON the SHA-256 of the image file's
-content and what was found. The content names the image, not its path or time: a log that was moved, copied or rendered anew
+content and what was found. The content names the image, not its path or time: a log that was moved, copied or rendered again
 gets the boxes that are its own. Lines are only ever appended, each in one write, so that processes may share the file;
 what a killed one left half is told by its checksum and passed over.
 """
@@ -18,8 +18,8 @@ from typing import Self
 
 import numpy as np
 
+from objslam.core.diagnostics import Ledger
 from objslam.detection.detector import Boxes
-from objslam.ledger import Ledger
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ import numpy as np
 
 from objslam import config
 from objslam.config import Role
-from objslam.detection.decode import decode
-from objslam.detection.layouts import Output
-from objslam.detection.network import Array, Network, open_network
-from objslam.detection.prepare import Fit, fill, fit
+from objslam.core.arrays import Array, Floats
+from objslam.detection.infer_recipe import input_size, settle, with_description
+from objslam.detection.onnx_model import Network, open_network
+from objslam.detection.output_layouts import Output
+from objslam.detection.postprocess import decode
+from objslam.detection.preprocess import Fit, fill, fit
 from objslam.detection.recipe import Recipe
-from objslam.detection.settle import input_size, settle, with_description
 from objslam.errors import DetectorError
-from objslam.types import Floats
 
 _DECODING = 1  # raised when the same outputs come to give other boxes
 

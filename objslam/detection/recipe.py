@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 
 from objslam.config import Activation, BoxForm, BoxUnits, Colour, Layout, Resize
-from objslam.detection.layouts import Roles
+from objslam.detection.output_layouts import Roles
 
 Three = tuple[float, float, float]
 PLAIN: tuple[Three, Three] = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from objslam.geometry import skew
-from objslam.graph.factors import l_key, x_key
-from objslam.graph.optimise import indeterminate
-from objslam.ledger import Ledger
-from objslam.types import Floats, Ints
+from objslam.core.arrays import Floats, Ints
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import skew
+from objslam.graph.factors.priors import point_prior
+from objslam.graph.optimizers import indeterminate
+from objslam.graph.variables import L0, X0
 
-_HELD = 1.0  # m; a landmark that only this prior holds is not determined
+HELD = 1.0
+"""The standard deviation (m) of a prior that holds landmarks which nothing else does. A landmark that only this prior holds
+is not determined; larger holds less, and lets the linear system become indeterminate."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
@@ -26,16 +29,15 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
         ledger.warn(f"covariances: {indeterminate(error).message}; objects that nothing holds are left unresolved")
     held = graph.clone()
     for j in landmarks.tolist():
-        prior = gtsam.noiseModel.Isotropic.Sigma(3, _HELD)
-        held.push_back(gtsam.PriorFactorPoint3(l_key(j), values.atPoint3(l_key(j)), prior))
+        held.push_back(point_prior(j, values.atPoint3(L0 + j), HELD))
     try:
         covariance = _marginals(held, values, landmarks)
     except RuntimeError as error:
         ledger.warn(f"covariances: {indeterminate(error).message}; no object has one")
         return np.full((len(landmarks), 3, 3), np.nan)
-    held_by_more = np.linalg.eigvalsh(covariance)[:, -1] <= (0.5 * _HELD) ** 2
+    held_by_more = np.linalg.eigvalsh(covariance)[:, -1] <= (0.5 * HELD) ** 2
     without_prior = np.full_like(covariance, np.nan)
-    without_prior[held_by_more] = np.linalg.inv(np.linalg.inv(covariance[held_by_more]) - np.eye(3) / _HELD**2)
+    without_prior[held_by_more] = np.linalg.inv(np.linalg.inv(covariance[held_by_more]) - np.eye(3) / HELD**2)
     return without_prior
 
 
@@ -53,18 +55,22 @@ def seen_covariances(
     try:
         marginals = gtsam.Marginals(graph, values)
         for i, (j, k) in enumerate(zip(landmarks.tolist(), witnesses.tolist(), strict=True)):
-            x, landmark = x_key(k), l_key(j)
-            joint = marginals.jointMarginalCovariance([x, landmark])
-            pose = values.atPose3(x)
-            turn = pose.rotation().matrix().T
-            seen = turn @ (values.atPoint3(landmark) - pose.translation())
-            to_pose, to_point = np.hstack([skew(seen), -np.eye(3)]), turn
-            cross = to_pose @ joint.at(x, landmark) @ to_point.T
-            spread = to_pose @ joint.at(x, x) @ to_pose.T + to_point @ joint.at(landmark, landmark) @ to_point.T
-            covariance[i] = spread + cross + cross.T
+            joint = marginals.jointMarginalCovariance([X0 + k, L0 + j])
+            covariance[i] = in_camera(joint, k, j, values.atPose3(X0 + k).matrix(), values.atPoint3(L0 + j))
     except RuntimeError as error:
         ledger.warn(f"covariances: {indeterminate(error).message}; objects far from the start are left unresolved")
     return covariance
+
+
+def in_camera(joint: gtsam.JointMarginal, k: int, j: int, map_T_camera: Floats, point: Floats) -> Floats:
+    """Covariance (3, 3), m^2, of L(j) at a point (3,) in the frame of X(k) at map_T_camera (4, 4), of their joint one."""
+    x, landmark = X0 + k, L0 + j
+    to_point = map_T_camera[:3, :3].T
+    seen = to_point @ (point - map_T_camera[:3, 3])
+    to_pose = np.hstack([skew(seen), -np.eye(3)])
+    cross = to_pose @ joint.at(x, landmark) @ to_point.T
+    spread = to_pose @ joint.at(x, x) @ to_pose.T + to_point @ joint.at(landmark, landmark) @ to_point.T
+    return np.asarray(spread + cross + cross.T)
 
 
 def largest_sigma(covariances: Floats) -> Floats:
@@ -77,7 +83,7 @@ def largest_sigma(covariances: Floats) -> Floats:
 
 def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints) -> Floats:
     marginals = gtsam.Marginals(graph, values)
-    covariance = np.array([marginals.marginalCovariance(l_key(j)) for j in landmarks.tolist()]).reshape(-1, 3, 3)
+    covariance = np.array([marginals.marginalCovariance(L0 + j) for j in landmarks.tolist()]).reshape(-1, 3, 3)
     if not np.isfinite(covariance).all():
         raise RuntimeError("a marginal covariance is not finite")
     return covariance

@@ -1,1 +1,4 @@
-"""Live: the map while the robot drives. The session knows no middleware; an adapter brings the messages, a file each."""
+"""Live: the map while the robot drives, shown and published as it grows.
+
+A log that is complete is mapped by `mapping`; the session here shares its rooms with it, but for the driver.
+"""

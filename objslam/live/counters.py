@@ -7,9 +7,11 @@ from collections import Counter, deque
 
 import numpy as np
 
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.sources.journal.records import FrameMessage
 
-_WINDOW = 2000  # updates that the percentiles are of
+_WINDOW = 2000
+"""Updates that the percentiles are of; more follow a change later."""
 
 
 class _Guarded(Ledger):
@@ -46,8 +48,13 @@ class Counters:
         """One more message dropped for a reason."""
         self.ledger.drop(reason, count, where)
 
+    def drop_frame(self, frame: FrameMessage, reason: str) -> None:
+        """One more frame that is not looked at, and its boxes."""
+        self.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
+        self.drop(reason.replace("frames", "boxes", 1), count=len(frame.labels))
+
     def updated(self, seconds: float) -> None:
-        """A frame is in the map so many seconds after it was pushed."""
+        """A frame is in the map; seconds: from its push until then."""
         with self._lock:
             self._seconds.append(seconds)
 

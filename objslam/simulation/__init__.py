@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.geometry import lift_se2
-from objslam.simulation.motion import START, Path, localization, odometry
+from objslam.core.geometry import lift_se2
+from objslam.core.types import CameraLog, Log, Trajectory, Truth, TruthObject
+from objslam.simulation.detector import Boxes, detect, detections, imagine, views
 from objslam.simulation.scene import furnish, roam
 from objslam.simulation.settings import PRESETS, DepthNoise, DriveSettings, PoseNoise, make_camera, pair, preset
-from objslam.simulation.sight import Boxes, detect, detections, imagine, views
-from objslam.types import CameraLog, Log, Trajectory, Truth, TruthObject
+from objslam.simulation.trajectory import START, Path, localization, odometry
 
 __all__ = ["PRESETS", "DepthNoise", "DriveSettings", "PoseNoise", "make_camera", "pair", "preset", "simulate"]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import lift_se2
 from objslam.errors import ConfigError
-from objslam.geometry import lift_se2
 from objslam.simulation.shapes import Material, Part, Pattern, ball, box, make_object, paint, torus, turned
-from objslam.types import Floats, Ints
 
 CEILING = 2.6
 """m."""
@@ -45,7 +45,7 @@ def furnish_room(size: tuple[float, float], labels: Sequence[str], rng: np.rando
     """A room of a size along x and y (m), the middle of its floor at the origin, with objects of the given labels.
 
     Furniture stands along the walls and reaches at most 0.6 m into the room; each object stands on a piece of it, next to
-    other things. ConfigError where the furniture has no place for so many objects.
+    other things. ConfigError where the furniture has no place for all the objects.
     """
     parts = [*_shell(size, rng)]
     spots = []

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from objslam.geometry import inverse
-from objslam.rays import project, undistort
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera, in_field, project, undistort
+from objslam.core.geometry import inverse
 from objslam.simulation.furniture import Room
-from objslam.types import Camera, Floats, Ints
 
 Reals = NDArray[np.floating]
 
@@ -102,12 +102,12 @@ class Caster:
     def full_sizes(self, map_T_camera: Floats, chosen: Ints) -> Floats:
         """Width and height (M, 2), px, of the boxes that the chosen objects (M,) would have in an image without edges.
 
-        inf where an object reaches behind the camera.
+        inf where an object reaches out of the lens' field.
         """
         sizes = np.full((len(chosen), 2), np.inf)
         for i, number in enumerate(chosen):
             local = self._local(number, map_T_camera)
-            if local[:, 2].min() >= NEAR:
+            if local[:, 2].min() >= NEAR and in_field(self.camera, local).all():
                 sizes[i] = np.ptp(project(self.camera, local), axis=0)
         return sizes
 

@@ -9,12 +9,13 @@ from itertools import count, islice
 import numpy as np
 from scipy.spatial import cKDTree
 
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import lift_se2
+from objslam.core.types import label_table
 from objslam.errors import ConfigError
-from objslam.geometry import lift_se2
-from objslam.simulation.motion import START, Path
+from objslam.simulation.detector import views
 from objslam.simulation.settings import DriveSettings
-from objslam.simulation.sight import views
-from objslam.types import Bools, Floats, Ints, label_table
+from objslam.simulation.trajectory import START, Path
 
 EXTENTS = {
     "cup": (0.09, 0.11),

@@ -10,9 +10,9 @@ from pydantic import Field, InstanceOf, model_validator
 
 from objslam import config
 from objslam.config import NotNegative, Positive, Section
+from objslam.core.camera import Camera, DistortionModel
+from objslam.core.geometry import make_pose
 from objslam.errors import ConfigError
-from objslam.geometry import make_pose
-from objslam.types import Camera, DistortionModel
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -113,7 +113,7 @@ class DriveSettings(Section):
     """boxes carry a depth."""
     tracks: Literal["none", "broken", "perfect"] = "none"
     """track ids of the boxes: `perfect` ones are the objects' ids in the truth (moving objects come after them), `broken`
-    ones start anew after a second out of sight; boxes of nothing have none."""
+    ones start again after a second out of sight; boxes of nothing have none."""
 
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
     """its drift: a random walk with the way (floors are for estimators: unused), or so much a frame; None: no odometry."""

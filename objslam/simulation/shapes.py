@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from objslam.types import Floats, Ints
+from objslam.core.arrays import Floats, Ints
 
 Pattern = Literal["plain", "noise", "stripes", "checks"]
 

@@ -1,142 +1,129 @@
 """Sources: whatever a robot recorded, read into a `Log`.
 
-One file a kind of recording. `SOURCES` is the table of them: a new kind is one more file and one more row.
+`SOURCES` is the table of the kinds of recordings, one file or folder each; messages that come live are in `live`. A new kind
+is one more file and one more row. If it has options of its own, it declares them as `options` says, and `SourceOptions`
+inherits them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from objslam.errors import ConfigError, LogError
-from objslam.ledger import Ledger
-from objslam.sources import folder, mrclam, ros, tum
-from objslam.types import Log
+from objslam.sources.mrclam import MrclamOptions
+from objslam.sources.options import AnyOptions, names, unused
+from objslam.sources.ros_bag.options import BagOptions
+from objslam.sources.tum_rgbd import TumOptions
+
+if TYPE_CHECKING:
+    from objslam.core.diagnostics import Ledger
+    from objslam.core.types import Log
 
 
 @dataclass(frozen=True)
-class SourceOptions:
-    """What a recording does not say itself.
-
-    format: the name of a source, None to guess it. robot: which one, where there are several. with_range: whether measured
-    depths are used. anonymous: whether landmarks that tell who they are get one label. label: for boxes without a class.
-    ROS bags: topics, base_frame, camera_info, rectified, extract and with_images are what `ros.BagOptions` says.
-    """
-
-    format: str | None = None
-    robot: int | None = None
-    with_range: bool = True
-    anonymous: bool = False
-    label: str | None = None
-    topics: tuple[str, ...] = ()
-    base_frame: str | None = None
-    camera_info: Path | None = None
-    rectified: bool | None = None
-    extract: Path | None = None
-    with_images: bool = True
-
-    def of_bag(self) -> ros.BagOptions:
-        """Those of the options that a ROS bag takes."""
-        return ros.BagOptions(**{field.name: getattr(self, field.name) for field in fields(ros.BagOptions)})
+class SourceOptions(BagOptions, TumOptions, MrclamOptions, AnyOptions):
+    """What a recording of any kind does not say itself: the options of all sources, the last class's first in `--help`."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A kind of recording: how to tell it, in words and as a function, how to read it, and which options it takes."""
+    """A kind of recording.
+
+    Attributes:
+        name: what `--format` calls it.
+        looks_for: how to tell it, in words.
+        detector: "module:function", where function(path) says whether a path is one; imported when it is first asked.
+        reader: "module:function", where function(path, ledger) reads one, or function(path, ledger, options).
+        options: the class of the options that it takes, which `SourceOptions` inherits; None: it takes none.
+    """
 
     name: str
     looks_for: str
-    detects: Callable[[Path], bool]
-    reads: Callable[[Path, Ledger, SourceOptions], Log]
-    takes: frozenset[str] = frozenset()
+    detector: str
+    reader: str
+    options: type[Any] | None = None
+
+    def detects(self, path: Path) -> bool:
+        """Whether a path is a recording of this kind."""
+        return bool(_function(self.detector)(path))
+
+    def reads(self, path: Path, ledger: Ledger, options: SourceOptions) -> Log:
+        """Read a recording of this kind; LogError where it cannot be read."""
+        log: Log = _function(self.reader)(path, ledger, *((options,) if self.options is not None else ()))
+        return log
 
 
-def _read_log(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    return folder.read_log_folder(path, ledger)
+def _function(place: str) -> Callable[..., Any]:
+    module, _, name = place.partition(":")
+    found: Callable[..., Any] = getattr(import_module(f"objslam.{module}"), name)
+    return found
 
 
-def _read_mrclam(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    with_range, anonymous = options.with_range, options.anonymous
-    return mrclam.read_mrclam(path, options.robot, with_range=with_range, anonymous=anonymous, ledger=ledger)
-
-
-def _read_tum_numbered(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    return tum.read_numbered(path, ledger, label=options.label or "object", with_range=options.with_range)
-
-
-def _read_tum(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    return tum.read_stamped(path, ledger, label=options.label or "object", with_range=options.with_range)
-
-
-def _read_ros(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    return ros.read_bag(path, ledger, options.of_bag())
-
-
-def _is_journal(path: Path) -> bool:
-    from objslam.live.journal import is_journal
-
-    return is_journal(path)
-
-
-def _read_journal(path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-    from objslam.live.journal import read_journal
-
-    return read_journal(path, ledger)
-
-
-SOURCES: tuple[Source, ...] = (
-    Source("log", "camera.yaml or cameras/ with odometry.txt or localization.txt", folder.is_log_folder, _read_log),
+SOURCES = (
+    Source(
+        "log",
+        "camera.yaml or cameras/ with odometry.txt or localization.txt",
+        "sources.log_folder:is_log_folder",
+        "sources.log_folder:read_log_folder",
+    ),
     Source(
         "mrclam",
         "Barcodes.dat and Robot<n>_Odometry.dat (or .dat.gz)",
-        mrclam.is_mrclam,
-        _read_mrclam,
-        frozenset({"robot", "with_range", "anonymous"}),
+        "sources.mrclam.reader:is_mrclam",
+        "sources.mrclam.reader:read_mrclam",
+        MrclamOptions,
     ),
     Source(
         "tum_numbered",
         "truth_cam_poses.txt and boxes/<number>*.txt",
-        tum.is_numbered,
-        _read_tum_numbered,
-        frozenset({"label", "with_range"}),
+        "sources.tum_rgbd.reader:is_numbered",
+        "sources.tum_rgbd.reader:read_numbered",
+        TumOptions,
     ),
     Source(
         "tum",
         "groundtruth.txt (or .gz) and rgb.txt, or boxes in <stamp>.txt in a folder or tar archive",
-        tum.is_stamped,
-        _read_tum,
-        frozenset({"label", "with_range"}),
+        "sources.tum_rgbd.reader:is_stamped",
+        "sources.tum_rgbd.reader:read_stamped",
+        TumOptions,
     ),
-    Source("journal", "journal.objslam, what a live session accepted", _is_journal, _read_journal),
+    Source(
+        "journal",
+        "journal.objslam, what a live session accepted",
+        "sources.journal.file:is_journal",
+        "sources.journal.file:read_journal",
+    ),
     Source(
         "ros",
         "a ROS bag (.bag, .mcap, .db3, also .zstd), or a folder with one",
-        ros.is_bag,
-        _read_ros,
-        frozenset(field.name for field in fields(ros.BagOptions)),
+        "ros.bag.recording:is_bag",
+        "sources.ros_bag.log:read_bag",
+        BagOptions,
     ),
 )
-
-
-_FLAGS = {"topics": "--topic", "with_range": "--without-range"}
-"""What the command line calls an option, where that is not its name here."""
+"""The kinds of recordings in the order in which they are looked for: the first that fits is taken."""
 
 
 def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
-    """Read a recording of any kind that `SOURCES` lists; the kind is guessed from what the path holds unless it is given.
+    """Read a recording of any kind that `SOURCES` lists.
 
-    An option that the kind does not take is named in a warning. LogError where nothing fits or the recording cannot be read;
-    ConfigError for a format that does not exist.
+    Args:
+        path: what was recorded; its kind is guessed from what it holds unless the options name it.
+        ledger: takes what was dropped, and a warning of each option that the kind does not take.
+        options: what the recording does not say itself.
+    Raises:
+        LogError: when nothing fits or the recording cannot be read.
+        ConfigError: for a format that does not exist.
     """
     options = options or SourceOptions()
     source = choose(path, options.format)
-    default = SourceOptions()
-    for option in (field.name for field in fields(options) if field.name != "format"):
-        if option not in source.takes and getattr(options, option) != getattr(default, option):
-            flag = _FLAGS.get(option, f"--{option.replace('_', '-')}")
-            ledger.warn(f"{path}: {flag} has no meaning for a {source.name} recording")
+    for flag in unused(options, SourceOptions, names(source.options, AnyOptions)):
+        ledger.warn(f"{path}: {flag} has no meaning for a {source.name} recording")
     return replace(source.reads(path, ledger, options), path=path.resolve())
 
 
@@ -144,14 +131,16 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
     """Read a recording of any kind and write it as a log folder, with the images and depth images that it brings.
 
     Images that a recording holds inside it are extracted right beside the log folder and then take their place in it: they
-    are written once. Errors as in `read` and `folder.write_log_folder`.
+    are written once. Errors as in `read` and `log_folder.write_log_folder`.
     """
-    takes = choose(source, options.format).takes
-    folder.check_target(log, overwrite)
+    from objslam.sources import log_folder
+
+    kind = choose(source, options.format)
+    log_folder.check_target(log, overwrite)
     with ExitStack() as stack:
-        if "extract" in takes and options.extract is None:
-            options = replace(options, extract=stack.enter_context(folder.beside(log)))
-        folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
+        if "extract" in names(kind.options) and options.extract is None:
+            options = replace(options, extract=stack.enter_context(log_folder.beside(log)))
+        log_folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
 
 
 def choose(path: Path, name: str | None = None) -> Source:
@@ -166,8 +155,10 @@ def choose(path: Path, name: str | None = None) -> Source:
         for source in SOURCES:
             if source.detects(path):
                 return source
-        if folder.resembles_log(path):  # reading it says what is missing
-            return SOURCES[0]
+        from objslam.sources.log_folder import resembles_log
+
+        if resembles_log(path):  # reading it says what is missing
+            return choose(path, "log")
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
     if (path / "objects.json").is_file() and (path / "summary.json").is_file():

@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from objslam.association.search import associate
+from objslam.association.global_association import associate_globally
 from objslam.config import Settings
-from objslam.geometry import inverse, widest_angle
-from objslam.keyframes import build_keyframes
-from objslam.ledger import Ledger
-from objslam.matching import match
-from objslam.rays import build_rays, project
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera, project
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse, widest_angle
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.evaluation.alignment import match_points
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
 from objslam.simulation import DriveSettings, make_camera, simulate
-from objslam.triangulation import triangulate
-from objslam.types import Association, Bools, Camera, Floats, Ints, Keyframes, Rays
+from objslam.triangulation.triangulate import triangulate
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Scene:
     def associate(self, settings: Settings | None = None, **changes: Any) -> Association:
         rays = changes.pop("rays", self.rays)
         keyframes = changes.pop("keyframes", self.keyframes)
-        return associate(
+        return associate_globally(
             rays,
             keyframes,
             self.cameras,
@@ -59,7 +61,7 @@ class Scene:
     def compare(self, association: Association, radius: float = 0.5) -> tuple[Ints, Ints, Floats]:
         """Matched objects and points, and their errors, m."""
         positions = self.place(association)
-        found, true = match(positions, self.points, association.label[:, None] == self.label, radius)
+        found, true = match_points(positions, self.points, association.label[:, None] == self.label, radius)
         return found, true, np.linalg.norm(positions[found] - self.points[true], axis=1)
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import expit, softmax
 
-from objslam.detection.decode import decode, suppress
-from objslam.detection.prepare import fill, fit
+from objslam.detection.postprocess import decode, suppress
+from objslam.detection.preprocess import fill, fit
 from objslam.detection.recipe import HABITS, InputSize, Recipe
 from objslam.errors import DetectorError
 

@@ -7,7 +7,7 @@ from tiny_models import COLOURS, IMAGENET, SCORE, scene, tiny_model
 
 from objslam.config import Detector as Settings
 from objslam.detection import load_detector
-from objslam.detection.network import Network
+from objslam.detection.onnx_model import Network
 
 ONE = [[100, 60, 260, 200], [300, 250, 420, 430], [500, 40, 560, 130]]
 TWO = [[40, 300, 180, 440], [330, 20, 530, 160], [400, 200, 600, 400]]

@@ -13,11 +13,11 @@ from tiny_models import COLOURS, SCORE, scene, tiny_model
 
 from objslam.config import Detector as Settings
 from objslam.config import dump_settings, load_settings
+from objslam.core.coco import COCO_NAMES
 from objslam.detection import load_detector
-from objslam.detection.layouts import Facts, Output, recognise
-from objslam.detection.names import KNOWN, names_from_metadata
+from objslam.detection.class_names import KNOWN, names_from_metadata
+from objslam.detection.output_layouts import Facts, Output, recognise
 from objslam.errors import ConfigError, DetectorError
-from objslam.sources.coco import COCO_NAMES
 
 ONE = [[100, 60, 260, 200], [300, 250, 420, 430], [500, 40, 560, 130]]
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from objslam.types import Floats
+from objslam.core.arrays import Floats
 
 
 def eq1_factor(pose_key: int, point_key: int, direction: Floats, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:

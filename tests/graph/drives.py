@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from objslam.association.by_label import associate_by_label
+from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import Odometry, Settings, load_settings
-from objslam.geometry import align, interpolate
-from objslam.graph.batch import Estimate, solve_fixed, solve_joint
-from objslam.graph.placing import triangulate_at
-from objslam.keyframes import build_keyframes
-from objslam.ledger import Ledger
-from objslam.rays import angles_off, build_rays
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
+from objslam.core.geometry import align, angles_off, interpolate
+from objslam.core.types import Association, Keyframes, Log, Rays, Trajectory
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.graph.batch_solver import solve_fixed, solve_joint
+from objslam.graph.fixed_pose_triangulation import triangulate_at
 from objslam.simulation import preset, simulate
-from objslam.types import Association, Floats, Keyframes, Log, Rays, Trajectory
 
 ODOMETRY_ALONE: dict[str, Any] = {"localization": None, "odometry": Odometry()}
 

@@ -9,11 +9,17 @@ from custom_factor import eq1_factor, eq1_fixed_factor
 from gtsam.utils.numerical_derivative import numericalDerivative21, numericalDerivative22
 
 from objslam.config import Settings
-from objslam.geometry import adjoint, exp_se3, inverse, lift_se2, make_pose
-from objslam.graph import factors
-from objslam.types import Keyframes
+from objslam.core.geometry import adjoint, exp_se3, inverse, lift_se2, make_pose
+from objslam.core.statistics import CAUCHY_K, HUBER_K
+from objslam.core.types import Keyframes
+from objslam.graph.factors.bearing import bearings, point_to_line, point_to_line_fixed
+from objslam.graph.factors.localization import localizations
+from objslam.graph.factors.noise import robust
+from objslam.graph.factors.odometry import betweens, motions
+from objslam.graph.factors.range import along_ray, ranges
+from objslam.graph.variables import L0, X0
 
-X, L = factors.x_key(0), factors.l_key(0)
+X, L = (X0 + 0), (L0 + 0)
 
 
 def scene(seed: int):
@@ -54,7 +60,7 @@ def test_point_to_line_is_eq1(seed, behind):
         point = 2 * pose[:3, 3] - point
     values = values_of(pose, point)
     unit2, unit3 = gtsam.noiseModel.Unit.Create(2), gtsam.noiseModel.Unit.Create(3)
-    compiled = factors.point_to_line(np.array([0]), direction[None], np.array([0]), [unit2])[0]
+    compiled = point_to_line(np.array([0]), direction[None], np.array([0]), [unit2])[0]
     oracle = eq1_factor(X, L, direction, unit3)
     truth = distance * np.sin(angle)
     assert np.linalg.norm(oracle.unwhitenedError(values)) == pytest.approx(truth, rel=1e-9)
@@ -72,7 +78,7 @@ def test_point_to_line_has_the_whole_information_on_the_ray(seed):
     pose, direction, _, _, distance = scene(seed)
     values = values_of(pose, pose[:3, 3] + distance * pose[:3, :3] @ direction)
     noise = gtsam.noiseModel.Isotropic.Sigma
-    compiled = factors.point_to_line(np.array([0]), direction[None], np.array([0]), [noise(2, 0.1)])[0]
+    compiled = point_to_line(np.array([0]), direction[None], np.array([0]), [noise(2, 0.1)])[0]
     a = information(compiled, values, [X, L])
     b = information(eq1_factor(X, L, direction, noise(3, 0.1)), values, [X, L])
     np.testing.assert_allclose(a, b, atol=1e-5 * np.abs(b).max())
@@ -89,7 +95,7 @@ def numerical(factor, pose, point, step):
 @pytest.mark.parametrize("seed", range(10))
 def test_point_to_line_jacobians_are_numerical_derivatives(seed):
     pose, direction, point, _, _ = scene(seed)
-    factor = factors.point_to_line(np.array([0]), direction[None], np.array([0]), [gtsam.noiseModel.Unit.Create(2)])[0]
+    factor = point_to_line(np.array([0]), direction[None], np.array([0]), [gtsam.noiseModel.Unit.Create(2)])[0]
     # at 1e7 m the differences of rounded coordinates limit the numerical side: hence the long step
     by_pose, by_point = numerical(factor, pose, point, 1e-3)
     jacobian = factor.linearize(values_of(pose, point)).jacobian()[0]
@@ -104,7 +110,7 @@ def test_bearing_residual_is_the_angle_and_its_jacobians_the_derivatives_near_th
     off /= np.linalg.norm(off)
     angle = np.radians(0.5)
     point = pose[:3, 3] + pose[:3, :3] @ (distance * (np.cos(angle) * direction + np.sin(angle) * off))
-    factor = factors.bearing(np.array([0]), direction[None], np.array([0]), [gtsam.noiseModel.Unit.Create(2)])[0]
+    factor = bearings(np.array([0]), direction[None], np.array([0]), [gtsam.noiseModel.Unit.Create(2)])[0]
     values = values_of(pose, point)
     assert np.linalg.norm(factor.unwhitenedError(values)) == pytest.approx(angle, rel=1e-4)
     # GTSAM takes the chart's derivative at the measured direction: exact on the ray, off like the angle beside it
@@ -135,10 +141,10 @@ def test_fixed_point_to_line_has_the_optimum_of_the_oracle():
     optima = []
     for dimension in (2, 3):
         # a kink well above rounding: both graphs then have a smooth cost with one minimum
-        noise = factors.robust("l1", np.ones(12), dimension, 1e-2)
+        noise = robust("l1", np.ones(12), dimension, 1e-2)
         graph = gtsam.NonlinearFactorGraph()
         if dimension == 2:
-            made = factors.point_to_line_fixed(origins, directions, np.zeros(12, dtype=int), noise)
+            made = point_to_line_fixed(origins, directions, np.zeros(12, dtype=int), noise)
         else:
             made = [eq1_fixed_factor(L, m, n, model) for m, n, model in zip(origins, directions, noise, strict=True)]
         for factor in made:
@@ -173,7 +179,7 @@ def planar_keyframes(xy_yaw, drift):
 def test_motion_is_the_odometry_moved_to_the_camera():
     keyframes = planar_keyframes([[0, 0, 0.3], [1.0, 0.5, 0.9]], np.zeros((2, 6, 6)))
     settings = Settings()
-    motion, covariance = factors.motions(keyframes, settings)
+    motion, covariance = motions(keyframes, settings)
     extrinsics = keyframes.base_T_camera[0]
     odo = inverse(keyframes.odom_T_base[0]) @ keyframes.odom_T_base[1]
     np.testing.assert_allclose(motion[0], inverse(extrinsics) @ odo @ extrinsics, atol=1e-12)
@@ -187,7 +193,7 @@ def test_motion_is_the_odometry_moved_to_the_camera():
 def test_losses_cost_what_their_formulas_say(sigma):
     distance = np.array([0.01, 0.5, 1.5, 4, 30]) * sigma  # on both sides of every kink
     kink = 1e-3 * sigma
-    r, k, c = distance / sigma, factors.HUBER_K, factors.CAUCHY_K
+    r, k, c = distance / sigma, HUBER_K, CAUCHY_K
     expected = {
         "l1": r - 0.5e-3,
         "huber": np.where(r <= k, r**2 / 2, k * r - k**2 / 2),
@@ -195,7 +201,7 @@ def test_losses_cost_what_their_formulas_say(sigma):
         "gnc": r**2 / 2,
     }
     for loss, cost in expected.items():
-        (model,) = factors.robust(loss, np.array([sigma]), 3, kink)
+        (model,) = robust(loss, np.array([sigma]), 3, kink)
         prior = gtsam.PriorFactorPoint3(L, np.zeros(3), model)
         found = []
         for d in distance:
@@ -207,56 +213,74 @@ def test_losses_cost_what_their_formulas_say(sigma):
 
 def test_noise_models_are_shared_where_sigmas_agree_to_three_digits():
     sigmas = np.array([0.0100, 0.010001, 0.0102, 0.0100, 12.341, 12.342])
-    models = factors.robust("huber", sigmas, 2)
+    models = robust("huber", sigmas, 2)
     assert models[0] is models[1]
     assert models[0] is models[3]
     assert models[0] is not models[2]
     assert models[4] is models[5]
-    assert factors.robust("huber", np.zeros(0), 2) == []
+    assert robust("huber", np.zeros(0), 2) == []
 
 
 def test_a_range_along_a_ray_says_nothing_across_it():
     rng = np.random.default_rng(4)
     origin, n = rng.normal(size=3), np.array([2.0, -1, 2]) / 3
-    (factor,) = factors.along_ray(origin[None], n[None], np.array([4.0]), np.array([0.1]), np.array([0]))
+    (factor,) = along_ray(origin[None], n[None], np.array([4.0]), np.array([0.1]), np.array([0]))
     for along in (-0.1, 0.0, 0.2):
         values = gtsam.Values()
         values.insert(L, origin + (4.0 + along) * n + 7.0 * np.cross(n, [0.6, 0, 0.8]))
         r = abs(along) / 0.1
-        k = factors.HUBER_K
+        k = HUBER_K
         assert factor.error(values) == pytest.approx(r**2 / 2 if r <= k else k * r - k**2 / 2, abs=1e-9)
 
 
 def test_a_range_is_the_distance_from_the_camera():
     pose, _, point, _, distance = scene(1)
-    (factor,) = factors.ranges(np.array([0]), np.array([distance + 0.3]), np.array([0]), [gtsam.noiseModel.Unit.Create(1)])
+    (factor,) = ranges(np.array([0]), np.array([distance + 0.3]), np.array([0]), [gtsam.noiseModel.Unit.Create(1)])
     assert factor.unwhitenedError(values_of(pose, point))[0] == pytest.approx(-0.3)
 
 
 def test_betweens_tie_each_keyframe_to_the_next():
     keyframes = planar_keyframes([[0, 0, 0], [1, 0, 0.2], [1.5, 1, 0.5]], np.zeros((3, 6, 6)))
-    made = factors.betweens(*factors.motions(keyframes, Settings()), 5)
+    made = betweens(*motions(keyframes, Settings()), 5)
     values = gtsam.Values()
     for k, pose in enumerate(keyframes.odom_T_base @ keyframes.base_T_camera):
-        values.insert(factors.x_key(5 + k), gtsam.Pose3(pose))
+        values.insert((X0 + 5 + k), gtsam.Pose3(pose))
     assert [list(factor.keys()) for factor in made] == [
-        [factors.x_key(5), factors.x_key(6)],
-        [factors.x_key(6), factors.x_key(7)],
+        [(X0 + 5), (X0 + 6)],
+        [(X0 + 6), (X0 + 7)],
     ]
     for factor in made:
         np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-12)
 
 
+def test_betweens_are_only_of_what_was_measured():
+    keyframes = planar_keyframes([[0, 0, 0], [1, 0, 0.2], [1.5, 1, 0.5], [2, 1, 0.5]], np.zeros((4, 6, 6)))
+    keyframes = replace(keyframes, localized_every=1.0, stretch=np.array([0, 0, -1, -1]))
+    made = betweens(*motions(keyframes, Settings()), 0, keyframes.measured)
+    assert [list(factor.keys()) for factor in made] == [[X0 + 0, X0 + 1]]
+
+
+def test_each_stretch_of_the_odometry_has_a_plane_of_its_own():
+    keyframes = planar_keyframes([[0, 0, 0], [1, 0, 0.2], [1.5, 1, 0.5], [2, 1, 0.5]], np.zeros((4, 6, 6)))
+    _, flat = motions(keyframes, Settings())
+    tilted = keyframes.odom_T_base.copy()
+    tilted[2:] = make_pose(np.array([[1.0, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]), np.ones(3)) @ tilted[2:]
+    stretches = replace(keyframes, odom_T_base=tilted, localized_every=1.0, stretch=np.array([0, 0, 1, 1]))
+    for steps in (stretches, replace(stretches, stretch=np.array([3, 3, -1, -1]))):
+        _, covariance = motions(steps, Settings())
+        np.testing.assert_allclose(covariance[0], flat[0], atol=1e-12)
+
+
 def test_motions_need_odometry():
     keyframes = replace(planar_keyframes([[0, 0, 0], [1, 0, 0]], None), odom_T_base=None)
     with pytest.raises(ValueError, match="odometry"):
-        factors.motions(keyframes, Settings())
+        motions(keyframes, Settings())
 
 
 def test_localisations_hold_the_camera_as_the_base_is_known():
     keyframes = replace(planar_keyframes([[3, -2, 0.7], [1, 0, 0]], None), localized_every=4.0)
     settings = Settings()
-    first, _ = factors.localizations(keyframes, settings)
+    first, _ = localizations(keyframes, settings)
     extrinsics, base = keyframes.base_T_camera[0], keyframes.map_T_base[0]
     at, planar = settings.localization, settings.planar
     sigmas = 2.0 * np.array([planar.tilt, planar.tilt, at.yaw, at.xy, at.xy, planar.z])  # four share one: twice as unsure

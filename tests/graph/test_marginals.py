@@ -6,11 +6,12 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from objslam.geometry import inverse
-from objslam.graph import factors
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse
+from objslam.graph.factors.bearing import bearings
 from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
-from objslam.graph.optimise import build_graph, make_values
-from objslam.ledger import Ledger
+from objslam.graph.optimizers import build_graph
+from objslam.graph.variables import L0, X0, make_values
 
 POINTS = np.array([[4.0, 1, 0], [0, 5, 1], [-3, 2, 0.5]])
 CAMERAS = np.tile(np.eye(4), (3, 1, 1))
@@ -23,19 +24,19 @@ def sightings(pairs, sigma=0.01):
     to = POINTS[point] - CAMERAS[camera, :3, 3]
     directions = to / np.linalg.norm(to, axis=1, keepdims=True)
     noise = [gtsam.noiseModel.Isotropic.Sigma(2, sigma)] * len(pairs)
-    return factors.bearing(camera, directions, point, noise)
+    return bearings(camera, directions, point, noise)
 
 
 def anchors(cameras, sigma=1e-3):
     return [
-        gtsam.PriorFactorPose3(factors.x_key(k), gtsam.Pose3(CAMERAS[k]), gtsam.noiseModel.Isotropic.Sigma(6, sigma))
+        gtsam.PriorFactorPose3((X0 + k), gtsam.Pose3(CAMERAS[k]), gtsam.noiseModel.Isotropic.Sigma(6, sigma))
         for k in cameras
     ]
 
 
 def dense(graph, values, landmark):
     """The block of the inverse of the whole information matrix."""
-    keys = [factors.x_key(k) for k in range(3)] + [factors.l_key(j) for j in range(3)]
+    keys = [(X0 + k) for k in range(3)] + [(L0 + j) for j in range(3)]
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
@@ -61,7 +62,7 @@ def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():
     assert np.isnan(covariance[2]).all()
     # the same graph with the loose landmark held: that changes nothing for the others, for nothing ties it to them
     sure = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
-    sure.push_back(gtsam.PriorFactorPoint3(factors.l_key(2), POINTS[2], gtsam.noiseModel.Isotropic.Sigma(3, 1)))
+    sure.push_back(gtsam.PriorFactorPoint3((L0 + 2), POINTS[2], gtsam.noiseModel.Isotropic.Sigma(3, 1)))
     for j in range(2):
         np.testing.assert_allclose(covariance[j], dense(sure, values, j), rtol=1e-4, atol=1e-9)
     assert len(ledger.warnings) == 1
@@ -102,17 +103,17 @@ def test_seen_from_a_camera_the_covariance_is_that_of_a_map_that_begins_there():
     turned[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=0.3, size=(3, 3))).as_matrix()
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.05, 0.05, 0.2, 0.1, 0.05, 0.02]))
     steps = [
-        gtsam.BetweenFactorPose3(factors.x_key(k), factors.x_key(k + 1), gtsam.Pose3(inverse(a) @ b), noise)
+        gtsam.BetweenFactorPose3((X0 + k), (X0 + k + 1), gtsam.Pose3(inverse(a) @ b), noise)
         for k, (a, b) in enumerate(itertools.pairwise(turned))
     ]
     pairs = np.array([(k, j) for k in range(3) for j in range(3)])
     to = np.einsum("rji,rj->ri", turned[pairs[:, 0], :3, :3], POINTS[pairs[:, 1]] - turned[pairs[:, 0], :3, 3])
     unit = to / np.linalg.norm(to, axis=1, keepdims=True)
-    rays = factors.bearing(pairs[:, 0], unit, pairs[:, 1], [gtsam.noiseModel.Isotropic.Sigma(2, 0.02)] * len(pairs))
+    rays = bearings(pairs[:, 0], unit, pairs[:, 1], [gtsam.noiseModel.Isotropic.Sigma(2, 0.02)] * len(pairs))
     values, ledger = make_values(turned, POINTS, np.arange(3)), Ledger()
 
     def anchored_at(k):
-        anchor = gtsam.PriorFactorPose3(factors.x_key(k), gtsam.Pose3(turned[k]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+        anchor = gtsam.PriorFactorPose3((X0 + k), gtsam.Pose3(turned[k]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
         return build_graph(rays, steps, [anchor])
 
     seen = seen_covariances(anchored_at(0), values, np.arange(3), np.array([2, 2, 2]), ledger)

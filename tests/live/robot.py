@@ -15,6 +15,9 @@ from typing import Any
 
 import numpy as np
 
+sys.path.append(str(Path(__file__).parents[1]))
+from waiting import LIMIT, wait_for
+
 LOOPBACK = (
     '<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
@@ -26,6 +29,11 @@ BASE_T_CAMERA = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.
 MAP_T_ODOM = np.array([[0.0, -1.0, 0.0, 2.0], [1.0, 0.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
+def time_of_day() -> float:
+    """s, as robots stamp."""
+    return time.time()
+
+
 def pose_at(time_s: float) -> np.ndarray:
     """odom_T_base on a circle of 2 m at 0.5 rad/s."""
     a = 0.5 * time_s
@@ -35,7 +43,7 @@ def pose_at(time_s: float) -> np.ndarray:
 
 @dataclass
 class Drive:
-    """What a robot does. hz: odometry and detections a second. bad: detections whose label is no text.
+    """What a robot does. hz: odometry and detections a second. bad: detections whose label is no text, before the last ones.
 
     heard: the writers that must have a reader before it drives off.
     """
@@ -46,7 +54,6 @@ class Drive:
     detections_hz: float = 20.0
     reliable: bool = True
     bad: int = 0
-    first: int = 0
     topic: str = "odom"
     heard: tuple[str, ...] = ("odom", "tf", "info", "found")
 
@@ -69,7 +76,7 @@ class Recorder:
         return True
 
     def push_odometry(self, stamp, odom_T_base, covariance=None):
-        self.odometry.append((stamp, odom_T_base, covariance, time.time()))
+        self.odometry.append((stamp, odom_T_base, covariance, time_of_day()))
         return True
 
     def push_localization(self, stamp, map_T_base, covariance=None):
@@ -83,7 +90,7 @@ class Recorder:
     def push_detections(self, stamp, camera, boxes, labels, scores, depths=None, track_ids=None, whole=False):
         self.depths.append(depths)
         self.whole.append(whole)
-        self.detections.append((stamp, camera, np.array(boxes), list(labels), np.array(scores), track_ids, time.time()))
+        self.detections.append((stamp, camera, np.array(boxes), list(labels), np.array(scores), track_ids, time_of_day()))
         return True
 
 
@@ -95,7 +102,7 @@ def start(drive: Drive) -> subprocess.Popen:
 
 def sent(process: subprocess.Popen) -> dict:
     """What a robot sent, when it is done."""
-    out, _ = process.communicate(timeout=60)
+    out, _ = process.communicate(timeout=LIMIT)
     assert process.returncode == 0
     return json.loads(out)
 
@@ -153,7 +160,7 @@ class Robot:
 
         self.drive, self.types = drive, messages()
         participant = DomainParticipant(drive.domain)
-        reliable = Policy.Reliability.Reliable(10**8)
+        reliable = Policy.Reliability.Reliable(int(LIMIT * 1e9))
         plain = Qos(reliable if drive.reliable else Policy.Reliability.BestEffort, Policy.History.KeepLast(500))
         latched = Qos(reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(10))
 
@@ -209,22 +216,20 @@ class Robot:
     def run(self) -> dict:
         drive = self.drive
         self.tf_static.write(self.transform(0.0, "base_link", "front_optical_frame", BASE_T_CAMERA))
-        end = time.monotonic() + 20
-        while not all(getattr(self, name).get_matched_subscriptions() for name in drive.heard) and time.monotonic() < end:
-            time.sleep(0.02)
-        now = time.time()
+        wait_for(lambda: all(getattr(self, name).get_matched_subscriptions() for name in drive.heard))
+        now = time_of_day()
         self.tf.write(self.transform(now, "map", "odom", MAP_T_ODOM))
         self.info.write(self.camera_info(now))
-        begin, odometry, frames = time.perf_counter(), drive.first, 0
+        begin, odometry, frames = time.perf_counter(), 0, 0
         stamps: dict[str, list[float]] = {"odometry": [], "detections": []}
         while (elapsed := time.perf_counter() - begin) < drive.seconds:
-            if elapsed * drive.odometry_hz >= odometry - drive.first:
-                now = time.time()
+            if elapsed * drive.odometry_hz >= odometry:
+                now = time_of_day()
                 self.odom.write(self.odometry(now, pose_at(odometry / drive.odometry_hz)))
                 stamps["odometry"].append(now)
                 odometry += 1
             if elapsed * drive.detections_hz >= frames:
-                now = time.time()
+                now = time_of_day()
                 boxes = [(100.0 + 90 * i, 200.0, 40.0, 60.0, f"cup{i}", 0.9, str(i)) for i in range(5)]
                 if frames % 50 == 0:
                     self.info.write(self.camera_info(now))
@@ -233,12 +238,15 @@ class Robot:
                 frames += 1
             time.sleep(0.0005)
         for _ in range(drive.bad):
-            bad = self.detections(time.time(), [(100.0, 100.0, 20.0, 20.0, "cup", 0.9, "")])
+            bad = self.detections(time_of_day(), [(100.0, 100.0, 20.0, 20.0, "cup", 0.9, "")])
             data = bytes(bad.serialize()).replace(b"cup\0", b"\xff\xfe\xff\0")
             bad.serialize = lambda *args, data=data, **kwargs: data
             self.found.write(bad)
+        last = time_of_day()  # what comes after the bad ones: who has heard that has heard them
+        self.found.write(self.detections(last, [(100.0, 100.0, 20.0, 20.0, "cup", 0.9, "")]))
+        stamps["detections"].append(last)
         for writer in (self.odom, self.found):
-            writer.wait_for_acks(2 * 10**9)
+            writer.wait_for_acks(int(LIMIT * 1e9))
         return stamps
 
 

@@ -9,13 +9,21 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
 
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import make_pose
 from objslam.errors import LogError, OutputError
-from objslam.geometry import make_pose
-from objslam.ledger import Ledger
-from objslam.live.journal import Journal, is_journal, messages, read_journal
-from objslam.live.messages import CameraMessage, FrameMessage, MountMessage, NoteMessage, PoseMessage, decode, encode
 from objslam.simulation import make_camera
 from objslam.sources import read
+from objslam.sources.journal.file import Journal, is_journal, messages, read_journal
+from objslam.sources.journal.records import (
+    CameraMessage,
+    FrameMessage,
+    MountMessage,
+    NoteMessage,
+    PoseMessage,
+    decode,
+    encode,
+)
 
 FINITE = st.floats(-1e6, 1e6)
 POSES = st.builds(
@@ -81,7 +89,7 @@ def write(file, found, resume=False):
     journal.close()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(MESSAGES, max_size=6), st.data())
 def test_a_torn_end_costs_the_last_record_only(tmp_path_factory, found, data):
     file = tmp_path_factory.mktemp("journal") / "journal.objslam"

@@ -5,16 +5,26 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from robot import Drive, sent, start
 from typer.testing import CliRunner
+from waiting import LIMIT, wait_for
 
 pytest.importorskip("cyclonedds")
 
 from objslam.cli import app
+from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
+from objslam.sources.journal.file import messages
+from objslam.sources.journal.records import FrameMessage, PoseMessage
+
+
+def heard(out):
+    """How many poses of the odometry and frames are in the journal of a session."""
+    kept = list(messages(out, Ledger()))
+    odometry = sum(isinstance(message, PoseMessage) and message.path == "odometry" for message in kept)
+    return {"odometry": odometry, "detections": sum(isinstance(message, FrameMessage) for message in kept)}
 
 
 def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
@@ -35,9 +45,9 @@ def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
     command += ["--set", "output.recording=false", "--set", "output.picture=false"]
     live = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     said = sent(start(Drive(domain, seconds=2.0, bad=2)))
-    time.sleep(0.5)
+    wait_for(lambda: heard(tmp_path / "out") == {kind: len(stamps) for kind, stamps in said.items()})
     live.send_signal(signal.SIGINT)
-    out, err = live.communicate(timeout=60)
+    out, err = live.communicate(timeout=LIMIT)
     assert live.returncode == 0, err
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["live"]["odometry"] == len(said["odometry"])

@@ -2,23 +2,24 @@
 
 import itertools
 import os
-import time
 
 import numpy as np
 import pytest
 from robot import messages
 from scipy.spatial.transform import Rotation
+from waiting import wait_for
 
-from objslam.live.interface import Snapshot
-from objslam.sources.ros.decode import make_decoder
-from objslam.sources.ros.records import Connection
-from objslam.types import MapObject, ObjectMap, Trajectory
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.snapshot import Snapshot
+from objslam.core.types import Trajectory
+from objslam.ros.bag.records import Connection
+from objslam.ros.messages.decode import make_decoder
 
 pytest.importorskip("cyclonedds")
 
-from objslam.live.dds_network import open_network
-from objslam.live.publish import TOPICS, DdsPublisher, messages_of
-from objslam.map_messages import MapMessages
+from objslam.live.dds.network import open_network
+from objslam.live.dds.publisher import TOPICS, DdsPublisher, messages_of
+from objslam.output.export.map_messages import MapMessages
 
 _DOMAINS = itertools.count(90 + os.getpid() % 9)
 COVARIANCE = np.diag([0.04, 0.01, 0.0025])
@@ -79,10 +80,7 @@ def test_objects_and_path_reach_those_who_come_late(monkeypatch):
     read = {}
     for topic, name in (("rt/robot/map/objects", "Detection3DArray"), ("rt/robot/map/path", "Path")):
         reader = DataReader(participant, Topic(participant, topic, types[name]), qos=qos)
-        end = time.monotonic() + 10
-        while not (taken := reader.take(1)) and time.monotonic() < end:
-            time.sleep(0.02)
-        read[name] = taken[0]
+        read[name] = wait_for(lambda reader=reader: reader.take(1))[0]
     found = read["Detection3DArray"]
     assert (found.header.stamp.sec, found.header.stamp.nanosec, found.header.frame_id) == (12, 250_000_000, "map")
     cup, chair = found.detections

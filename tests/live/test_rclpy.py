@@ -5,7 +5,6 @@ The stand-in has no more than the adapter uses, named after rclpy's documentatio
 
 import sys
 import threading
-import time
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
@@ -14,14 +13,15 @@ from types import SimpleNamespace as Thing
 import numpy as np
 import pytest
 from robot import Recorder, pose_at
+from waiting import LIMIT, pause, wait_for
 
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker
 
 from objslam.errors import ObjslamError
 from objslam.live.adapters.rclpy import RclpyAdapter
-from objslam.live.ros_messages import RosMessages
-from objslam.live.topic_choice import TopicChoice
+from objslam.live.ros.message_handler import RosMessages
+from objslam.live.ros.topic_discovery import TopicChoice
 
 Reliability = Enum("Reliability", "RELIABLE BEST_EFFORT")
 Durability = Enum("Durability", "VOLATILE TRANSIENT_LOCAL")
@@ -72,7 +72,7 @@ def node(monkeypatch):
                 topic, message = node.waiting.pop(0)
                 node.subscriptions[topic].callback(message)
             else:
-                time.sleep(0.005)
+                pause(0.005)
 
         def shutdown(self):
             assert self.nodes == [node]
@@ -107,13 +107,6 @@ def node(monkeypatch):
     return node
 
 
-def wait_for(condition):
-    end = time.monotonic() + 20
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
-
-
 def test_topics_are_heard_as_their_publishers_come_and_go(node):
     node.publish("/odom", "nav_msgs/msg/Odometry")
     node.publish("/tf_static", "tf2_msgs/msg/TFMessage", latched=True)
@@ -122,17 +115,17 @@ def test_topics_are_heard_as_their_publishers_come_and_go(node):
     adapter = RclpyAdapter(RosMessages(sink), TopicChoice())
     thread = threading.Thread(target=adapter.run, args=(stop,))
     thread.start()
-    assert wait_for(lambda: {"/odom", "/tf_static"} <= set(node.subscriptions))
+    wait_for(lambda: {"/odom", "/tf_static"} <= set(node.subscriptions))
     static, odom = node.subscriptions["/tf_static"].qos, node.subscriptions["/odom"].qos
     assert (static.durability, odom.durability) == (Durability.TRANSIENT_LOCAL, Durability.VOLATILE)
     assert odom.reliability == Reliability.RELIABLE
     node.waiting = [("/odom", maker.odometry(k * 10**9, pose_at(k))) for k in range(1, 6)]
-    assert wait_for(lambda: len(sink.odometry) == 5)
+    wait_for(lambda: len(sink.odometry) == 5)
     np.testing.assert_allclose(sink.odometry[4][1], pose_at(5), atol=1e-9)
     node.publish("/odom", "nav_msgs/msg/Odometry", reliable=False)
-    assert wait_for(lambda: node.subscriptions["/odom"].qos.reliability == Reliability.BEST_EFFORT)
+    wait_for(lambda: node.subscriptions["/odom"].qos.reliability == Reliability.BEST_EFFORT)
     stop.set()
-    thread.join(10)
+    thread.join(LIMIT)
     assert node.destroyed == ["/odom", "node"]
     assert adapter.ledger.warnings == [
         "vision_msgs/msg/Detection2DArray is not installed with this ROS: left out (No module named 'vision_msgs')"

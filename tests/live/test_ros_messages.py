@@ -12,10 +12,12 @@ sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker
 from robot import BASE_T_CAMERA, MAP_T_ODOM, Recorder, pose_at
 
+from objslam.core.camera import Camera
 from objslam.errors import ConfigError
-from objslam.live.ros_messages import RosMessages, RosOptions, parse_topics
-from objslam.sources.camera_file import Calibration
-from objslam.types import Camera
+from objslam.io.camera_yaml import write_camera
+from objslam.live.ros.message_handler import RosMessages
+from objslam.ros.topics import parse_topics
+from objslam.sources.ros_bag.options import RosOptions
 
 ODOMETRY, TF, DETECTIONS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "vision_msgs/msg/Detection2DArray"
 INFO, POSE = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -138,7 +140,7 @@ def test_tf_stands_in_for_odometry_after_a_while_but_a_topic_comes_first(maker):
 
 
 def test_tf_gives_the_odometry_at_once_where_a_user_says_so(maker):
-    robot = Robot(maker, topics=parse_topics(["odometry=tf"]))
+    robot = Robot(maker, topics=("odometry=tf",))
     robot.odometry(1.0)
     robot.tf(1.1, ("odom", "base_link", pose_at(1.1)))
     robot.tf(1.2, ("odom", "base_link", pose_at(1.1)))  # standing still is news as well
@@ -152,7 +154,7 @@ def test_a_pose_in_map_is_localisation(maker):
     assert not robot.sink.odometry
     np.testing.assert_allclose(robot.sink.localization[0][1], pose_at(1.0), atol=1e-9)
 
-    robot = Robot(maker, topics=parse_topics(["localization=/amcl_pose"]))
+    robot = Robot(maker, topics=("localization=/amcl_pose",))
     for topic in ("/amcl_pose", "/goal_pose"):
         robot.send(POSE, topic, maker.pose_stamped(ns(2.0), pose_at(2.0)))
     robot.tf(2.1, ("map", "odom", MAP_T_ODOM))  # not chosen
@@ -244,9 +246,9 @@ def test_a_calibration_that_changes_is_pushed_anew(maker):
     assert [camera.matrix[0, 0] for camera in robot.sink.cameras] == [500, 1000]
 
 
-def test_a_calibration_file_takes_the_place_of_camera_info(maker):
-    placed = Calibration(Camera("kinect", 640, 480, CAMERA.matrix, base_T_camera=BASE_T_CAMERA), placed=True)
-    robot = Robot(maker, calibrations=(placed,))
+def test_a_calibration_file_takes_the_place_of_camera_info(maker, tmp_path):
+    write_camera(Camera("kinect", 640, 480, CAMERA.matrix, base_T_camera=BASE_T_CAMERA), tmp_path / "kinect.yaml")
+    robot = Robot(maker, camera_info=tmp_path / "kinect.yaml")
     robot.detections(1.0, frame="")
     assert robot.sink.cameras[0].name == "kinect"
     np.testing.assert_allclose(robot.sink.cameras[0].base_T_camera, BASE_T_CAMERA)
@@ -280,7 +282,7 @@ def test_two_detectors_on_one_camera_do_not_count_twice(maker):
 
 
 def test_depth_images_give_boxes_their_depth(maker):
-    robot = Robot(maker, topics=parse_topics(["depth=/front/depth"]))
+    robot = Robot(maker, topics=("depth=/front/depth",))
     robot.odometry(1.0)
     robot.tf(0.0, ("base_link", OPTICAL, BASE_T_CAMERA), static=True)
     robot.info()
@@ -360,21 +362,18 @@ def test_a_stamp_that_nobody_set_is_the_time_of_arrival(maker):
 @pytest.mark.parametrize("text", ["odometry", "wheel=/odom", "image=tf", "odometry="])
 def test_choices_that_cannot_be_are_wrong_use(text):
     with pytest.raises(ConfigError):
-        parse_topics([text])
+        parse_topics([text], live=True)
 
 
 def test_choices_by_role():
-    assert parse_topics(["odometry=odom", "detections=/a", "detections=/b", "localization=none"]) == {
-        "odometry": ["/odom"],
-        "detections": ["/a", "/b"],
-        "localization": ["none"],
-    }
+    chosen = parse_topics(["odometry=odom", "detections=/a", "detections=/b", "localization=none"], live=True)
+    assert [chosen.of(role) for role in ("odometry", "detections", "localization")] == [["/odom"], ["/a", "/b"], ["none"]]
 
 
 finite = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.one_of(

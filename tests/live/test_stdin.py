@@ -11,8 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot import BASE_T_CAMERA, MATRIX, Recorder
 from scipy.spatial.transform import Rotation
+from waiting import LIMIT
 
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.io.detections_jsonl import read_detections
+from objslam.live.adapters.replay import ReplayAdapter
 from objslam.live.adapters.stdin import StdinAdapter
+from objslam.live.session.session import Session
+from objslam.sources import read
 
 POSE = {"translation": [1.0, 2.0, 0.5], "rotation_xyzw": [0.0, 0.0, float(np.sin(0.2)), float(np.cos(0.2))]}
 CAMERA = {
@@ -33,12 +40,18 @@ BOXES = {"boxes": [[1, 2, 3, 4], [5, 6, 9, 9]], "labels": ["cup", "mug"], "score
 
 def feed(data: bytes):
     """What is pushed, and the adapter, for bytes on a pipe."""
+    adapter = hear(data, Recorder())
+    return adapter.sink, adapter
+
+
+def hear(data: bytes, sink):
+    """The adapter that pushed what the bytes on a pipe say into a sink."""
     reading, writing = os.pipe()
     threading.Thread(target=_write, args=(writing, data), daemon=True).start()
     with os.fdopen(reading, "rb") as stream:
-        adapter = StdinAdapter(Recorder(), stream)
+        adapter = StdinAdapter(sink, stream)
         adapter.run(threading.Event())
-    return adapter.sink, adapter
+    return adapter
 
 
 def _write(writing, data):
@@ -85,6 +98,44 @@ def test_every_kind_of_message():
     assert not adapter.ledger.dropped
 
 
+def test_boxes_that_no_edge_cuts_off_say_so():
+    sink, adapter = feed(
+        lines(
+            {"type": "detections", "stamp": 1, **BOXES, "whole": True},
+            {"type": "detections", "stamp": 2, **BOXES, "whole": False},
+            {"type": "detections", "stamp": 3, **BOXES},
+            {"type": "detections", "stamp": 4, **BOXES, "whole": 1},
+        )
+    )
+    assert [stamp for stamp, *_ in sink.detections] == [1, 2, 3]
+    assert sink.whole == [True, False, False]
+    assert adapter.ledger.dropped == {"line malformed: whole is neither true nor false": 1}
+
+
+def test_boxes_that_no_edge_cuts_off_are_used_from_stdin_as_from_a_file(tmp_path):
+    """The same lines: heard by a session, replayed from its journal, and read as detections.jsonl."""
+    edge = "boxes cut off by the image's edge (rays.border)"
+    config = load_settings(None, ("mode=joint", "live.keyframe_distance=0"))
+    frames = [{"stamp": 1 + i, "boxes": [[0, 200, 40 + i, 240]], "labels": ["tag"], "scores": [1]} for i in range(4)]
+    for whole in (False, True):
+        told = [{**frame, "whole": True} for frame in frames] if whole else frames
+        poses = [{"type": "odometry", "stamp": 1 + i, "x": 0.1 * i, "y": 0, "yaw": 0} for i in range(5)]
+        detections = [{"type": "detections", "camera": "front", **frame} for frame in told]
+        out = tmp_path / str(whole)
+        out.mkdir()
+        (out / "detections.jsonl").write_bytes(lines(*told))
+        heard = Session(config, out / "journal.objslam", patient=True).start()
+        hear(lines(CAMERA, poses[0], *(m for pair in zip(detections, poses[1:], strict=True) for m in pair)), heard)
+        kept = read(out, Ledger())
+        again = Session(config, patient=True).start()
+        ReplayAdapter(again, kept, None, again.wait).run(threading.Event())
+        for session in (heard, again):
+            assert session.wait(LIMIT)
+            session.abort()
+            assert session.counters.dropped() == ({} if whole else {edge: 4})
+        assert kept.cameras[0].detections.whole == read_detections(out / "detections.jsonl", Ledger()).whole == whole
+
+
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
@@ -129,7 +180,7 @@ def test_it_stops_while_nothing_comes():
         thread = threading.Thread(target=StdinAdapter(Recorder(), stream).run, args=(stop,))
         thread.start()
         stop.set()
-        thread.join(10)
+        thread.join(LIMIT)
         assert not thread.is_alive()
     os.close(writing)
 
@@ -148,7 +199,7 @@ messages = st.builds(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.one_of(messages.map(lambda m: json.dumps(m).encode()), st.binary(max_size=30)), max_size=5))
 def test_no_bytes_break_it(rows):
     adapter = StdinAdapter(Recorder(), io.BytesIO())

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from objslam.config import Settings
-from objslam.ledger import Ledger
-from objslam.matching import match
-from objslam.offline import run
+from objslam.core.diagnostics import Ledger
+from objslam.evaluation.alignment import match_points
+from objslam.mapping.pipeline import run
 from objslam.sources import read
 
 
@@ -60,5 +60,5 @@ def test_no_object_is_there_twice(whole):
 
 def test_half_of_the_log_gives_the_same_objects_as_the_other(log):
     (first, here), (second, there) = (objects(half(log, late)) for late in (False, True))
-    matched, _ = match(here, there, np.array(first)[:, None] == np.array(second), 0.1)
+    matched, _ = match_points(here, there, np.array(first)[:, None] == np.array(second), 0.1)
     assert len(matched) >= 15

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
 
 CABINET = np.array([-1.520, 0.454])
@@ -15,7 +15,7 @@ CABINET = np.array([-1.520, 0.454])
 @pytest.mark.parametrize("overrides", [(), ("depth.use=false",), ("fixed.loss=huber",)])
 def test_the_cabinet(data_dir, overrides):
     log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
-    result = offline.run(log, load_settings(None, ("mode=fixed", *overrides)), Ledger())
+    result = pipeline.run(log, load_settings(None, ("mode=fixed", *overrides)), Ledger())
     (cabinet,) = result.map.resolved()
     assert cabinet.label == "cabinet"
     assert np.linalg.norm(cabinet.position[:2] - CABINET) <= 0.04
@@ -25,7 +25,7 @@ def test_the_cabinet(data_dir, overrides):
 
 def test_the_joint_mode_leaves_good_poses_where_they_are(data_dir):
     log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
-    result = offline.run(log, load_settings(None, ("mode=joint",)), Ledger())
+    result = pipeline.run(log, load_settings(None, ("mode=joint",)), Ledger())
     moved = np.linalg.norm((result.map_T_base - result.keyframes.map_T_base)[:, :3, 3], axis=1)
     assert moved.max() < 0.05
     (cabinet,) = result.map.resolved()
@@ -35,7 +35,7 @@ def test_the_joint_mode_leaves_good_poses_where_they_are(data_dir):
 def test_the_cabinet_stands_in_its_own_surface(data_dir):
     """The fused surface of the cabinet, the floor left out, holds the object; and its middle is what the poses say."""
     log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
-    result = offline.run(log, load_settings(None, ("mode=fixed",)), Ledger())
+    result = pipeline.run(log, load_settings(None, ("mode=fixed",)), Ledger())
     assert result.surface is not None
     vertices = result.surface.vertices
     floor = np.median(vertices[:, 2])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from objslam.geometry import interpolate
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
 from objslam.sources import SourceOptions, read
-from objslam.sources.folder import read_log_folder, write_log_folder
+from objslam.sources.log_folder import read_log_folder, write_log_folder
 
 _MRCLAM_BOXES = {1: (1234, 1534, 407, 1), 3: (2745, 4348, 1277, 2), 5: (2791, 4239, 1139, 0)}
 _OFFICE_BOXES = {"bottle": 5372, "chair": 2429, "book": 2206, "tv": 1439, "cup": 1392, "keyboard": 1128, "mouse": 995}

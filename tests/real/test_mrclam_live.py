@@ -5,12 +5,12 @@ import threading
 import numpy as np
 import pytest
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.ledger import Ledger
-from objslam.live import upkeep
+from objslam.core.diagnostics import Ledger
 from objslam.live.adapters.replay import ReplayAdapter
-from objslam.live.session import Session
+from objslam.live.mapper import maintenance
+from objslam.live.session.session import Session
+from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
 
 
@@ -20,12 +20,12 @@ def test_live_and_offline_find_the_same_in_the_same_place(data_dir, monkeypatch,
 
     Robot 1 places some landmarks badly at first, and looked at just then the rays of one seem to be of two.
     """
-    monkeypatch.setattr(upkeep, "_EVERY", every)
+    monkeypatch.setattr(maintenance, "_EVERY", every)
     log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=False))
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
     session = Session(settings, patient=True).start()
     ReplayAdapter(session, log, None, session.wait).run(threading.Event())
-    live, reference = session.stop().map, offline.run(log, settings, Ledger()).map
+    live, reference = session.stop().map, pipeline.run(log, settings, Ledger()).map
     found, expected = ({o.label: o.position for o in m.resolved()} for m in (live, reference))
     assert len(expected) == len(live.resolved()) == 15
     assert found.keys() == expected.keys()

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.evaluation import evaluate
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Trajectory
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
-from objslam.types import ObjectMap, Trajectory
 
 RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
 
@@ -18,7 +19,7 @@ RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
 def test_landmarks_and_path(data_dir, robot, with_range, position, path):
     log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=with_range))
     ledger = Ledger()
-    result = offline.run(log, load_settings(None, ("mode=joint",)), ledger)
+    result = pipeline.run(log, load_settings(None, ("mode=joint",)), ledger)
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     found = evaluate(
         result.map, log.truth, Trajectory(stamps, result.map_T_base[first]), align="se2", radius=RADIUS
@@ -41,7 +42,7 @@ def test_the_start_was_far_off(data_dir, robot):
 def test_landmarks_without_names(data_dir):
     """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other."""
     log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
-    result = offline.run(log, load_settings(None, ("mode=joint",)), Ledger())
+    result = pipeline.run(log, load_settings(None, ("mode=joint",)), Ledger())
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])
     found = evaluate(result.map, log.truth, path, align="se2", radius=0.3).to_dict()

@@ -6,9 +6,10 @@ import pytest
 
 from objslam.config import Detector as Settings
 from objslam.config import Settings as AllSettings
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.detection import detect_log, load_detector
-from objslam.ledger import Ledger
-from objslam.types import Camera, CameraLog, Images, Log, Trajectory
 
 CONTENT = {"dog.jpg": {"dog", "bicycle", "car"}, "person.jpg": {"person", "dog", "horse"}}
 LAYOUTS = {"yolov12n.onnx": "yolov8", "yolox_nano_416.onnx": "yolox"}

@@ -9,17 +9,17 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.geometry import align, interpolate, inverse, make_pose
-from objslam.ledger import Ledger
-from objslam.rays import undistort
+from objslam.core.camera import undistort
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import align, interpolate, inverse, make_pose
+from objslam.io.camera_yaml import read_calibrations
+from objslam.mapping import pipeline
+from objslam.ros.bag.recording import find_recording, read_messages
+from objslam.ros.messages.decode import make_decoder, read_head
+from objslam.ros.messages.poses import PoseRows
 from objslam.sources import SourceOptions, read
-from objslam.sources.camera_file import read_calibrations
-from objslam.sources.ros import describe
-from objslam.sources.ros.decode import make_decoder, read_head
-from objslam.sources.ros.recording import find_recording, read_messages
-from objslam.sources.ros.rows import PoseRows
+from objslam.sources.ros_bag.info import describe
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CALIBRATION, SETTINGS = CONFIGS / "cameras" / "tagslam.yaml", CONFIGS / "tags.yaml"
@@ -121,7 +121,7 @@ def test_the_rays_point_at_the_surveyed_tags(folder, log, survey, tmp_path):
 def _errors(log, tags, mode):
     """Errors (m) of the tags that are mapped, after alignment with the surveyed ones."""
     ledger = Ledger()
-    result = offline.run(log, load_settings(SETTINGS, (f"mode={mode}",)), ledger)
+    result = pipeline.run(log, load_settings(SETTINGS, (f"mode={mode}",)), ledger)
     assert not ledger.dropped
     best = {o.label: o for o in sorted(result.map.resolved(), key=lambda o: o.rays) if o.label in tags}
     mapped = list(best.values())

@@ -5,10 +5,10 @@ import sqlite3
 import numpy as np
 import pytest
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.ledger import Ledger
 from objslam.sources import read
-from objslam.sources.ros import describe
+from objslam.sources.ros_bag.info import describe
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject
 from objslam.errors import LogError, OutputError
-from objslam.geometry import lift_se2
-from objslam.ledger import Ledger
-from objslam.objects_file import read_truth_objects
-from objslam.sources import folder as folder_module
-from objslam.sources.folder import is_log_folder, read_log_folder, write_log_folder
-from objslam.types import Camera, CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject
+from objslam.io.objects_json import read_truth_objects
+from objslam.sources import log_folder as folder_module
+from objslam.sources.log_folder import is_log_folder, read_log_folder, write_log_folder
 
 _POSE = "1 0 0 0 0 0 0 1\n"
 
@@ -301,7 +302,7 @@ _PARTS = {
 }
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.data())
 def test_damage_of_any_kind_ends_in_a_log_or_one_clear_error(data):
     name = data.draw(st.sampled_from(sorted(_PARTS)))

@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.ledger import Ledger
-from objslam.sources.mrclam import bearing_to_pixel, integrate, is_mrclam, read_mrclam, robots
+from objslam.sources.mrclam import MrclamOptions
+from objslam.sources.mrclam.reader import bearing_to_pixel, integrate, is_mrclam, read_mrclam, robots
 
 _BARCODES = "# Subject Barcode\n 1 \t 5\n 3 41\n 6 63\n 7 81\n 20 25\n"
 _ODOMETRY = "# t v w\n100.0 1.0 0.5\n100.5 1.0 0.5\n101.0 0.0 0.5\n101.0 2.0 0.0\n102.0 0.0 0.0\n"
@@ -69,7 +70,7 @@ def test_integration_is_the_product_of_exponentials(rows):
 
 def test_a_robot_is_read(dataset):
     ledger = Ledger()
-    log = read_mrclam(dataset, 2, ledger=ledger)
+    log = read_mrclam(dataset, ledger, MrclamOptions(2))
     assert log.name == "mrclam_robot2"
     assert log.localization is None
     assert log.odometry.stamps.tolist() == [100.0, 100.5, 101.0, 102.0]
@@ -113,7 +114,7 @@ def test_a_robot_is_read(dataset):
 
 
 def test_the_truth_is_read(dataset):
-    truth = read_mrclam(dataset, 2, ledger=Ledger()).truth
+    truth = read_mrclam(dataset, Ledger(), MrclamOptions(2)).truth
     assert [(o.id, o.label, o.position.tolist()) for o in truth.objects] == [
         (6, "landmark_6", [1.5, -2.5, 0.0]),
         (20, "landmark_20", [0.25, 3.0, 0.0]),
@@ -124,7 +125,7 @@ def test_the_truth_is_read(dataset):
 
 
 def test_options(dataset):
-    log = read_mrclam(dataset, 2, with_range=False, anonymous=True, ledger=Ledger())
+    log = read_mrclam(dataset, Ledger(), MrclamOptions(2, with_range=False, anonymous=True))
     assert np.isnan(log.cameras[0].detections.depths).all()
     assert log.cameras[0].detections.label_names == ("landmark",)
     assert {o.label for o in log.truth.objects} == {"landmark"}
@@ -141,7 +142,7 @@ def test_every_bearing_of_a_60_degree_camera_fits_into_the_image():
 def test_without_truth(dataset):
     (dataset / "Landmark_Groundtruth.dat").unlink()
     (dataset / "Robot2_Groundtruth.dat").unlink()
-    assert read_mrclam(dataset, 2, ledger=Ledger()).truth is None
+    assert read_mrclam(dataset, Ledger(), MrclamOptions(2)).truth is None
 
 
 @pytest.mark.parametrize(("robot", "message"), [(None, "no robot is chosen"), (5, "there is no robot 5")])
@@ -149,20 +150,20 @@ def test_the_robots_are_listed(dataset, robot, message):
     assert is_mrclam(dataset)
     assert robots(dataset) == (2, 4)
     with pytest.raises(LogError, match=message + ", the folder has: 2, 4"):
-        read_mrclam(dataset, robot, ledger=Ledger())
+        read_mrclam(dataset, Ledger(), MrclamOptions(robot))
 
 
 def test_what_is_missing_or_damaged_is_named(dataset):
     with pytest.raises(LogError, match=r"neither Robot4_Measurement\.dat nor") as caught:
-        read_mrclam(dataset, 4, ledger=Ledger())
+        read_mrclam(dataset, Ledger(), MrclamOptions(4))
     assert caught.value.where == str(dataset)
     (dataset / "Robot4_Measurement.dat").write_text(_MEASUREMENT)
     with pytest.raises(LogError, match="nothing in it") as caught:
-        read_mrclam(dataset, 4, ledger=Ledger())
+        read_mrclam(dataset, Ledger(), MrclamOptions(4))
     assert caught.value.where == str(dataset / "Robot4_Odometry.dat.gz")
     (dataset / "Barcodes.dat").write_text("a b\n")
     with pytest.raises(LogError) as caught:
-        read_mrclam(dataset, 2, ledger=Ledger())
+        read_mrclam(dataset, Ledger(), MrclamOptions(2))
     assert caught.value.where == str(dataset / "Barcodes.dat")
 
 
@@ -171,6 +172,6 @@ def test_absurd_numbers_are_survived(dataset):
     (dataset / "Robot2_Measurement.dat.gz").unlink()
     (dataset / "Robot2_Measurement.dat").write_text("1 7 1 0\n1 8 1 0\n1 1e300 1 0\n1 63 1e300 0\n1 63 1 1e300\n")
     ledger = Ledger()
-    log = read_mrclam(dataset, 2, ledger=ledger)
+    log = read_mrclam(dataset, ledger, MrclamOptions(2))
     assert len(log.cameras[0].detections) == 1
     assert ledger.dropped["measurement of an unknown barcode"] == 3

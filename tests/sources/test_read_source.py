@@ -1,8 +1,10 @@
 import pytest
 
+from objslam import sources
+from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError, LogError
-from objslam.ledger import Ledger
 from objslam.sources import SOURCES, SourceOptions, read
+from objslam.sources.options import flags, names
 
 _CAMERA = """\
 image_width: 640
@@ -76,6 +78,15 @@ def test_options_without_a_meaning_are_named(tmp_path):
     assert not ledger.lines()
 
 
+@pytest.mark.parametrize("source", [source for source in SOURCES if source.options], ids=lambda source: source.name)
+def test_the_options_of_every_source_are_among_those_of_all(source):
+    assert names(source.options) <= names(SourceOptions)
+    everything = flags(SourceOptions)
+    for name, declared in flags(source.options).items():  # two sources may share an option, not have two of one name
+        assert everything[name] == declared
+        assert getattr(SourceOptions, name) == getattr(source.options, name)
+
+
 def test_nothing_that_fits_lists_what_was_looked_for(tmp_path):
     (tmp_path / "photo.jpg").touch()
     for path in (tmp_path, tmp_path / "photo.jpg"):
@@ -86,7 +97,9 @@ def test_nothing_that_fits_lists_what_was_looked_for(tmp_path):
             assert f"{source.name}: {source.looks_for}" in caught.value.hint
 
 
-def test_half_a_log_says_what_is_missing(tmp_path):
+@pytest.mark.parametrize("order", [1, -1])
+def test_half_a_log_says_what_is_missing(tmp_path, monkeypatch, order):
+    monkeypatch.setattr(sources, "SOURCES", SOURCES[::order])
     (tmp_path / "camera.yaml").write_text(_CAMERA)
     with pytest.raises(LogError, match=r"neither odometry\.txt nor localization\.txt"):
         read(tmp_path, Ledger())

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from objslam.core.geometry import lift_se2
 from objslam.errors import ConfigError
-from objslam.geometry import lift_se2
 from objslam.simulation import make_camera
 from objslam.simulation.furniture import Room, furnish_room
 from objslam.simulation.raycast import Caster
-from objslam.simulation.rendered import BoxLimits, true_boxes
+from objslam.simulation.render import BoxLimits, true_boxes
 from objslam.simulation.sensor import Sensor, expose, exposures
 from objslam.simulation.shapes import LABELS
 

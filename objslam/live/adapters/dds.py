@@ -7,24 +7,19 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from objslam.ledger import Ledger
-from objslam.live.dds_network import AUTO, LOOPBACK, Network, receive_buffer
-from objslam.live.dds_types import dds_topic, layouts_of, ros_topic, ros_type
-from objslam.live.ros_messages import RosMessages
-from objslam.live.topic_choice import TopicChoice
-from objslam.sources.ros.decode import Undecodable, make_decoder
-from objslam.sources.ros.records import Connection, plain
-from objslam.sources.ros.survey import CAMERA_INFO, COMPRESSED, IMAGE, TF
+from objslam.core.diagnostics import Ledger
+from objslam.live.dds.network import AUTO, LOOPBACK, Network, receive_buffer
+from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
+from objslam.live.ros.message_handler import RosMessages
+from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
+from objslam.ros.bag.records import Connection, plain
+from objslam.ros.messages.decode import DecodeError, make_decoder
+from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-_WAIT = 50  # ms: how soon a stop is seen
-_LOOK = 0.2  # s between looks at what is lost, waits, or is to be opened
-_HEAD_START = 1.0  # s for all publishers to be found before one of several is chosen
-_LONELY = 5.0  # s without any publisher, or with one that does not match, before that is said
-_DEPTH = 1000  # messages that a reader keeps: 5 s of odometry at 200 Hz
-_TAKE = 200
-_MAX_READERS = 256
-_LATCHED = (*TF, CAMERA_INFO)  # types whose past messages matter as well
-_MIN_BUFFER = 2 << 20
+_LONELY = 5.0  # Time without any publisher, or with one that does not match, before that is said, s.
+_TAKE = 200  # The messages that are taken of a reader at once; larger: other topics wait longer.
+_MAX_READERS = 256  # The most readers that are open; chosen to bound the memory.
+_MIN_BUFFER = 2 << 20  # The smallest socket buffer that a raw image fits into, bytes; below it a warning is given.
 
 _Kind = tuple[bool, bool]
 """Whether a writer is reliable, and whether it keeps past messages (transient-local)."""
@@ -85,12 +80,12 @@ class DdsAdapter:
         waitset.attach(ReadCondition(found, new))
         begin, looked = time.monotonic(), 0.0
         while not stop.is_set():
-            waitset.wait(duration(milliseconds=_WAIT))
+            waitset.wait(duration(seconds=STOP_WAIT))
             self._look_around(found)
             for reader in self._readers.values():
                 self._take(reader, found)
             now = time.monotonic()
-            if now - looked >= _LOOK:
+            if now - looked >= LOOK_EVERY:
                 looked = now
                 for reader in self._open(now - begin):
                     waitset.attach(ReadCondition(reader.entity, new))
@@ -116,7 +111,7 @@ class DdsAdapter:
     def _open(self, age: float) -> list[_Reader]:
         """Make the readers that are missing for what is published and wanted."""
         offered = {publication.topic: publication.type for publication in self._publications.values()}
-        wanted = self.choice.wanted(offered, self.messages, settled=age >= _HEAD_START)
+        wanted = self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)
         opened = []
         for publication in list(self._publications.values()):
             key = publication.topic, publication.kind
@@ -126,9 +121,8 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = [*TF, CAMERA_INFO]  # frames and cameras before what refers to them
-        ranked = sorted(self._readers.items(), key=lambda item: order.index(item[1].type) if item[1].type in order else 9)
-        self._readers = dict(ranked)
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # frames and cameras before what refers to them
+        self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].type, len(order))))
         return opened
 
     def _make_reader(self, publication: _Publication) -> _Reader | None:
@@ -142,11 +136,11 @@ class DdsAdapter:
             self.ledger.warn(f"{topic}: its type {type_} is not known, and DDS does not bring definitions: left out")
             return None
         layout = next((layout for layout in layouts if _is_of(publication, layout)), layouts[0])
-        images = type_ in (IMAGE, COMPRESSED)
+        images = type_ in IMAGES
         qos = Qos(
             Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-            Policy.History.KeepLast(1 if images else _DEPTH),
+            Policy.History.KeepLast(1 if images else QUEUE),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
         if images and (receive_buffer() or _MIN_BUFFER) < _MIN_BUFFER:
@@ -162,17 +156,21 @@ class DdsAdapter:
         return _Reader(topic, type_, publication.kind, entity, decode, time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        while samples := reader.entity.take(_TAKE):
+        """Hand on what a reader has; no more than it may hold, so that one that never runs dry does not keep off a stop."""
+        for _ in range(QUEUE // _TAKE):
+            samples = reader.entity.take(_TAKE)
             for sample in samples:
                 info = sample.sample_info
                 if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
                     continue
                 try:
                     message = reader.decode(sample.data)
-                except Undecodable as error:
+                except DecodeError as error:
                     self.messages.refuse("message that cannot be decoded", f"{reader.topic}: {error}")
                     continue
                 self.messages.receive(reader.type, reader.topic, message, info.source_timestamp / 1e9)
+            if len(samples) < _TAKE:
+                return
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
         """Whether a reader takes what a publisher sent: a best-effort one hears the reliable publishers too."""
@@ -221,4 +219,4 @@ def _kind(qos: Any, type_: str) -> _Kind:
 
     reliable = isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable) if Policy.Reliability in qos else False
     volatile = qos[Policy.Durability] == Policy.Durability.Volatile if Policy.Durability in qos else True
-    return reliable, not volatile and type_ in _LATCHED
+    return reliable, not volatile and type_ in LATCHED

@@ -8,17 +8,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
-from objslam.ledger import Ledger
-from objslam.live.ros_messages import RosMessages
-from objslam.live.topic_choice import TopicChoice
-from objslam.sources.ros.survey import CAMERA_INFO, COMPRESSED, IMAGE, TF
-
-_WAIT = 0.05  # s: how soon a stop is seen
-_LOOK = 0.2  # s between looks at what is published
-_HEAD_START = 1.0  # s for all publishers to be found before one of several is chosen
-_DEPTH = 1000
-_LATCHED = (*TF, CAMERA_INFO)  # types whose past messages matter as well
+from objslam.live.ros.message_handler import RosMessages
+from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
+from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
 
 @dataclass
@@ -68,11 +62,11 @@ class RclpyAdapter:
             executor.add_node(node)
             begin, looked = time.monotonic(), 0.0
             while not stop.is_set():
-                executor.spin_once(timeout_sec=_WAIT)
+                executor.spin_once(timeout_sec=STOP_WAIT)
                 now = time.monotonic()
-                if now - looked >= _LOOK:
+                if now - looked >= LOOK_EVERY:
                     looked = now
-                    self._look_around(node, settled=now - begin >= _HEAD_START)
+                    self._look_around(node, settled=now - begin >= HEAD_START)
                     self.messages.tick()
             executor.shutdown()
             node.destroy_node()
@@ -80,7 +74,7 @@ class RclpyAdapter:
             rclpy.shutdown(context=context)
 
     def _look_around(self, node: Any, settled: bool) -> None:
-        """Subscribe to what is published and wanted, anew where the publishers' QoS asks for it."""
+        """Subscribe to what is published and wanted, again where the publishers' QoS asks for it."""
         offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
         for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
             type_ = offered[topic]
@@ -118,7 +112,7 @@ def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
 
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
     latched = all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles)
-    return reliable, latched and type_ in _LATCHED
+    return reliable, latched and type_ in LATCHED
 
 
 def _profile(kind: tuple[bool, bool], type_: str) -> Any:
@@ -127,7 +121,7 @@ def _profile(kind: tuple[bool, bool], type_: str) -> Any:
     reliable, latched = kind
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=1 if type_ in (IMAGE, COMPRESSED) else _DEPTH,
+        depth=1 if type_ in IMAGES else QUEUE,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

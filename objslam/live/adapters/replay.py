@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from objslam.config import Settings
-from objslam.ledger import Ledger
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Detections, Log, Trajectory
 from objslam.live.interface import Sink
-from objslam.types import Detections, Floats, Log, Trajectory
 
-_BEHIND = 1.0  # s; a replay that fell behind by more is told
+_BEHIND = 1.0  # The most that a replay may fall behind before a user is told, s.
 
 
 @dataclass
@@ -31,7 +32,6 @@ class ReplayAdapter:
     wait: Callable[[], object] | None = None
     after: Callable[[], float] = lambda: -np.inf
     settings: Settings = field(default_factory=Settings)
-    name: str = "replay"
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:

@@ -21,14 +21,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2, pose_from_quaternion
 from objslam.errors import LogError
-from objslam.geometry import lift_se2, pose_from_quaternion
-from objslam.ledger import Ledger
+from objslam.io.box_collector import BoxCollector
+from objslam.io.camera_yaml import parse_camera
+from objslam.io.detections_jsonl import Malformed, add_frame, parse_object, read_numbers, read_stamp
 from objslam.live.interface import Sink
-from objslam.sources.boxes import BoxCollector
-from objslam.sources.camera_file import parse_camera
-from objslam.sources.detections_file import Malformed, add_frame, parse_object, read_numbers, read_stamp
-from objslam.types import Floats
 
 _CAMERA = "camera"
 _TYPES = ("camera", "odometry", "localization", "mount", "detections")
@@ -101,11 +101,11 @@ class StdinAdapter:
 
     def _push_detections(self, message: dict[str, Any], place: str) -> None:
         collector = BoxCollector()
-        add_frame(message, place, collector)
+        whole = add_frame(message, place, collector)
         boxes = np.array(collector.boxes, dtype=np.float64).reshape(-1, 4)
         scores, depths = np.array(collector.scores, dtype=np.float64), np.array(collector.depths, dtype=np.float64)
         camera, tracks = _name(message, _CAMERA), collector.track_ids
-        self.sink.push_detections(collector.stamps[0], camera, boxes, collector.labels, scores, depths, tracks)
+        self.sink.push_detections(collector.stamps[0], camera, boxes, collector.labels, scores, depths, tracks, whole)
 
 
 def _name(message: dict[str, Any], key: str) -> str:

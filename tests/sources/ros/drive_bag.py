@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from objslam.geometry import make_pose
+from objslam.core.geometry import make_pose
 from objslam.simulation import preset, simulate
 
 

@@ -9,11 +9,11 @@ from bag_writer import write_bag
 from drive_bag import nanoseconds, rows_of, simulated
 
 from objslam.cli import main
-from objslam.geometry import lift_se2
-from objslam.ledger import Ledger
-from objslam.results import load_map
-from objslam.sources.camera_file import write_camera
-from objslam.sources.folder import read_log_folder
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.io.camera_yaml import write_camera
+from objslam.results.read import load_map
+from objslam.sources.log_folder import read_log_folder
 
 LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
 

@@ -14,10 +14,12 @@ from bag_writer import copy_cut, serialize, write_bag, write_mcap
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.ledger import Ledger
-from objslam.sources.ros import BagOptions, describe, read_bag
-from objslam.sources.ros.recording import find_recording, read_messages
+from objslam.ros.bag.recording import find_recording, read_messages
+from objslam.sources.ros_bag.info import describe
+from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.options import BagOptions
 
 COUNT = 4000
 _ENOUGH = 0.95

@@ -8,10 +8,12 @@ import pytest
 from bag_writer import write_bag
 from drive_bag import simulated
 
-from objslam.ledger import Ledger
-from objslam.sources.ros import BagOptions, read_bag
-from objslam.sources.ros.images import DEPTH_SCALE, extract_images
-from objslam.sources.ros.recording import find_recording
+from objslam.core.diagnostics import Ledger
+from objslam.ros.bag.recording import find_recording
+from objslam.ros.messages.images import DEPTH_SCALE
+from objslam.sources.ros_bag.images import extract_images
+from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.options import BagOptions
 
 _S = 10**9
 

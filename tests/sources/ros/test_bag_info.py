@@ -5,9 +5,11 @@ import pytest
 from bag_writer import write_bag
 from drive_bag import rows_of, simulated
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.ledger import Ledger
-from objslam.sources.ros import BagOptions, describe, read_bag
+from objslam.sources.ros_bag.info import describe
+from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.options import BagOptions
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from objslam.core.camera import Camera
+from objslam.core.geometry import make_pose
 from objslam.errors import LogError
-from objslam.geometry import make_pose
-from objslam.sources.ros.boxes2d import boxes_of_points, tag_boxes, vision_boxes
-from objslam.sources.ros.calibration import camera_of
-from objslam.sources.ros.decode import Undecodable, make_decoder, read_head, read_length
-from objslam.sources.ros.records import Connection, type_name
-from objslam.types import Camera
+from objslam.ros.bag.records import Connection, type_name
+from objslam.ros.messages.camera_info import camera_of
+from objslam.ros.messages.decode import DecodeError, make_decoder, read_head, read_length
+from objslam.ros.messages.detections import boxes_of_points, tag_boxes, vision_boxes
 
 _K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
 _FISHEYE = Camera("c", 640, 480, _K, "equidistant", np.array([0.01, -0.02, 0.003, -0.001]))
@@ -99,6 +99,16 @@ def test_a_tag_of_which_only_the_pose_is_told(camera):
     np.testing.assert_allclose((boxes[0, :2] + boxes[0, 2:]) / 2, pixels[0])
     assert (pixels[1:] >= boxes[0, :2] - 1e-9).all()
     assert (pixels[1:] <= boxes[0, 2:] + 1e-9).all()
+
+
+def test_a_tag_that_the_lens_cannot_see_has_no_box():
+    lens = np.array([-0.3, 0.0, 0.0, 0.0, 0.0])  # folds back at 46 degrees
+    camera = Camera("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), "plumb_bob", lens)
+    poses = [make_pose(np.eye(3), 2 * np.array([np.sin(a), 0.0, np.cos(a)])) for a in np.radians([20.0, 60.0])]
+    found = list(tag_boxes(_MAKER.tag_poses(0, [([i], 0.1, pose) for i, pose in enumerate(poses)])))
+    boxes = boxes_of_points(camera, np.array([f.points for f in found]))
+    assert np.isfinite(boxes[0]).all()
+    assert np.isnan(boxes[1]).all()
 
 
 @pytest.mark.parametrize("vision", "14")
@@ -193,7 +203,7 @@ def test_any_bytes_for_a_head(data):
     for encoding in ("cdr", "ros1"):
         try:
             stamp, frame, number = read_head(data, encoding)
-        except Undecodable:
+        except DecodeError:
             assert len(data) < 16 or int.from_bytes(data[12:16], "little" if encoding == "ros1" or data[1] else "big") > 0
         else:
             assert stamp >= 0
@@ -207,7 +217,7 @@ def test_any_bytes_for_a_message(data):
     for name, decode in _DECODERS.items():
         try:
             message = decode(data)
-        except Undecodable:
+        except DecodeError:
             continue
         assert message.__msgtype__ == name
 
@@ -232,7 +242,7 @@ _DECODERS = {
     ],
 )
 def test_types_that_cannot_be_decoded(connection, message):
-    with pytest.raises(Undecodable, match=message):
+    with pytest.raises(DecodeError, match=message):
         make_decoder(connection)
 
 

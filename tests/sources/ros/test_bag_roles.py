@@ -5,12 +5,14 @@ import pytest
 from bag_writer import write_bag
 from scipy.spatial.transform import Rotation
 
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate, lift_se2, make_pose
 from objslam.errors import ConfigError, LogError
-from objslam.geometry import interpolate, lift_se2, make_pose
-from objslam.ledger import Ledger
-from objslam.sources.camera_file import write_camera
-from objslam.sources.ros import BagOptions, describe, read_bag
-from objslam.types import Camera
+from objslam.io.camera_yaml import write_camera
+from objslam.sources.ros_bag.info import describe
+from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.options import BagOptions
 
 _S = 10**9
 _OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.1, 0.0, 0.4]))

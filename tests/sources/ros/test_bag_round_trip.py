@@ -5,11 +5,11 @@ import pytest
 from bag_writer import write_bag
 from drive_bag import rows_of, simulated
 
-from objslam import offline
 from objslam.config import load_settings
-from objslam.ledger import Ledger
+from objslam.core.diagnostics import Ledger
+from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
-from objslam.sources.folder import read_log_folder, write_log_folder
+from objslam.sources.log_folder import read_log_folder, write_log_folder
 
 KINDS = ["1-bag", "1-bag-bz2", "1-bag-lz4", "1-mcap-zstd", "2-sqlite3", "2-sqlite3-old", "3-sqlite3-message", "3-mcap-none",
          "4-sqlite3", "4-sqlite3-old", "4-sqlite3-file", "4-mcap-none", "4-mcap-lz4", "4-mcap-zstd"]  # fmt: skip
@@ -64,7 +64,7 @@ def test_the_same_map_as_from_the_folder(tmp_path, makers, log, kind):
     path = write_bag(tmp_path / "drive", storage, maker, rows_of(log, maker))
     settings = load_settings(None, ("mode=fixed", "association.method=by_label", "triangulation.device=cpu"))
     maps = [
-        offline.run(source, settings, Ledger()).map.objects
+        pipeline.run(source, settings, Ledger()).map.objects
         for source in (read_log_folder(tmp_path / "log", Ledger()), read(path, Ledger()))
     ]
     assert len(maps[0]) == len(maps[1]) >= 3

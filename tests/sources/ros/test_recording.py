@@ -9,11 +9,11 @@ from bag_writer import write_bag
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.ledger import Ledger
+from objslam.ros.bag.recording import find_recording, is_bag, read_messages
 from objslam.sources import read
-from objslam.sources.ros import describe, is_bag
-from objslam.sources.ros.recording import find_recording, read_messages
+from objslam.sources.ros_bag.info import describe
 
 _S = 10**9
 

@@ -4,10 +4,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import make_pose
 from objslam.errors import LogError
-from objslam.geometry import make_pose
-from objslam.ledger import Ledger
-from objslam.sources.ros.tf_tree import TfRows, TfTree
+from objslam.ros.tf.tree import TfRows, TfTree
 
 
 def _pose(seed):

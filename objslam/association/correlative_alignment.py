@@ -1,0 +1,70 @@
+"""Correlative alignment (after Olson, ICRA 2009): the planar correction that lays rays of a stretch onto known landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import lift_se2
+from objslam.core.statistics import STRAY_RAY
+from objslam.core.types import Rays
+
+_GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
+_MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most steps of the grid in yaw, and in x and y; larger costs time.
+_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The least steps (rad, m): the association that follows finds the rest.
+_LANDMARK_SIGMA = 0.03  # The standard deviation (m) of a landmark's position here.
+_MIN_LEVEL = 0.1  # The least cosine of a ray's elevation that its heading's noise is divided by.
+_AT_ONCE = 2_000_000  # The distances computed together; larger needs more memory.
+_MOST_RANGE_COST = 9.0  # The most that a range costs, in squared deviations, because it may be wrong.
+
+
+def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
+    """The planar correction (4, 4), in map, of the cameras of these rays.
+
+    Every ray costs its squared deviation from the landmark of its label that it fits best, or that of a stray.
+
+    Args:
+        positions: (N, 3) m, and labels: (N,), of the landmarks.
+        centre: (3,) m, the point about which the correction turns.
+        spread: (3,) standard deviations of x, y (m) and yaw (rad) in map: the correction's prior, which also bounds it.
+    """
+    steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
+    grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
+    cost = ((grid / np.maximum(spread, 1e-6)) ** 2).sum(axis=1)
+    few = max(1, _AT_ONCE // max(1, len(positions)))  # rays
+    size = max(1, _AT_ONCE // max(1, min(len(rays), few) * len(positions)))
+    for first in range(0, len(rays), few):
+        some = rays.take(np.arange(first, min(first + few, len(rays))))
+        for begin in range(0, len(grid), size):
+            part = slice(begin, begin + size)
+            cost[part] += _misfit(some, positions, labels, map_T_camera, centre, grid[part])
+    correction = lift_se2(grid[np.argmin(cost)])
+    correction[:3, 3] += centre - correction[:3, :3] @ centre
+    return correction
+
+
+def _misfit(
+    rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
+) -> Floats:
+    """The cost (H,) of all rays under corrections (H, 3)."""
+    origin, direction = rays.in_map(map_T_camera)
+    offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
+    cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])
+    x = centre[0] + corrections[:, :1] + cos * offset[:, 0] - sin * offset[:, 1]
+    y = centre[1] + corrections[:, 1:2] + sin * offset[:, 0] + cos * offset[:, 1]
+    heading = np.arctan2(direction[:, 1], direction[:, 0]) + corrections[:, 2, None]
+    dx, dy = positions[:, 0] - x[..., None], positions[:, 1] - y[..., None]  # (H, R, N)
+    distance = np.maximum(np.hypot(dx, dy), 1e-6)
+    angle = (np.arctan2(dy, dx) - heading[..., None] + np.pi) % (2 * np.pi) - np.pi
+    sigma = (rays.sigma / np.maximum(level, _MIN_LEVEL))[:, None]
+    deviation = angle**2 / (sigma**2 + (_LANDMARK_SIGMA / distance) ** 2)
+    miss = (distance - (rays.range * level)[:, None]) ** 2 / (rays.range_sigma**2 + _LANDMARK_SIGMA**2)[:, None]
+    deviation += np.where(np.isfinite(rays.range)[:, None], np.minimum(miss, _MOST_RANGE_COST), 0.0)
+    same = rays.label[:, None] == labels
+    return np.asarray(np.where(same, deviation, STRAY_RAY).min(axis=2, initial=STRAY_RAY).sum(axis=1))
+
+
+def _steps(sigma: float, finest: float, most: int) -> Floats:
+    """The steps of the grid along one axis, 0 among them."""
+    half = int(min(np.ceil(_GRID_SIGMAS * sigma / finest), most // 2))
+    return np.linspace(-_GRID_SIGMAS * sigma, _GRID_SIGMAS * sigma, 2 * half + 1) if half else np.zeros(1)

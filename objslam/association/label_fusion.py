@@ -1,0 +1,47 @@
+"""Which other labels a detector gives to one thing now and then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.association.existence import stray_share
+from objslam.association.gating import gated_edges
+from objslam.association.landmarks import State
+from objslam.core.arrays import Bools
+from objslam.core.statistics import grouped_median
+
+SIZE_RATIO = 2.0
+"""The greatest ratio of sizes between the boxes of two labels for them to show one thing."""
+_MIN_BOXES = 3  # The fewest boxes of another label for it to be accepted.
+_MOST_BY_CHANCE = 1e-3  # The number of labels accepted by chance in a whole log; larger fuses labels sooner.
+
+
+def fused_labels(state: State, gate: float) -> Bools:
+    """Which labels each landmark accepts (N, L): its own, and those whose unassigned boxes it explains.
+
+    Such boxes have its size and lie on it in frames in which it has no box. They are more than strays would be, and fewer
+    than its own boxes.
+    """
+    from scipy.stats import poisson
+
+    obs, accepts = state.obs, state.landmarks.accepts
+    count, labels = accepts.shape
+    free = obs.take(state.matched < 0)
+    everything = replace(state.landmarks, accepts=np.ones_like(accepts))
+    edges = gated_edges(free, everything, gate)
+    frames = int(obs.frame.max(initial=0)) + 1
+    taken = np.unique(state.owner * frames + obs.frame[state.assigned])
+    missed = ~np.isin(edges.landmark * frames + free.frame[edges.ray], taken)
+    ray, landmark = edges.ray[missed], edges.landmark[missed]
+    pair = landmark * labels + free.label[ray]
+    number = np.bincount(pair, minlength=count * labels).reshape(count, labels)
+
+    away = np.linalg.norm(state.landmarks.position[landmark] - free.origin[ray], axis=1)
+    size = grouped_median(np.sqrt(free.size[ray].prod(axis=1)) * away, pair, count * labels).reshape(count, labels)
+    ratio = size / np.maximum(state.size, 1e-9)[:, None]
+    expected = stray_share(state, gate)[:, None] * state.unassigned
+    surprising = poisson.sf(number - 1, expected) * max(count * labels, 1) < _MOST_BY_CHANCE
+    few = (number >= _MIN_BOXES) & (number < state.ray_count[:, None])
+    return np.asarray(accepts | (surprising & few & (ratio < SIZE_RATIO) & (ratio > 1 / SIZE_RATIO)))

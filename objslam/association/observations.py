@@ -1,0 +1,165 @@
+"""Rays as lines in the map, which association works on, where two of them meet, and how large things are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera
+from objslam.core.statistics import grouped_median
+from objslam.core.types import Association, Keyframes, Rays
+
+MIN_DEPTH = 0.05
+"""The least distance (m) of an object from a camera; larger loses things right in front of it."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """R boxes as lines in the map, sorted by frame, then by what the box says, never by the order in which they came.
+
+    frame: (R,) number in the order of time. label: (R,). origin: (R, 3) m, direction: (R, 3) unit, in map. sigma: (R,) rad
+    along each of two axes across. position_sigma: m, the noise of the origins. range: (R,) m, NaN where unknown;
+    range_sigma: (R,) m. size: (R, 2) width and height of what the box holds for each metre of its distance. box: (R, 4) px.
+    track: (R,) -1 where unknown. score: (R,).
+    """
+
+    frame: Ints
+    label: Ints
+    origin: Floats
+    direction: Floats
+    sigma: Floats
+    position_sigma: float
+    range: Floats
+    range_sigma: Floats
+    size: Floats
+    box: Floats
+    track: Ints
+    score: Floats
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def of_lines(
+        cls, origin: Floats, direction: Floats, sigma: Floats, range_: Floats, range_sigma: Floats, label: Ints | None = None
+    ) -> Self:
+        """R lines in map as if of one frame, with nothing known but where they point, their ranges and labels."""
+        zero, minus, one, size, box = _nothing(len(origin))
+        return cls(
+            frame=zero,
+            label=zero if label is None else label,
+            origin=origin,
+            direction=direction,
+            sigma=sigma,
+            position_sigma=0.0,
+            range=range_,
+            range_sigma=range_sigma,
+            size=size,
+            box=box,
+            track=minus,
+            score=one,
+        )
+
+    def take(self, rays: Bools | Ints) -> Self:
+        """Some of them, by a mask or increasing indices."""
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()}
+        return type(self)(**selected)
+
+
+@lru_cache(maxsize=256)
+def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats, Floats]:
+    zero = np.zeros(count, dtype=np.int64)
+    columns = zero, zero - 1, np.ones(count), np.zeros((count, 2)), np.zeros((count, 4))
+    for column in columns:
+        column.flags.writeable = False
+    return columns
+
+
+def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Where P pairs of rays come closest.
+
+    Returns:
+        The way along the first and along the second (P,) m, the point in the middle (P, 3) m, the squared gap (P,) m^2, and
+        the squared sine of their angle (P,).
+    """
+    m, n, o, p = obs.origin[first], obs.direction[first], obs.origin[second], obs.direction[second]
+    between, cos, normal = o - m, np.einsum("pi,pi->p", n, p), np.cross(n, p)
+    sin2 = np.maximum(np.einsum("pi,pi->p", normal, normal), 1e-12)
+    a, b = np.einsum("pi,pi->p", between, n), np.einsum("pi,pi->p", between, p)
+    along_first, along_second = (a - cos * b) / sin2, (cos * a - b) / sin2
+    one, two = m + along_first[:, None] * n, o + along_second[:, None] * p
+    return along_first, along_second, (one + two) / 2, ((one - two) ** 2).sum(axis=1), sin2
+
+
+def observe(
+    rays: Rays,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+    map_T_camera: Floats,
+    sigma: Floats,
+    position_sigma: float,
+) -> tuple[Observations, Ints, Ints]:
+    """The rays as observations, the ray (R,) that each one is, and the keyframe (K,) that each frame is.
+
+    Frames are in the order of time and camera, the boxes of a frame in the order of label and box: nothing depends on the
+    order in which they are given.
+    """
+    keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
+    number = np.empty(len(keyframe), dtype=np.int64)
+    number[keyframe] = np.arange(len(keyframe))
+    frame = number[rays.keyframe]
+    content = (*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame)
+    ray = np.lexsort(content)
+    rays, frame = rays.take(ray), frame[ray]
+    origin, direction = rays.in_map(map_T_camera)
+    known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
+    observations = Observations(
+        frame=frame,
+        label=rays.label,
+        origin=origin,
+        direction=direction,
+        sigma=sigma[ray],
+        position_sigma=position_sigma,
+        range=np.where(known, rays.range, np.nan),
+        range_sigma=np.where(known, rays.range_sigma, np.nan),
+        size=size_per_metre(rays, keyframes, cameras),
+        box=rays.box,
+        track=rays.track_id,
+        score=rays.score,
+    )
+    return observations, ray, keyframe
+
+
+def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
+    """Width and height (R, 2) of what each box holds, m for each m of its distance."""
+    of = keyframes.camera[rays.keyframe]
+    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
+    pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
+    depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # in a pinhole image size falls with z, not with distance
+    return np.asarray((rays.box[:, 2:] - rays.box[:, :2]) / focal * depth[:, None])
+
+
+def extents(
+    rays: Rays,
+    association: Association,
+    positions: Floats,
+    map_T_camera: Floats,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+) -> Floats:
+    """Width and height (N, 2) m of the objects at positions (N, 3) m: the median over their rays.
+
+    NaN where there is no ray or no position, or where half of the rays come from a camera that sees no sizes.
+    map_T_camera: (K, 4, 4) of the keyframes.
+    """
+    held = np.flatnonzero(association.object >= 0)
+    index = association.object[held]
+    distance = np.linalg.norm(positions[index] - map_T_camera[rays.keyframe[held], :3, 3], axis=1)
+    size = size_per_metre(rays.take(held), keyframes, cameras) * distance[:, None]
+    size[~np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[held]]]] = np.nan
+    return grouped_median(size, index, len(association.label))

@@ -1,0 +1,115 @@
+"""Class names: as the settings give them, as the model's metadata tells them, or COCO's where their number fits."""
+
+from __future__ import annotations
+
+import ast
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from objslam import config
+from objslam.core.coco import COCO_NAMES
+from objslam.errors import ConfigError, DetectorError
+
+_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # numbers of COCO's 91 that no class has
+_BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})
+_MOST = 100_000
+
+
+def _coco91() -> tuple[str, ...]:
+    names = iter(COCO_NAMES)
+    return tuple("N/A" if number in _GAPS else next(names) for number in range(91))
+
+
+KNOWN = {"coco": COCO_NAMES, "coco91": _coco91()}
+
+
+def is_background(name: str) -> bool:
+    """Whether the name stands for no object at all."""
+    return name.strip().lower() in _BACKGROUND
+
+
+def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
+    """The names that the settings give: a list, coco, coco91, or a file, as it stands or beside the model.
+
+    ConfigError where there is no such file, or something in it is not a name.
+    """
+    if given is None:
+        return None
+    if isinstance(given, tuple):
+        return _checked(given, "detector.names")
+    if given in KNOWN:
+        return KNOWN[given]
+    places = (Path(given), model.parent / given)
+    file = next((place for place in places if config.is_file(place)), None)
+    if file is None:
+        looked = " and ".join(dict.fromkeys(str(place) for place in places))
+        raise ConfigError(f"there is no names file {given}", hint=f"looked for {looked}; known lists: {', '.join(KNOWN)}")
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the names cannot be read: {error}", where=str(file)) from error
+    if file.suffix.lower() not in (".yaml", ".yml", ".json"):
+        return _checked(tuple(line.strip() for line in text.rstrip().splitlines()), str(file))
+    try:
+        data = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"not YAML: {str(error).splitlines()[0]}", where=str(file)) from error
+    names = _as_names(data.get("names", data) if isinstance(data, dict) else data)
+    if names is None:
+        raise ConfigError("no list of names in it", where=str(file), hint="names: [cup, book] or names: {0: cup, 1: book}")
+    return _checked(names, str(file))
+
+
+def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
+    """The names in a model's metadata, a Python or JSON list or dictionary; None where there are none.
+
+    DetectorError where there is something else.
+    """
+    if not text:
+        return None
+    try:
+        data = ast.literal_eval(text)
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError):
+            data = None
+    names = _as_names(data)
+    if names is None:
+        message = f"the names in the model's metadata are no list of names: {text[:60]!r}"
+        raise DetectorError(message, where=str(model), hint="give them in detector.names")
+    return _checked(names, f"{model}, metadata")
+
+
+def default_names(count: int) -> tuple[tuple[str, ...], str] | None:
+    """COCO's names for a model that brings none, if their number is its, and a warning that says so."""
+    for key, names in KNOWN.items():
+        if len(names) == count:
+            return names, f"the model names no classes but has {count} of them, as {key} has: its names are taken"
+    return None
+
+
+def _as_names(data: Any) -> tuple[str, ...] | None:
+    if isinstance(data, dict):
+        try:
+            numbered = {int(number): name for number, name in data.items()}
+        except (TypeError, ValueError):
+            return None
+        if not numbered or min(numbered) < 0 or max(numbered) >= _MOST:
+            return None
+        data = [numbered.get(number, f"class_{number}") for number in range(max(numbered) + 1)]
+    if not isinstance(data, list | tuple) or not data or not all(isinstance(name, str | int) for name in data):
+        return None
+    return tuple(str(name).strip() for name in data)
+
+
+def _checked(names: tuple[str, ...], where: str) -> tuple[str, ...]:
+    for number, name in enumerate(names):
+        if not name.strip() or not name.isprintable():
+            raise ConfigError(f"the name of class {number} is empty or not printable", where=where)
+    if not names:
+        raise ConfigError("no name in it", where=where)
+    return names

@@ -1,0 +1,173 @@
+"""The network itself: an ONNX model in an onnxruntime session, and what its file says about it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam import config
+from objslam.core.arrays import Array
+from objslam.errors import ConfigError, DetectorError, first_line
+
+_KINDS: dict[str, type[np.generic]] = {
+    "float": np.float32,
+    "float16": np.float16,
+    "double": np.float64,
+    "uint8": np.uint8,
+    "int32": np.int32,
+    "int64": np.int64,
+    "bool": np.bool_,
+}
+_PIXELS = ("float", "float16", "double", "uint8")
+_MASK, _SIZES = "pixel_mask", "orig_target_sizes"
+_FED = {_MASK: 3, _SIZES: 2}  # what exporters of the DETR family ask for besides the image, with the rank
+_CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+
+
+@dataclass(frozen=True)
+class Tensor:
+    """An input or output as the model declares it: name, shape (None where it may be anything), kind of its values."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    kind: str
+
+    def __str__(self) -> str:
+        return f"{self.name} [{', '.join('?' if n is None else str(n) for n in self.shape)}] {self.kind}"
+
+
+@dataclass(frozen=True)
+class ImageInput:
+    """How the image goes in.
+
+    batch, height, width: None where they may be anything; batch is 0 where there is no such axis. channels_last: HWC.
+    """
+
+    tensor: Tensor
+    batch: int | None
+    height: int | None
+    width: int | None
+    channels_last: bool
+
+
+@dataclass(frozen=True)
+class Network:
+    """A session that runs, with the facts of its file. digest: SHA-256 of the model. extras: its other inputs."""
+
+    path: Path
+    session: Any
+    digest: str
+    metadata: Mapping[str, str]
+    image: ImageInput
+    extras: tuple[Tensor, ...]
+    outputs: tuple[Tensor, ...]
+
+    def run(self, blob: Array) -> list[Array]:
+        """The outputs, in the model's order, for the values of images (B, 3, H, W); DetectorError if it fails."""
+        count, _, height, width = blob.shape
+        array = blob.transpose(0, 2, 3, 1) if self.image.channels_last else blob
+        if self.image.batch == 0:
+            array = array[0]
+        feed = {self.image.tensor.name: np.ascontiguousarray(array, dtype=_KINDS[self.image.tensor.kind])}
+        for extra in self.extras:
+            feed[extra.name] = _extra(extra, count, height, width)
+        try:
+            return [np.asarray(output) for output in self.session.run(None, feed)]
+        except Exception as error:
+            message = f"onnxruntime cannot run the model on images of {width}x{height}: {first_line(error)}"
+            raise DetectorError(message, where=str(self.path)) from error
+
+
+def open_network(path: Path, settings: config.Detector) -> Network:
+    """Load an ONNX model with the settings' device and threads.
+
+    DetectorError where the file is missing, no ONNX model, or has inputs that an image cannot feed; ConfigError where CUDA
+    is asked for and this onnxruntime cannot give it.
+    """
+    import onnxruntime
+
+    try:
+        digest = _digest(path)
+    except OSError as error:
+        raise DetectorError(f"the model cannot be read: {error.strerror or error}", where=str(path)) from error
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # what fails is raised; it is not printed besides
+    options.intra_op_num_threads = settings.threads
+    # Threads that spin while they wait take the cores from the thread that decodes the images.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    providers = _providers(onnxruntime, settings.device)
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:
+        message = f"not an ONNX model that onnxruntime loads: {first_line(error)}"
+        raise DetectorError(message, where=str(path)) from error
+    if settings.device == "cuda" and _CUDA not in session.get_providers():
+        raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="are its CUDA libraries there?")
+    inputs, outputs = ([_tensor(node) for node in nodes] for nodes in (session.get_inputs(), session.get_outputs()))
+    image, extras = _split_inputs(path, inputs)
+    metadata = session.get_modelmeta().custom_metadata_map
+    return Network(path, session, digest, metadata, image, extras, tuple(outputs))
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of the model and of the files beside it that begin with its name: exporters keep large weights there."""
+    total = hashlib.sha256()
+    beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
+    for part in (path, *beside):
+        with part.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
+
+
+def _providers(onnxruntime: Any, device: config.Device) -> list[str]:
+    offered = _CUDA in onnxruntime.get_available_providers()
+    if device == "cuda" and not offered:
+        raise ConfigError(
+            "detector.device is cuda, but this onnxruntime has no CUDA", hint="pip install onnxruntime-gpu in its place"
+        )
+    if device == "cpu" or not offered:
+        return [_CPU]
+    onnxruntime.preload_dlls()  # finds the CUDA libraries that pip installed
+    return [_CUDA, _CPU]
+
+
+def _tensor(node: Any) -> Tensor:
+    shape = tuple(n if isinstance(n, int) and n > 0 else None for n in node.shape)
+    return Tensor(node.name, shape, str(node.type).removeprefix("tensor(").removesuffix(")"))
+
+
+def _split_inputs(path: Path, inputs: list[Tensor]) -> tuple[ImageInput, tuple[Tensor, ...]]:
+    images = [image for image in map(_as_image, inputs) if image is not None]
+    rest = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
+    if len(images) != 1 or len(rest) + 1 != len(inputs):
+        saw = "; ".join(map(str, inputs)) or "none"
+        raise DetectorError(
+            f"the model has inputs that an image does not feed: {saw}",
+            where=str(path),
+            hint=f"one image with 3 channels is fed, and {_MASK} and {_SIZES} where they are asked for; export the model so",
+        )
+    return images[0], rest
+
+
+def _as_image(tensor: Tensor) -> ImageInput | None:
+    shape = tensor.shape
+    if tensor.kind not in _PIXELS or len(shape) not in (3, 4) or tensor.name in _FED:
+        return None
+    batch, (a, b, c) = (shape[0] if len(shape) == 4 else 0), shape[-3:]
+    if a == 3 or (a is None and c != 3):
+        return ImageInput(tensor, batch, b, c, channels_last=False)
+    return ImageInput(tensor, batch, a, b, channels_last=True) if c == 3 else None
+
+
+def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
+    """pixel_mask: all of the image counts. orig_target_sizes: boxes in pixels of the input, as from any other model."""
+    kind = _KINDS[tensor.kind]
+    if tensor.name == _SIZES:
+        return np.tile(np.array([width, height], dtype=kind), (count, 1))
+    sides = [side or full for side, full in zip(tensor.shape[-2:], (height, width), strict=True)]
+    return np.ones((count, *sides), dtype=kind)

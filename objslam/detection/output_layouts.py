@@ -1,0 +1,223 @@
+"""Which layout a model's outputs have, told from their shapes on one image and from the model's metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from objslam import config
+from objslam.config import Layout, Role
+from objslam.core.arrays import Array
+from objslam.errors import ConfigError, DetectorError
+
+STRIDES = (8, 16, 32)  # of the three grids that most of the YOLOs predict on
+_FEW = 1000  # more boxes than a network gives once it has chosen among them; a grid gives thousands
+_ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
+    "ssd": (frozenset({"boxes", "labels", "scores"}), frozenset({"boxes", "labels"})),
+    "detr": (frozenset({"boxes", "logits"}), frozenset({"predictions"})),
+}
+_ONE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
+
+Roles = Mapping[Role, str]
+"""The name of the output that holds each role."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One output of a run on one image: its name and values."""
+
+    name: str
+    values: Array
+
+    def __str__(self) -> str:
+        return f"{self.name} {list(self.values.shape)} {self.values.dtype}"
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What helps to tell layouts apart: the input's size in px, the number of class names (None if unknown), metadata."""
+
+    height: int
+    width: int
+    classes: int | None
+    metadata: Mapping[str, str]
+
+    @property
+    def cells(self) -> int:
+        """Cells of the three grids together."""
+        return sum(-(-self.height // stride) * -(-self.width // stride) for stride in STRIDES)
+
+    @property
+    def ultralytics_detr(self) -> bool:
+        """Whether Ultralytics says that it is one of the DETR family: one output then, with each box's class scores, or,
+        since 8.4 (which names the `head` besides), its best score and class."""
+        return "detr" in self.metadata.get("description", "").lower()
+
+
+def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
+    """The layout of the outputs and which of them has which role; what the settings say goes before what is told.
+
+    ConfigError where the settings name outputs that are not there, or roles that make no layout; DetectorError, with the
+    outputs and how to describe them, where no layout fits.
+    """
+    found: tuple[Layout, Roles] | None
+    if settings.outputs is not None:
+        named = _named(outputs, settings.outputs, model)
+        layout = settings.layout or _by_roles(named, facts)
+        found = (layout, settings.outputs) if layout is not None else None
+        if layout is not None and frozenset(named) not in _ROLES.get(layout, _ONE):
+            forms = " or ".join(", ".join(sorted(form)) for form in _ROLES.get(layout, _ONE))
+            message = f"detector.outputs names {', '.join(sorted(named))}, but the layout {layout} has {forms}"
+            raise ConfigError(message, where=str(model))
+    elif settings.layout is not None:
+        roles = _roles(settings.layout, outputs)
+        found = (settings.layout, roles) if roles is not None else None
+    else:
+        found = _tell(outputs, facts)
+    if found:
+        return found
+    saw = "; ".join(map(str, outputs))
+    what = "no layout that is known" if settings.layout is None else f"not the layout {settings.layout}"
+    raise DetectorError(
+        f"its outputs fit {what}: {saw}",
+        where=str(model),
+        hint=f"describe them: detector.layout is one of {', '.join(get_args(Layout))}; detector.outputs says which is "
+        "which, such as {boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}",
+    )
+
+
+def rows_are_boxes(values: Array, classes: int | None) -> bool:
+    """Whether predictions (..., A, B) have a box a row, not a box a column as YOLOv8 has it."""
+    rows, columns = values.shape[-2:]
+    if classes is not None and (rows == 4 + classes) != (columns == 4 + classes):
+        return bool(columns == 4 + classes)
+    return bool(rows > columns)
+
+
+def count_classes(layout: Layout, named: Mapping[Role, Array], facts: Facts) -> int | None:
+    """How many classes the outputs have room for; None where they only give the numbers of classes."""
+    if layout in ("ssd", "end_to_end"):
+        return None
+    if "logits" in named:
+        return int(named["logits"].shape[-1])
+    values = named["predictions"]
+    if layout == "yolov8":
+        return int(values.shape[-1 if rows_are_boxes(values, facts.classes) else -2]) - 4
+    return int(values.shape[-1]) - (4 if layout == "detr" else 5)
+
+
+def _tell(outputs: Sequence[Output], facts: Facts) -> tuple[Layout, Roles] | None:
+    ssd, detr, single = _ssd_roles(outputs), _detr_roles(outputs), _single(outputs)
+    if ssd is not None:
+        return "ssd", ssd
+    if detr is not None and all(o.values.shape[-2] <= _FEW for o in outputs if o.name in detr.values()):
+        return "detr", detr
+    layout = _tell_single(single, facts) if single is not None else None
+    return (layout, {"predictions": single.name}) if single is not None and layout is not None else None
+
+
+def _roles(layout: Layout, outputs: Sequence[Output]) -> Roles | None:
+    single = _single(outputs)
+    one: Roles | None = {"predictions": single.name} if single is not None else None
+    if layout == "ssd":
+        return _ssd_roles(outputs)
+    return _detr_roles(outputs) or one if layout == "detr" else one
+
+
+def _ssd_roles(outputs: Sequence[Output]) -> Roles | None:
+    for boxes in outputs:
+        shape = boxes.values.shape
+        if len(shape) not in (2, 3) or shape[-1] not in (4, 5):
+            continue
+        columns = [o for o in outputs if o is not boxes and o.values.shape in (shape[:-1], (*shape[:-1], 1))]
+        whole = [o for o in columns if o.values.dtype.kind in "iu"]
+        labels = _named_so(whole or columns, "label", "class") if len(whole) != 1 else whole
+        scores = [o for o in columns if o not in labels and o.values.dtype.kind == "f"]
+        scores = _named_so(scores, "score", "conf") if len(scores) > 1 else scores
+        if len(labels) == 1 and shape[-1] == 4 and len(scores) == 1:
+            return {"boxes": boxes.name, "labels": labels[0].name, "scores": scores[0].name}
+        if len(labels) == 1 and shape[-1] == 5 and not scores:
+            return {"boxes": boxes.name, "labels": labels[0].name}
+    return None
+
+
+def _detr_roles(outputs: Sequence[Output]) -> Roles | None:
+    lists = [o for o in outputs if o.values.ndim in (2, 3) and o.values.dtype.kind == "f"]
+    boxes = [o for o in lists if o.values.shape[-1] == 4]
+    if len(boxes) > 1:
+        boxes = _named_so(boxes, "box", "det")
+    if len(boxes) != 1:
+        return None
+    beside = [o for o in lists if o is not boxes[0] and o.values.shape[:-1] == boxes[0].values.shape[:-1]]
+    return {"boxes": boxes[0].name, "logits": beside[0].name} if len(beside) == 1 else None
+
+
+def _single(outputs: Sequence[Output]) -> Output | None:
+    """The one output with predictions; others may be there that have nothing for each box (masks, raw heads)."""
+    lists = [o for o in outputs if o.values.dtype.kind == "f" and (_is_numbered(o) or _is_list(o))]
+    if len(lists) != 1:
+        return None
+    beside = [o for o in outputs if o is not lists[0] and o.values.shape[:2] == lists[0].values.shape[:2]]
+    return None if beside else lists[0]
+
+
+def _is_list(output: Output) -> bool:
+    return output.values.ndim == 3 and output.values.shape[-1] >= 5
+
+
+def _is_numbered(output: Output) -> bool:
+    return output.values.ndim == 2 and output.values.shape[-1] == 7  # the image's number comes first (YOLOv7, end to end)
+
+
+def _tell_single(output: Output, facts: Facts) -> Layout | None:
+    if _is_numbered(output):
+        return "end_to_end"
+    (rows, columns), cells, classes = output.values.shape[-2:], facts.cells, facts.classes
+    few = rows <= _FEW and rows not in (cells, 3 * cells)
+    if few and facts.ultralytics_detr:
+        return "end_to_end" if columns == 6 and (classes != 2 or "head" in facts.metadata) else "detr"
+    if facts.metadata.get("end2end") == "True" or (few and columns == 6):
+        return "end_to_end"
+    if columns == cells:
+        return "yolov8"
+    if rows == 3 * cells:
+        return "yolov5"
+    if rows == cells and (classes is None or columns != 4 + classes):
+        return _tell_yolox(output.values)
+    if classes is not None and 4 + classes in (rows, columns):
+        return "detr" if few and columns == 4 + classes else "yolov8"
+    if classes is not None and columns == 5 + classes:
+        return "yolov5"
+    if max(rows, columns) > _FEW:  # other grids: more strides, more anchors
+        return "yolov8" if columns > rows else "yolov5"
+    return None
+
+
+def _tell_yolox(values: Array) -> Layout:
+    """Raw offsets stay within a few cells; decoded centres, in pixels, are spread over the image."""
+    if np.median(np.abs(values[..., :2])) < STRIDES[0]:
+        return "yolox"
+    return "yolov5" if (values[..., 4] == 1).all() else "yolox_decoded"  # YOLOv6 writes an objectness of 1 throughout
+
+
+def _by_roles(named: Mapping[Role, Output], facts: Facts) -> Layout | None:
+    if "predictions" in named:
+        return _tell_single(named["predictions"], facts) if _is_list(named["predictions"]) else None
+    return "detr" if "logits" in named else "ssd"
+
+
+def _named(outputs: Sequence[Output], names: Roles, model: Path) -> dict[Role, Output]:
+    there = {output.name: output for output in outputs}
+    for name in names.values():
+        if name not in there:
+            message = f"detector.outputs: the model has no output {name!r}"
+            raise ConfigError(message, where=str(model), hint=f"it has {'; '.join(map(str, outputs))}")
+    return {role: there[name] for role, name in names.items()}
+
+
+def _named_so(outputs: Sequence[Output], *words: str) -> list[Output]:
+    return [output for output in outputs if any(word in output.name.lower() for word in words)]

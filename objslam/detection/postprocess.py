@@ -1,0 +1,185 @@
+"""Outputs to boxes: one function a layout, each on one image, vectorised over its boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.config import Layout, Role
+from objslam.core.arrays import Array, Floats, Ints
+from objslam.detection.output_layouts import STRIDES
+from objslam.detection.recipe import Recipe
+from objslam.errors import DetectorError
+
+_FRACTION = 1.5  # no box in fractions of the image reaches further out, and none in pixels that stays below matters
+_CANDIDATES = 1000  # The best boxes that go through non-maximum suppression, whose time grows with their square.
+_Outputs = Mapping[Role, Array]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Boxes (N, 4), scores (N,) and the number of each one's class, label (N,)."""
+
+    boxes: Floats
+    scores: Floats
+    label: Ints
+
+
+def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    """The boxes of one image that count: x1, y1, x2, y2 in px of the network's input of width x height, the best first.
+
+    outputs: by role, without the batch's axis. label: place among the recipe's names, or the model's number without names.
+    DetectorError where scores are no probabilities or a class has no name.
+    """
+    found = _DECODERS[recipe.layout](recipe, outputs, width, height)
+    boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
+    if len(scores) and scores.max() > 1.001:
+        hint = "detector.activation: sigmoid or softmax makes them from what the network gives"
+        raise DetectorError(f"scores of up to {scores.max():g} are no probabilities", hint=hint)
+    label = _places(recipe, found.label)
+    keep = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (label >= 0)
+    if recipe.taken is not None:
+        keep &= np.isin(label, recipe.taken)
+    boxes, scores, label = boxes[keep], np.minimum(scores[keep], 1.0), label[keep]
+    best = np.argsort(-scores, kind="stable")[:_CANDIDATES]
+    if recipe.nms:
+        best = best[suppress(boxes[best], scores[best], label[best], recipe.iou)]
+    best = best[: recipe.max_boxes]
+    return Candidates(boxes[best], scores[best], label[best])
+
+
+def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
+    """Indices of the boxes (N, 4) that stay, best first: none overlaps a better one of its label by more than `iou`."""
+    import cv2
+
+    if len(boxes) == 0:
+        return np.zeros(0, dtype=np.int64)
+    sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    kept = cv2.dnn.NMSBoxesBatched(sized, scores.astype(np.float32), label.astype(np.int32), -1.0, iou)  # type: ignore[arg-type]
+    return np.asarray(kept, dtype=np.int64).reshape(-1)
+
+
+def _ssd(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    boxes = outputs["boxes"]
+    scores = _probability(outputs["scores"].reshape(-1) if "scores" in outputs else boxes[:, 4], recipe)
+    keep = np.flatnonzero(scores >= recipe.min_score)
+    return _candidates(boxes[keep, :4], scores[keep], outputs["labels"].reshape(-1)[keep])
+
+
+def _end_to_end(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    rows = outputs["predictions"]
+    if rows.shape[1] == 7:  # YOLOv7 writes the image's number, box, class, score
+        rows = rows[:, [1, 2, 3, 4, 6, 5]]
+    scores = _probability(rows[:, 4], recipe)
+    keep = np.flatnonzero(scores >= recipe.min_score)
+    return _candidates(rows[keep, :4], scores[keep], rows[keep, 5])
+
+
+def _yolov8(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    rows = outputs["predictions"] if recipe.row_boxes else outputs["predictions"].T
+    return _best_class(recipe, rows[:, :4], rows[:, 4:])
+
+
+def _yolov5(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    rows = _likely(recipe, outputs["predictions"])[0]
+    return _best_class(recipe, rows[:, :4], rows[:, 5:], rows[:, 4])
+
+
+def _yolox(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    rows, likely = _likely(recipe, outputs["predictions"])
+    cells, strides = _grid(width, height)
+    if len(strides) != len(outputs["predictions"]):
+        message = (
+            f"{len(outputs['predictions'])} predictions, but the grids of an input of {width}x{height} have {len(strides)}"
+        )
+        raise DetectorError(message, hint="detector.layout yolox needs strides of 8, 16 and 32")
+    cells, strides, raw = cells[likely], strides[likely, None], rows[:, :4].astype(np.float64)
+    with np.errstate(over="ignore"):  # an infinite box is dropped
+        boxes = np.concatenate([(raw[:, :2] + cells) * strides, np.exp(raw[:, 2:]) * strides], axis=1)
+    return _best_class(recipe, boxes, rows[:, 5:], rows[:, 4])
+
+
+def _detr(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
+    if "predictions" in outputs:
+        rows = outputs["predictions"]
+        return _best_class(recipe, rows[:, :4], rows[:, 4:])
+    return _best_class(recipe, outputs["boxes"], outputs["logits"])
+
+
+_DECODERS: dict[Layout, Callable[[Recipe, _Outputs, int, int], Candidates]] = {
+    "ssd": _ssd,
+    "yolov8": _yolov8,
+    "yolov5": _yolov5,
+    "end_to_end": _end_to_end,
+    "yolox": _yolox,
+    "yolox_decoded": _yolov5,
+    "detr": _detr,
+}
+
+
+def _likely(recipe: Recipe, rows: Array) -> tuple[Array, Ints]:
+    """The rows whose objectness, in column 4, alone is enough, and which they are: few, so that the rest costs little."""
+    likely = np.flatnonzero(_probability(rows[:, 4], recipe) >= recipe.min_score)
+    return rows[likely], likely
+
+
+def _best_class(recipe: Recipe, boxes: Array, values: Array, objectness: Array | None = None) -> Candidates:
+    """Each box with its best class where that is good enough; values (N, C), objectness (N,) multiplies them."""
+    values = values[:, : recipe.channels]
+    if recipe.activation == "softmax":
+        weights = np.exp(values - values.max(axis=1, keepdims=True))
+        values = (weights / weights.sum(axis=1, keepdims=True))[:, :-1]
+    scores = values.max(axis=1)
+    if recipe.activation == "sigmoid":
+        scores = _probability(scores, recipe)
+    if objectness is not None:
+        scores = scores * _probability(objectness, recipe)
+    keep = np.flatnonzero(scores >= recipe.min_score)
+    return _candidates(boxes[keep], scores[keep], values[keep].argmax(axis=1))
+
+
+def _candidates(boxes: Array, scores: Array, label: Array) -> Candidates:
+    numbers = np.where(np.isfinite(label), label, -1).astype(np.float64)
+    return Candidates(boxes.astype(np.float64), scores.astype(np.float64), np.rint(numbers).astype(np.int64))
+
+
+def _probability(values: Array, recipe: Recipe) -> Array:
+    if recipe.activation != "sigmoid":
+        return values
+    return 0.5 * (1.0 + np.tanh(0.5 * values.astype(np.float64)))  # the logistic function, without overflow
+
+
+def _grid(width: int, height: int) -> tuple[Floats, Floats]:
+    """The corner (N, 2) and stride (N,) of every cell, grid after grid, row after row."""
+    corners, strides = [], []
+    for stride in STRIDES:
+        columns, rows = np.meshgrid(np.arange(-(-width // stride)), np.arange(-(-height // stride)))
+        corners.append(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        strides.append(np.full(columns.size, stride))
+    return np.concatenate(corners).astype(np.float64), np.concatenate(strides).astype(np.float64)
+
+
+def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
+    """Boxes (N, 4) in the recipe's form and units as x1, y1, x2, y2 in px of the network's input."""
+    if recipe.box_form == "cxcywh":
+        boxes = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
+    elif recipe.box_form == "yxyx":
+        boxes = boxes[:, [1, 0, 3, 2]]
+    fractions = recipe.box_units == "fractions"
+    if recipe.box_units is None:
+        fractions = bool((np.abs(boxes) <= _FRACTION).all())
+    return boxes * np.array([width, height] * 2) if fractions else boxes
+
+
+def _places(recipe: Recipe, label: Ints) -> Ints:
+    """The place of each number among the names, -1 for the background before the first; the number itself without names."""
+    places = label - recipe.first_label
+    beyond = places >= len(recipe.names)
+    if recipe.names and beyond.any():
+        message = f"the model gives class {label[beyond][0]}, but there are {len(recipe.names)} names"
+        raise DetectorError(
+            message, hint="detector.names in the model's order; detector.first_label, the first one's number"
+        )
+    return np.maximum(places, -1)

@@ -1,0 +1,87 @@
+"""Images in: fitted into the network's input, its colours and range of values; and the way back for the boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Array, Floats
+from objslam.detection.recipe import InputSize, Recipe
+from objslam.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where an image of width x height px lies in the network's input: at left, top, resized to content_width x _height."""
+
+    width: int
+    height: int
+    input_width: int
+    input_height: int
+    left: int
+    top: int
+    content_width: int
+    content_height: int
+
+    def to_raw(self, boxes: Floats) -> Floats:
+        """Boxes (N, 4) x1, y1, x2, y2 from pixels of the input to pixels of the raw image, cut off at its edges."""
+        scale = np.array([self.width / self.content_width, self.height / self.content_height] * 2)
+        raw = (boxes - np.array([self.left, self.top] * 2)) * scale
+        return np.clip(raw, 0.0, np.array([self.width, self.height] * 2, dtype=np.float64))
+
+
+def fit(recipe: Recipe, width: int, height: int) -> Fit:
+    """How an image of this size goes in; ConfigError where it cannot."""
+    size = recipe.size
+    if recipe.resize == "none":
+        if (width if size.free_width else size.width, height if size.free_height else size.height) != (width, height):
+            message = (
+                f"detector.resize is none, but the model takes {size.width}x{size.height} and images are {width}x{height}"
+            )
+            raise ConfigError(message, hint="letterbox, corner or stretch fits them")
+        return Fit(width, height, width, height, 0, 0, width, height)
+    if recipe.resize == "stretch":
+        return Fit(width, height, size.width, size.height, 0, 0, size.width, size.height)
+    scale = min(size.width / width, size.height / height)
+    content_width, content_height = max(round(width * scale), 1), max(round(height * scale), 1)
+    input_width, input_height = _shrunk(size, content_width, content_height)
+    left, top = 0, 0
+    if recipe.resize == "letterbox":
+        left, top = (input_width - content_width) // 2, (input_height - content_height) // 2
+    return Fit(width, height, input_width, input_height, left, top, content_width, content_height)
+
+
+def fill(recipe: Recipe, images: Sequence[Array], where: Fit, count: int) -> Array:
+    """The images (H, W, 3), uint8 BGR, of one size, as values (count, 3, H, W); those missing to `count` are grey."""
+    import cv2
+
+    gain = 1.0 / (recipe.divide_by * np.array(recipe.std))
+    offset = -np.array(recipe.mean) / np.array(recipe.std)
+    blob = np.empty((count, 3, where.input_height, where.input_width), dtype=np.float32)
+    if len(images) < count or (where.content_width, where.content_height) != (where.input_width, where.input_height):
+        blob[:] = (recipe.pad * gain + offset).astype(np.float32)[:, None, None]
+    rows = slice(where.top, where.top + where.content_height)
+    columns = slice(where.left, where.left + where.content_width)
+    for image, planes in zip(images, blob, strict=False):
+        content = image
+        if (where.content_width, where.content_height) != (where.width, where.height):
+            content = cv2.resize(image, (where.content_width, where.content_height), interpolation=cv2.INTER_LINEAR)
+        channels = cv2.split(content)
+        for plane, channel, factor, shift in zip(
+            planes, reversed(channels) if recipe.colour == "rgb" else channels, gain, offset, strict=True
+        ):
+            target = plane[rows, columns]
+            np.multiply(channel, np.float32(factor), out=target)
+            if shift:
+                target += np.float32(shift)
+    return blob
+
+
+def _shrunk(size: InputSize, width: int, height: int) -> tuple[int, int]:
+    """The input, along its free axes only as much of it as holds the content, in whole strides."""
+    return (
+        -(-width // size.stride) * size.stride if size.free_width else size.width,
+        -(-height // size.stride) * size.stride if size.free_height else size.height,
+    )

@@ -1,0 +1,68 @@
+"""A comparison with the ground truth as tables for a terminal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from objslam.evaluation.evaluate import Evaluation
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+_OBJECT_ROWS = (
+    ("matched", "matched objects", ""),
+    ("missed", "missed objects", ""),
+    ("false", "false objects", ""),
+    ("unresolved", "unresolved objects", ""),
+    ("precision", "precision", ""),
+    ("recall", "recall", ""),
+    ("position_rmse", "position RMSE", " m"),
+    ("position_median", "position median", " m"),
+    ("position_max", "position max", " m"),
+)
+"""Rows about objects: the key in evaluation.json, what the table says, and the unit."""
+
+_PATH_ROWS = (
+    ("ate", "ATE (RMSE)", " m"),
+    ("ate_median", "ATE median", " m"),
+    ("ate_max", "ATE max", " m"),
+    ("ate_in_map_alignment", "ATE in the objects' alignment", " m"),
+    ("path_poses", "poses compared", ""),
+    ("path_poses_without_truth", "poses without truth", ""),
+)
+"""Rows about the path, likewise."""
+
+
+def evaluation_table(evaluation: Evaluation) -> RenderableType:
+    """The scores, every object with its error (the worst first), and the warnings."""
+    from rich.console import Group
+    from rich.markup import escape
+    from rich.table import Table
+
+    data = evaluation.to_dict()
+    scores = Table(title=f"align {evaluation.align}, radius {evaluation.radius:g} m")
+    scores.add_column("against the ground truth" if evaluation.truth is None else f"against {escape(evaluation.truth)}")
+    scores.add_column("value", justify="right")
+    rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
+    for key, name, unit in rows:
+        scores.add_row(name, _cell(data[key], unit))
+    parts: list[RenderableType] = [scores]
+    if evaluation.objects is not None:
+        listing = Table(title="objects, the worst first")
+        for column in ("object", "truth", "label", "error (m)"):
+            listing.add_column(column, justify="left" if column == "label" else "right")
+        for m in sorted(evaluation.objects.matches, key=lambda m: -m.error):
+            listing.add_row(str(m.object.id), str(m.truth.id), escape(m.object.label), f"{m.error:.3f}")
+        for missed in evaluation.objects.missed:
+            listing.add_row("-", str(missed.id), escape(missed.label), "missed")
+        for false in evaluation.objects.false:
+            listing.add_row(str(false.id), "-", escape(false.label), "false")
+        parts.append(listing)
+    parts += [f"warning: {escape(text)}" for text in evaluation.warnings]
+    return Group(*parts)
+
+
+def _cell(value: Any, unit: str) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}{unit}" if isinstance(value, float) else f"{value}{unit}"

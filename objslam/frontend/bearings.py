@@ -1,0 +1,128 @@
+"""From boxes to bearing rays: each box's centre, undistorted, as a direction from its keyframe's camera."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera, undistort
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Keyframes, Log, Rays, label_table
+
+MAX_OF_LABEL = 1000
+"""The most boxes of one label in a frame that are looked at, which bounds memory and time in a crowd."""
+
+
+def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
+    """One ray for each usable box of the keyframes, in their order.
+
+    Dropped and counted are boxes below the score limit, with their centre outside the image, cut off by its edge (unless
+    the detections are `whole`), where the lens model has no inverse, or beyond the surest `MAX_OF_LABEL` of a label in a
+    frame.
+    """
+    label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
+    place = {name: i for i, name in enumerate(label_names)}
+    columns: list[tuple[Floats | Ints, ...]] = []
+    for index, camera_log in enumerate(log.cameras):
+        detections, camera = camera_log.detections, camera_log.camera
+        if detections is None:
+            continue
+        keyframe_of_frame = np.full(len(detections.frame_stamps), -1)
+        mine = np.flatnonzero(keyframes.camera == index)
+        keyframe_of_frame[keyframes.frame[mine]] = mine
+        boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
+        kept, directions, angle_sigma = box_rays(boxes.boxes, boxes.scores, camera, settings, ledger, boxes.whole)
+        boxes = boxes.take(kept)
+        few = surest(boxes.frame, boxes.label, boxes.scores, camera, ledger)
+        boxes, directions, angle_sigma = boxes.take(few), directions[few], angle_sigma[few]
+        names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
+        of_rays = (keyframe_of_frame[boxes.frame], directions, angle_sigma)
+        columns.append((*of_rays, boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids))
+    keyframe, direction, sigma, depth, label, score, box, track_id = (np.concatenate(c) for c in zip(*columns, strict=True))
+    order = np.argsort(keyframe, kind="stable")
+    if not settings.depth.use:
+        depth = np.full(len(depth), np.nan)
+    ranges = (depth / direction[:, 2])[order]
+    return Rays(
+        keyframe=keyframe[order],
+        direction=direction[order],
+        sigma=sigma[order],
+        range=ranges,
+        range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * ranges,
+        label=label[order],
+        score=score[order],
+        box=box[order],
+        track_id=track_id[order],
+        label_names=label_names,
+    )
+
+
+def box_rays(
+    boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
+) -> tuple[Ints, Floats, Floats]:
+    """Indices (n,) of the usable boxes (M, 4) px of a camera, their unit directions (n, 3) in its frame and sigmas (n,) rad.
+
+    The other boxes are counted. whole: as in `types.Detections`.
+    """
+    kept = _usable(boxes, scores, camera, settings, ledger, whole)
+    boxes = boxes if len(kept) == len(boxes) else boxes[kept]
+    directions, valid = undistort(camera, (boxes[:, :2] + boxes[:, 2:]) / 2)
+    if not valid.all():
+        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+        kept, boxes, directions = kept[valid], boxes[valid], directions[valid]
+    return kept, directions, _angle_sigma(camera, directions, _centre_sigma(boxes, settings))
+
+
+def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
+    """Increasing indices of the boxes (M,) that are looked at: of each label in a frame the surest `MAX_OF_LABEL`.
+
+    The other boxes are counted. Of boxes with the same score the first ones are surer.
+    """
+    count = len(frame)
+    if count <= MAX_OF_LABEL:
+        return np.arange(count)
+    order = np.lexsort((-scores, label, frame))
+    first = np.append(True, (np.diff(frame[order]) != 0) | (np.diff(label[order]) != 0))
+    rank = np.arange(count) - np.flatnonzero(first)[np.cumsum(first) - 1]
+    kept = np.sort(order[rank < MAX_OF_LABEL])
+    ledger.drop(
+        f"boxes beyond the {MAX_OF_LABEL} surest of their label in a frame", count - len(kept), f"camera {camera.name}"
+    )
+    return kept
+
+
+def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool) -> Ints:
+    of, size = settings.rays, camera.size
+    low, high = boxes[:, :2], boxes[:, 2:]
+    centre = (low + high) / 2
+    wrong = {
+        f"boxes below rays.min_score {of.min_score:g}": ~(scores >= of.min_score),
+        "boxes with their centre outside the image": ~((centre >= 0) & (centre <= size)).all(axis=1),
+    }
+    if of.border >= 0 and not whole:
+        border = np.maximum(of.border, of.border_share * (high - low))
+        cut = (low <= border) | (high >= size - 1 - border)
+        wrong["boxes cut off by the image's edge (rays.border)"] = cut.any(axis=1)
+    keep = ~np.logical_or.reduce(list(wrong.values()))
+    if not keep.all():
+        left = np.ones(len(boxes), dtype=bool)
+        for reason, bad in wrong.items():
+            ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}")
+            left &= ~bad
+    return np.flatnonzero(keep)
+
+
+def _centre_sigma(boxes: Floats, settings: Settings) -> Floats:
+    """One standard deviation (M,), px, of the centres of boxes (M, 4)."""
+    size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
+    return np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
+
+
+def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: Floats) -> Floats:
+    # At an angle `a` off the axis, a small angle moves a pinhole image by f / cos(a)^2 along the radius and by f / cos(a)
+    # across it. Their geometric mean gives one sigma a ray. A fisheye has f everywhere.
+    if camera.fisheye:
+        return pixel_sigma / camera.focal
+    cos = directions[:, 2]
+    return pixel_sigma / camera.focal * cos**1.5

@@ -1,0 +1,81 @@
+"""Depths at boxes, read from depth images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Detections, Images
+from objslam.errors import LogError
+from objslam.io.images import decode_depth
+from objslam.io.text import read_bytes
+
+_CENTRE_SHARE = (
+    0.5  # The share of a box's width and height whose depth counts: its edge shows what stands behind the object.
+)
+_MIN_VALID_SHARE = 0.1  # The least share of valid pixels there for a depth.
+MAX_IMAGE_LAG = 0.02
+"""The greatest time (s) between the colour and the depth image of one frame: some cameras stamp the two apart."""
+
+
+def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledger: Ledger) -> Detections:
+    """The detections with the depth (m, NaN where unknown) of each box, from the depth image nearest in time.
+
+    The depth images must be registered to the camera's image. Images that cannot be decoded or have another size are
+    dropped and counted; so are boxes' frames without a depth image within 20 ms.
+    """
+    depths = np.full(len(detections), np.nan)
+    frames, start, count = np.unique(detections.frame, return_index=True, return_counts=True)
+    stamps = detections.frame_stamps[frames]
+    closest = nearest_stamps(images.stamps, stamps)
+    near = np.abs(images.stamps[closest] - stamps) <= MAX_IMAGE_LAG
+    if not near.all():
+        ledger.drop("depth of a frame without a depth image", int((~near).sum()), f"stamp {stamps[~near][0]:.3f}")
+    for index, first, boxes in zip(closest[near].tolist(), start[near].tolist(), count[near].tolist(), strict=True):
+        image = read_depth(images.paths[index], camera, ledger)
+        if image is not None:
+            mine = slice(first, first + boxes)
+            depths[mine] = [box_depth(image, box) / camera.depth_scale for box in detections.boxes[mine]]
+    return replace(detections, depths=depths)
+
+
+def box_depth(image: NDArray[Any], box: Floats) -> float:
+    """The median depth of the central half (in width and height) of a box (x1, y1, x2, y2) px, in the image's units.
+
+    NaN where fewer than a tenth of the pixels there are valid, finite and above zero.
+    """
+    height, width = image.shape
+    middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) * _CENTRE_SHARE / 2
+    low = np.clip(np.floor(middle - half), 0, [width - 1, height - 1]).astype(int)
+    high = np.clip(np.ceil(middle + half), low + 1, [width, height]).astype(int)
+    part = image[low[1] : high[1], low[0] : high[0]]
+    valid = part[np.isfinite(part) & (part > 0)]
+    return float(np.median(valid)) if valid.size and valid.size >= _MIN_VALID_SHARE * part.size else np.nan
+
+
+def nearest_stamps(stamps: Floats, query: Floats) -> NDArray[np.int64]:
+    """For each stamp asked for (Q,), the index of the one nearest to it of stamps (N,), increasing."""
+    after = np.clip(np.searchsorted(stamps, query), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(stamps[before] - query) <= np.abs(stamps[after] - query), before, after)
+
+
+def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
+    """A depth image (H, W) in its own units; None, counted, where it cannot be decoded or has not the camera's size."""
+    try:
+        image = decode_depth(read_bytes(path))
+    except LogError:
+        image = None
+    if image is None:
+        ledger.drop("depth image that cannot be decoded", where=str(path))
+    elif image.shape != (camera.height, camera.width):
+        ledger.drop("depth image that has not the camera's size, or colour", where=str(path))
+        return None
+    return image

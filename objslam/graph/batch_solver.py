@@ -1,0 +1,182 @@
+"""The whole log in one factor graph: objects with fixed poses, or poses and objects together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Loss, Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
+from objslam.core.geometry import angles_off, inverse
+from objslam.core.statistics import CAUCHY_K, HUBER_K
+from objslam.core.trace import Trace
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.graph.assembly import Measurements, fixed_pose_factors
+from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.graph.init_known_correspondences import initialize_known
+from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
+from objslam.graph.outlier_rejection import misfit, reject_outliers, rejected_stretches, widening
+from objslam.graph.robust_cost import ray_information
+from objslam.graph.variables import make_values, with_points
+from objslam.triangulation.triangulate import Triangulation
+
+
+def solve_fixed(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    start: Triangulation,
+    settings: Settings,
+    trace: Trace | None = None,
+) -> Estimate:
+    """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
+
+    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's, which also places the objects that need
+    their ranges for it. The other losses weigh each ray by its noise across at the object's distance, and take a measured
+    range as a factor along the ray. Objects that the triangulation left unresolved stay out.
+    """
+    loss = settings.fixed.loss
+    member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
+    used = np.flatnonzero((start.weight > 0) & np.isin(association.object, np.flatnonzero(member)))
+    landmark = association.object[used]
+    origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
+    angle, place = pose_noise(rays, keyframes, settings)
+    across = np.hypot(angle[used] * np.linalg.norm(start.positions[landmark] - origins, axis=1), place)
+    some = rays.take(used)
+    graph, landmarks = build_graph(fixed_pose_factors(some, origins, n, landmark, across, loss)), np.unique(landmark)
+    values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
+    traced = trace_solve(trace, start.positions, landmarks, keyframes.map_T_camera)
+    others = range(len(used), graph.size())
+    optimum = optimize(graph, values, loss, settings, others, tolerance=1e-12, on_iteration=traced)
+    positions = with_points(start.positions, landmarks, optimum.values)
+    distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
+    weight = start.weight.copy()
+    weight[used] = _weights(loss, distance / across, optimum)
+    covariance = start.covariance
+    if loss != "l1":
+        along = np.where(np.isfinite(some.range), some.range_sigma**-2, 0.0)
+        information = ray_information(n, weight[used] / across**2, along, landmark, association.count)
+        held = np.linalg.eigvalsh(information)[:, 0] > 0
+        covariance = np.full((association.count, 3, 3), np.nan)
+        covariance[held] = np.linalg.inv(information[held])
+        covariance *= widening(distance / across, landmark, association.count)[:, None, None]
+    return Estimate(
+        map_T_base=keyframes.map_T_base,
+        positions=positions,
+        covariance=covariance,
+        seen_sigma=largest_sigma(covariance),
+        solved=start.ok,
+        weight=weight,
+        cost_before=optimum.cost_before,
+        cost_after=optimum.cost_after,
+        iterations=optimum.iterations,
+    )
+
+
+def solve_joint(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    start: Floats | None = None,
+    trace: Trace | None = None,
+) -> Estimate:
+    """Poses and objects together, from the localisation's poses, or from a graph that has grown along the odometry.
+
+    start: camera poses (K, 4, 4) to begin from instead.
+    After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
+    that the poses now carry, or place better, enter or move, until nothing changes. Where a stretch of the drive was
+    rejected as a whole, its poses may be wrong, not its rays: these are taken back once, and the better solution counts.
+    """
+    rays = _share_bias(rays, association, settings)
+    measured = Measurements.of(keyframes, rays, settings)
+    positions = np.full((association.count, 3), np.nan)
+    map_T_camera = keyframes.map_T_camera
+    if start is not None:
+        map_T_camera = start
+    elif not keyframes.localized_every:
+        map_T_camera, positions = initialize_known(measured, association, progress, trace)
+    nothing = np.zeros(len(rays), dtype=bool)
+    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace)
+    loose = keyframes.odom_T_base is not None and not keyframes.localized_every
+    back = rejected_stretches(rays, association, found) if loose else nothing
+    if back.any():
+        attempt = trace.aside() if trace is not None else None
+        at = found.map_T_camera, found.positions, found.used
+        other = reject_outliers(measured, association, *at, back, attempt)
+        before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
+        if after < before:
+            iterations = found.iterations + other.iterations
+            found = replace(other, cost_before=found.cost_before, iterations=iterations)
+            if trace is not None and attempt is not None:
+                trace.take(attempt)
+    map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
+
+    landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
+    origins, directions = (a[used] for a in rays.in_map(map_T_camera))
+    residual = angles_off(origins, directions, positions[association.object[used]]) / rays.sigma[used]
+    weight = np.zeros(len(rays))
+    weight[used] = _weights(settings.joint.loss, residual, optimum)
+    covariance = np.full((association.count, 3, 3), np.nan)
+    inliers = np.flatnonzero(used & (weight > 0))
+    gaussian = build_graph(measured.factors(association.object, inliers, landmarks, positions, "gnc"))
+    covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
+    seen_sigma = largest_sigma(covariance)
+    witness = _witnesses(rays, association, used & (weight > 0))
+    reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
+    far = np.flatnonzero(seen_sigma > settings.triangulation.max_rel_sigma * reach)
+    seen_sigma[far] = largest_sigma(seen_covariances(gaussian, optimum.values, far, witness[far], ledger))
+    wider = widening(residual, association.object[used], association.count)
+    covariance *= wider[:, None, None]
+    seen_sigma *= np.sqrt(wider)
+    return Estimate(
+        map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
+        positions=positions,
+        covariance=covariance,
+        seen_sigma=seen_sigma,
+        solved=np.isfinite(covariance[:, 0, 0]),
+        weight=weight,
+        cost_before=found.cost_before,
+        cost_after=optimum.cost_after,
+        iterations=found.iterations,
+    )
+
+
+def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
+    """The rays with the noise of ranges widened so that all of an object's together say no more than their shared bias lets.
+
+    n ranges of noise s that share a bias b have a mean of variance b^2 + s^2 / n: that of n independent ones of s^2 + n b^2.
+    """
+    ranged = np.isfinite(rays.range) & (association.object >= 0)
+    number = np.bincount(association.object[ranged], minlength=association.count)
+    sigma = rays.range_sigma.copy()
+    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * settings.depth.bias**2)
+    return replace(rays, range_sigma=sigma)
+
+
+def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:
+    if loss == "gnc" and optimum.weights is not None:
+        return optimum.weights[: len(residual)]
+    if loss == "huber":
+        return np.minimum(1.0, HUBER_K / np.maximum(residual, 1e-12))
+    if loss == "cauchy":
+        return 1 / (1 + (residual / CAUCHY_K) ** 2)
+    return np.ones(len(residual))
+
+
+def _witnesses(rays: Rays, association: Association, used: Bools) -> Ints:
+    """For each object (N,) the keyframe of the middle one of its used rays, 0 where it has none."""
+    object_, keyframe = association.object[used], rays.keyframe[used]
+    order = np.lexsort((keyframe, object_))
+    number = np.bincount(object_, minlength=association.count)
+    middle = np.cumsum(number) - number + number // 2
+    witness = np.zeros(association.count, dtype=np.int64)
+    witness[number > 0] = keyframe[order][middle[number > 0]]
+    return witness

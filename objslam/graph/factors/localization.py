@@ -1,0 +1,32 @@
+"""What a localisation says: the absolute pose of a keyframe."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.geometry import adjoint, inverse, is_planar
+from objslam.core.types import Keyframes
+from objslam.graph.factors.noise import huber
+from objslam.graph.variables import X0
+
+
+def localizations(
+    keyframes: Keyframes, settings: Settings, first: int = 0, on_plane: bool | None = None
+) -> list[gtsam.NonlinearFactor]:
+    """Absolute pose priors on every keyframe, X(first) and on, with Huber's loss, for a localisation may jump.
+
+    Keyframes that share a measurement share its information. on_plane: whether the path is planar, None to see.
+    """
+    of, planar = settings.localization, settings.planar
+    on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
+    tilt, z = (planar.tilt, planar.z) if on_plane else (of.yaw, of.xy)
+    s = np.diag([tilt, tilt, of.yaw, of.xy, of.xy, z]) ** 2 * keyframes.localized_every
+    to_camera = adjoint(inverse(keyframes.base_T_camera))
+    covariance = to_camera @ s @ np.swapaxes(to_camera, 1, 2)
+    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+    return [
+        gtsam.PriorFactorPose3(X0 + first + k, gtsam.Pose3(pose), huber(gtsam.noiseModel.Gaussian.Covariance(c)))
+        for k, (pose, c) in enumerate(zip(keyframes.map_T_camera, covariance, strict=True))
+    ]

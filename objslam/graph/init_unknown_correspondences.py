@@ -1,0 +1,272 @@
+"""Initialisation where it is unknown which ray is of which object, and odometry alone says where the robot is.
+
+As in `init_known_correspondences`, keyframes are added a few at a time at the poses that the solved ones predict. Their
+rays are given to the landmarks known so far by predicted bearing, with the odometry's drift in the gate; what is left over
+in the last stretch of the drive, where poses still agree with each other, is searched for new landmarks. With the poses and
+landmarks that come of it a global association can begin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from objslam.association.correlative_alignment import align
+from objslam.association.global_association import associate_globally
+from objslam.association.nearest_neighbour import assign
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera
+from objslam.core.geometry import adjoint, inverse
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.graph.assembly import Measurements
+from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
+from objslam.graph.loop_closure import Closure, Landmarks, distribute_correction, find_closure
+from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
+from objslam.graph.variables import make_values, read_points, read_poses
+
+_HORIZON = 0.1
+"""The drift in heading (rad, one standard deviation) since a landmark was last seen, up to which it is expected where it
+was; larger recognises landmarks after longer, and confuses neighbours."""
+_STRETCH = 150
+"""The most keyframes back among which new landmarks are searched for; larger is slower, and lets the odometry drift more."""
+_PLACE = 0.1
+"""The distance (m) that a measured range may always be off its landmark, besides its own noise; larger lets wrong ones
+pass."""
+_LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
+"""What is left open of a step's pose once it is aligned with the landmarks: a share of its drift, and standard deviations
+(rad, m); larger widens the gate of every ray."""
+_MORE_RAYS = 2
+"""The rays beyond association.min_rays that must agree on a new landmark: a wrong one pulls on every pose after it. With
+more, landmarks enter later."""
+_ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
+"""The iterations of the solve after a step, which begins close to its optimum, and after a loop closed, which does not; more
+are slower."""
+_STRAIN = 200.0
+"""The squared deviations by which a loop may raise the cost for each landmark that it joins; larger closes more wrong
+loops. On MRCLAM right ones took up to 110, wrong ones 240 and more."""
+
+
+@dataclass(frozen=True)
+class InitialEstimate:
+    """Camera poses (K, 4, 4) in map, which is the odometry's frame: its first keyframe is held; which ray is of which
+    landmark, and where those are, (N, 3)."""
+
+    map_T_camera: Floats
+    association: Association
+    positions: Floats
+
+
+def initialize_unknown(
+    keyframes: Keyframes,
+    rays: Rays,
+    cameras: tuple[Camera, ...],
+    settings: Settings,
+    progress: Callable[[int, int], None],
+) -> InitialEstimate:
+    """Poses and landmarks, a few keyframes at a time; progress(done, total) is called in keyframes."""
+    measured = Measurements.of(keyframes, rays, settings)
+    heading = _heading_drift(keyframes)
+    map_T_camera = keyframes.map_T_camera.copy()
+    first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
+    owner = np.full(len(rays), -1, dtype=np.int64)
+    known = Landmarks.none()
+    refused: set[tuple[tuple[int, ...], tuple[int, ...]] | None] = set()
+    nobody = np.zeros(0, dtype=np.int64)
+    graph = build_graph(measured.factors(owner, nobody, nobody, known.position, end=1))
+    for begin in range(1, len(keyframes), settings.joint.explore_step):
+        end = min(begin + settings.joint.explore_step, len(keyframes))
+        follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
+        map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
+
+        new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
+        owner[new], map_T_camera = _recognise(
+            rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end
+        )
+        fresh = new[owner[new] >= 0]
+        stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - _HORIZON**2)))
+        born = _discover(rays, owner, known, keyframes, map_T_camera, stretch, end, cameras, settings)
+        fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known) - len(born))]) if len(born) else fresh
+        known.last[owner[fresh]] = np.maximum(known.last[owner[fresh]], rays.keyframe[fresh])
+
+        for factor in measured.factors(owner, fresh, born, known.position, begin=begin, end=end):
+            graph.push_back(factor)
+        if len(known):
+            values = _solve(graph, map_T_camera[:end], known, _ITERATIONS)
+            map_T_camera[:end] = read_poses(values)
+            known.position = read_points(values)
+            known.covariance = _covariances(rays, owner, known.position, map_T_camera)
+            active, now = _active(known, heading, end - 1), end - 1
+            found = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, settings.association)
+            pairs = None if found is None else (tuple(found.now), tuple(found.before))
+            if found is not None and pairs not in refused:
+                closed = _close(found, known, measured, owner, map_T_camera[:end], heading)
+                if closed is None:
+                    refused.add(pairs)
+                else:
+                    graph, known, owner, map_T_camera[:end] = closed
+                    refused.clear()  # the landmarks have other numbers now
+        progress(end, len(keyframes))
+    return InitialEstimate(map_T_camera, Association(owner, known.label), known.position)
+
+
+def _solve(graph: gtsam.NonlinearFactorGraph, map_T_camera: Floats, known: Landmarks, iterations: int) -> gtsam.Values:
+    values = make_values(map_T_camera, known.position, np.arange(len(known)))
+    return levenberg_marquardt(graph, values, iterations, 1e-4).values
+
+
+def _close(
+    found: Closure,
+    known: Landmarks,
+    measured: Measurements,
+    owner: Ints,
+    map_T_camera: Floats,
+    heading: Floats,
+) -> tuple[gtsam.NonlinearFactorGraph, Landmarks, Ints, Floats] | None:
+    """The graph, landmarks, owners and poses with the loop closed, or None where it strains them."""
+    now, old, rays = found.now, found.before, measured.rays
+    back = int(known.first[now].min())
+    left = int(np.minimum(known.last[old], back).max())
+    end = len(map_T_camera)
+    poses = distribute_correction(map_T_camera, found.correction, min(left, max(back - 1, 0)), back, heading[:end])
+    into = np.arange(len(known))
+    into[now] = old
+    kept = np.flatnonzero(into == np.arange(len(known)))
+    number = np.searchsorted(kept, into)
+    first, last = known.first.copy(), known.last.copy()
+    np.minimum.at(first, into, known.first)
+    np.maximum.at(last, into, known.last)
+    # landmarks go along with the pose that saw them last
+    carried = poses[known.last] @ inverse(map_T_camera[known.last])
+    position = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position) + carried[:, :3, 3]
+    merged = Landmarks(position[kept], known.covariance[kept], known.label[kept], first[kept], last[kept])
+    owned = np.where(owner >= 0, number[owner], -1)
+    held = np.flatnonzero((owned >= 0) & (rays.keyframe < end))
+    graph = build_graph(measured.factors(owned, held, np.arange(len(merged)), merged.position, end=end))
+    values = _solve(graph, poses, merged, _ITERATIONS_OF_A_LOOP)
+    before = truncated_cost(rays, owner, known.position, map_T_camera, *measured.odometry())
+    poses, merged.position = read_poses(values), read_points(values)
+    if truncated_cost(rays, owned, merged.position, poses, *measured.odometry()) > before + _STRAIN * len(now):
+        return None
+    merged.covariance = _covariances(rays, owned, merged.position, poses)
+    return graph, merged, owned, poses
+
+
+def _heading_drift(keyframes: Keyframes) -> Floats:
+    """(K,) rad^2, the variance of the heading that the odometry has gathered by each keyframe."""
+    assert keyframes.drift is not None
+    return np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
+
+
+def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
+    """Which landmarks (N,) were seen recently enough to be expected at their known positions.
+
+    "Recently" means that the drift in heading since then (rad, one standard deviation) is below _HORIZON.
+    """
+    return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
+
+
+def _recognise(
+    rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
+) -> tuple[Ints, Floats]:
+    """The active landmark of each of the new rays (n,), or -1, and the poses (K, 4, 4) with which they fit.
+
+    Landmarks may stand closer together than the odometry's heading is known: ray by ray each would take its nearest. So the
+    step is first laid onto the landmarks as a whole.
+    """
+    if len(new) == 0 or not active.any():
+        return np.full(len(new), -1, dtype=np.int64), map_T_camera
+    some, which = rays.take(new), np.flatnonzero(active)
+    drift = _drifted(keyframes, begin - 1)
+    centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
+    correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread)
+    poses = map_T_camera.copy()
+    poses[begin:end] = correction @ poses[begin:end]
+    left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
+    owner = assign(
+        some,
+        np.where(active[:, None], known.position, np.nan),
+        known.covariance,
+        known.label[:, None] == np.arange(len(rays.label_names)),
+        poses,
+        some.sigma,
+        pose_covariance=left,
+    )
+    return np.where(_in_range(some, owner, known, poses), owner, -1), poses
+
+
+def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
+    """Standard deviations (3,) of x, y (m) and yaw (rad) in map, of a covariance (6, 6) in the camera's own frame."""
+    turn = map_T_camera[:3, :3]
+    place, rotation = (np.diag(turn @ block @ turn.T) for block in (covariance[3:, 3:], covariance[:3, :3]))
+    return np.sqrt(np.maximum([place[0], place[1], rotation[2]], 0.0))
+
+
+def _in_range(rays: Rays, owner: Ints, known: Landmarks, map_T_camera: Floats) -> Bools:
+    """Which rays (n,) do not contradict their landmark by the range that came with them."""
+    origins, _ = rays.in_map(map_T_camera)
+    distance = np.linalg.norm(known.position[owner] - origins, axis=1)
+    return ~(np.abs(rays.range - distance) > 4 * rays.range_sigma + _PLACE)
+
+
+def _discover(
+    rays: Rays,
+    owner: Ints,
+    known: Landmarks,
+    keyframes: Keyframes,
+    map_T_camera: Floats,
+    begin: int,
+    end: int,
+    cameras: tuple[Camera, ...],
+    settings: Settings,
+) -> Ints:
+    """New landmarks among the rays of the last stretch, from begin to end, that have no owner; they become owners."""
+    free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
+    none = np.zeros(0, dtype=np.int64)
+    fewest = settings.association.min_rays + _MORE_RAYS
+    if len(free) < fewest:
+        return none
+    some = rays.take(free)
+    found = associate_globally(
+        some, keyframes.take(np.arange(end)), cameras, settings, map_T_camera=map_T_camera[:end], sigma=some.sigma
+    )
+    if found.count == 0:
+        return none
+    placed, ready = triangulate_landmarks(map_T_camera, some, found, fewest, settings)
+    born = len(known.label) + np.arange(int(ready.sum()))
+    number = np.full(found.count + 1, -1, dtype=np.int64)
+    number[:-1][ready] = born
+    owner[free] = np.where(placed.weight > 0, number[found.object], -1)
+    known.position = np.concatenate([known.position, placed.positions[ready]])
+    known.covariance = np.concatenate([known.covariance, placed.covariance[ready]])
+    known.label = np.concatenate([known.label, found.label[ready]])
+    mine = owner[free] >= born[0] if len(born) else np.zeros(len(free), dtype=bool)
+    seen_first = np.full(len(known.label), len(keyframes), dtype=np.int64)
+    np.minimum.at(seen_first, owner[free][mine], rays.keyframe[free][mine])
+    known.first = np.concatenate([known.first, seen_first[born]])
+    known.last = np.concatenate([known.last, np.zeros(len(born), dtype=np.int64)])
+    return born
+
+
+def _drifted(keyframes: Keyframes, since: int) -> Floats:
+    """Covariance (K, 6, 6) of the cameras that the odometry has gathered from keyframe `since` on, in their own frames."""
+    odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
+    assert odom_T_base is not None
+    assert drift is not None
+    to_camera = adjoint(inverse(odom_T_base @ keyframes.base_T_camera))
+    gathered = np.where((np.arange(len(drift)) >= since)[:, None, None], drift - drift[since], 0.0)
+    return to_camera @ gathered @ np.swapaxes(to_camera, 1, 2)
+
+
+def _covariances(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats) -> Floats:
+    """Covariances (N, 3, 3) of landmarks from the rays that they own, at these poses."""
+    held = np.flatnonzero(owner >= 0)
+    origins, n = rays.take(held).in_map(map_T_camera)
+    across = np.linalg.norm(position[owner[held]] - origins, axis=1) * rays.sigma[held]
+    along = np.where(np.isfinite(rays.range[held]), rays.range_sigma[held] ** -2, 0.0)
+    information = ray_information(n, across**-2, along, owner[held], len(position))
+    return np.linalg.inv(information + 1e-6 * np.eye(3)) + FLOOR**2 * np.eye(3)

@@ -1,0 +1,148 @@
+"""Loop closure during initialisation: landmarks of now that are landmarks of long ago become one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import gtsam
+import numpy as np
+
+from objslam.association.place_recognition import MIN_LANDMARKS, POSE_FLOOR, label_densities, neighbourhood, recognise_place
+from objslam.config import AssociationSettings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import adjoint, exp_se3, inverse, log_se3
+from objslam.core.types import Rays
+from objslam.graph.variables import X0
+
+_EPOCHS = 8
+"""The epochs of the past in which a loop is looked for, the latest first; more is slower, and closes longer loops."""
+_SLIPS = (1.0, 3.0, 10.0)
+"""The factors on the promised drift with which a loop is looked for: wheels slip more than a Gaussian says. Larger ones find
+loops after a slip, and more wrong candidates."""
+_EPOCH = 40
+"""The keyframes of an epoch, for which one keyframe stands; larger is faster, and coarser about the drift since then."""
+
+
+@dataclass
+class Landmarks:
+    """Landmarks so far: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe that saw them (N,)."""
+
+    position: Floats
+    covariance: Floats
+    label: Ints
+    first: Ints
+    last: Ints
+
+    @classmethod
+    def none(cls) -> Self:
+        """No landmarks."""
+        nobody = np.zeros(0, dtype=np.int64)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody)
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Landmarks of now (P,) that are those of before (P,); correction: (4, 4) of the poses of now; evidence: log odds."""
+
+    correction: Floats
+    now: Ints
+    before: Ints
+    evidence: float
+
+
+def find_closure(
+    landmarks: Landmarks,
+    active: Bools,
+    rays: Rays,
+    owner: Ints,
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    map_T_camera: Floats,
+    now: int,
+    settings: AssociationSettings,
+) -> Closure | None:
+    """Which landmarks of now are landmarks of before, if any are for sure.
+
+    Two ways lead there. The robot comes back after a long drift: then the active landmarks (N,) are among those not seen for
+    long. Or its wheels slipped, or somebody pushed it: then all that was born since is there already.
+    """
+    together = _seen_together(rays, owner, len(landmarks))
+    density = label_densities(landmarks.position, landmarks.label)
+    pivot = map_T_camera[now, :2, 3]
+    born = active & (landmarks.first >= now - _EPOCH)
+    best: Closure | None = None
+    marginals: gtsam.Marginals | None = None
+    for here, there in ((active, ~active), (born, ~born)):
+        possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~together
+        one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
+        if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
+            continue
+        marginals = marginals or _marginals(graph, values)
+        if marginals is None:
+            return None
+        before = np.minimum(landmarks.last[two], landmarks.first[one].min())
+        epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
+        anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
+        a, b = (
+            neighbourhood(landmarks.position[which], landmarks.covariance[which], landmarks.label[which], pivot)
+            for which in (one, two)
+        )
+        for prior in relative_covariances(marginals, map_T_camera, anchors, now):
+            found = recognise_place(a, b, pivot, prior, density[one], possible[np.ix_(one, two)])
+            if found is not None and found.is_sure(settings) and (best is None or found.evidence > best.evidence):
+                best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
+    return best
+
+
+def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | None:
+    """None where the graph is indeterminate: a loop that cannot be judged stays open."""
+    try:
+        return gtsam.Marginals(graph, values)
+    except RuntimeError:
+        return None
+
+
+def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
+    """Whether two landmarks (N, N) were ever in one frame."""
+    from scipy.sparse import csr_array
+
+    held = np.flatnonzero(owner >= 0)
+    frames = int(rays.keyframe.max(initial=0)) + 1
+    table = csr_array((np.ones(len(held)), (owner[held], rays.keyframe[held])), shape=(count, frames))
+    return np.asarray((table @ table.T).toarray() > 0)
+
+
+def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
+    """Covariances (3, 3) of the camera `now` relative to each of the anchor keyframes: x, y, yaw along the map's axes.
+
+    Each comes as the graph has it, and for wheels that slipped more than they should.
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
+    result = []
+    for anchor in anchors:
+        if anchor >= now:
+            continue
+        joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
+        relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
+        jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])
+        planar = (turn @ jacobian @ joint @ jacobian.T @ turn.T)[np.ix_([3, 4, 2], [3, 4, 2])]
+        if np.isfinite(planar).all():
+            result += [slip**2 * (planar + np.diag(POSE_FLOOR) ** 2) for slip in _SLIPS]
+    return result
+
+
+def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
+    """The path (K, 4, 4) with the correction spread over keyframes begin to end by the drift (K,) gathered there."""
+    gathered = drift - drift[begin]
+    share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)
+    share[:begin] = 0.0
+    # about the place where it begins: nothing swings out on the way
+    centre = np.eye(4)
+    centre[:3, 3] = map_T_camera[begin, :3, 3]
+    twist = log_se3(inverse(centre) @ correction @ centre)
+    return np.asarray(centre @ exp_se3(share[:, None] * twist) @ inverse(centre) @ map_T_camera)

@@ -1,0 +1,92 @@
+"""Boxes as they come out of a file, gathered frame by frame and checked all at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from objslam.core.arrays import Bools
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Detections, label_table
+from objslam.io.text import count_drops, in_order
+
+
+@dataclass
+class BoxCollector:
+    """Frames and boxes as read, with the place (file:line) of each; `checked` makes detections of them.
+
+    A depth is NaN where the file says that it is unknown; a track id is -1 there.
+    """
+
+    stamps: list[float] = field(default_factory=list)
+    frame_places: list[str] = field(default_factory=list)
+    frame: list[int] = field(default_factory=list)
+    boxes: list[list[float]] = field(default_factory=list)
+    labels: list[str] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    depths: list[float] = field(default_factory=list)
+    track_ids: list[int] = field(default_factory=list)
+    box_places: list[str] = field(default_factory=list)
+
+    def add_frame(self, stamp: float, place: str) -> None:
+        """Begin a frame; the boxes added next belong to it."""
+        self.stamps.append(stamp)
+        self.frame_places.append(place)
+
+    def add_box(
+        self, box: list[float], label: str, score: float, place: str, depth: float = np.nan, track_id: int = -1
+    ) -> None:
+        """Add a box (x1, y1, x2, y2) px to the frame begun last."""
+        self.frame.append(len(self.stamps) - 1)
+        self.boxes.append(box)
+        self.labels.append(label)
+        self.scores.append(score)
+        self.depths.append(depth)
+        self.track_ids.append(track_id)
+        self.box_places.append(place)
+
+    def checked(self, ledger: Ledger) -> Detections:
+        """The detections, without frames whose stamp repeats or goes back and without boxes that cannot be right.
+
+        Each of them is counted; a depth that is not above zero becomes unknown and is counted too.
+        """
+        stamps = np.array(self.stamps, dtype=np.float64)
+        forward = in_order(stamps)
+        late = np.flatnonzero(~forward)
+        places = (self.frame_places[i] for i in late)
+        count_drops("detection frame with a stamp that repeats or goes back", len(late), places, ledger)
+
+        frame = np.array(self.frame, dtype=np.int64)
+        boxes = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)
+        scores = np.array(self.scores, dtype=np.float64)
+        names = np.array([bool(label.strip()) and label.isprintable() for label in self.labels], dtype=bool)
+        good = forward[frame]
+        for fine, reason in (
+            (np.isfinite(boxes).all(axis=1), "box with a corner that is not finite"),
+            ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1]), "box without area (x2 <= x1 or y2 <= y1)"),
+            ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
+            (names, "box with a label that is empty or not printable"),
+        ):
+            self._count(good & ~fine, reason, ledger)
+            good &= fine
+        depths = np.array(self.depths, dtype=np.float64)
+        wrong = ~np.isnan(depths) & ~((depths > 0) & np.isfinite(depths))
+        self._count(good & wrong, "depth of a box that is not above zero (taken as unknown)", ledger)
+        depths[wrong] = np.nan
+
+        label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
+        return Detections(
+            frame_stamps=stamps[forward],
+            frame=(np.cumsum(forward) - 1)[frame[good]],
+            boxes=boxes[good],
+            label=label,
+            scores=scores[good],
+            depths=depths[good],
+            track_ids=np.array(self.track_ids, dtype=np.int64)[good],
+            label_names=label_names,
+        )
+
+    def _count(self, bad: Bools, reason: str, ledger: Ledger) -> None:
+        rows = np.flatnonzero(bad)
+        count_drops(reason, len(rows), (self.box_places[i] for i in rows), ledger)

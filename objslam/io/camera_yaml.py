@@ -1,0 +1,255 @@
+"""camera.yaml: ROS camera_info keys, and the camera's place on the robot.
+
+The file is read as YAML nodes, not as Python objects: every value keeps its line, nothing is constructed, and a number such
+as 1e-05, which YAML 1.1 takes for text, stays a number.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import yaml
+
+from objslam.core.arrays import Floats
+from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import pose_from_quaternion, quaternion
+from objslam.errors import LogError
+from objslam.io.text import read_bytes
+
+CAMERAS = "cameras"
+_MAX_SIDE = 1 << 16  # px
+_Mapping = dict[str, yaml.Node]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera out of a file, and whether the file says where it is on the robot (else base_T_camera is the identity)."""
+
+    camera: Camera
+    placed: bool
+
+
+def read_camera(
+    path: Path, ledger: Ledger, *, name: str | None = None, place_needed: bool = True, depth_scale: float = 1000.0
+) -> Camera:
+    """Read a camera file.
+
+    name: the camera's, else camera_name in the file, else "camera". place_needed: whether base_T_camera must be there (else
+    the identity stands in for it). depth_scale: units per metre where the file gives none. camera_matrix and
+    distortion_coefficients are taken as ROS writes them (rows, cols, data), as a flat list or as nested lists. LogError with
+    the line of what is wrong.
+    """
+    return _read(path, _mapping(path, _parse(path), "the file"), ledger, name, place_needed, depth_scale).camera
+
+
+def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
+    """Read a file with one camera as `read_camera` does, or with several, by name, under the key `cameras`.
+
+    Their place on the robot may be missing. LogError with the line of what is wrong.
+    """
+    top = _mapping(path, _parse(path), "the file")
+    if CAMERAS not in top:
+        return (_read(path, top, ledger, None, False, 1000.0),)
+    cameras = _mapping(path, top[CAMERAS], CAMERAS)
+    if not cameras:
+        raise _error(path, top[CAMERAS], "no camera in it")
+    return tuple(
+        _read(path, _mapping(path, node, f"{CAMERAS}.{name}"), ledger, name, False, 1000.0) for name, node in cameras.items()
+    )
+
+
+def _read(
+    path: Path, top: _Mapping, ledger: Ledger, name: str | None, place_needed: bool, depth_scale: float
+) -> Calibration:
+    width, height = _size(path, top, "image_width"), _size(path, top, "image_height")
+    matrix = _matrix(path, _get(path, top, "camera_matrix"))
+    if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:
+        ledger.warn(f"{path}: camera_matrix has a skew of {matrix[0, 1]:g} px, which is left out")
+    if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
+        ledger.warn(f"{path}: the principal point lies outside the image: is the calibration for {width}x{height}?")
+    model, distortion = _distortion(path, top)
+    placed = place_needed or "base_T_camera" in top
+    base_T_camera = _pose(path, _get(path, top, "base_T_camera")) if placed else np.eye(4)
+    if "depth_scale" in top:
+        depth_scale = _number(path, top["depth_scale"], "depth_scale")
+        if depth_scale <= 0:
+            raise _error(path, top["depth_scale"], "depth_scale must be above zero", "units per metre, such as 1000 for mm")
+    sees_size = "sees_size" not in top or _flag(path, top["sees_size"], "sees_size")
+    if name is None:
+        name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
+    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size)
+    return Calibration(camera, placed)
+
+
+def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
+    """The camera that a text with the keys of a camera file describes; place: what LogError calls it."""
+    path = Path(place)
+    return _read(path, _mapping(path, _compose(path, text), "the camera"), ledger, name, True, 1000.0).camera
+
+
+def write_camera(camera: Camera, path: Path) -> None:
+    """Write a camera file; every number but the rotation, a quaternion, reads back as the same float."""
+    xyzw = quaternion(camera.base_T_camera[None])[0]
+    data = {
+        "camera_name": camera.name,
+        "image_width": int(camera.width),
+        "image_height": int(camera.height),
+        "camera_matrix": {"rows": 3, "cols": 3, "data": camera.matrix.ravel().tolist()},
+        "distortion_model": camera.distortion_model,
+        "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": camera.distortion.tolist()},
+        "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
+        "depth_scale": float(camera.depth_scale),
+    }
+    if not camera.sees_size:
+        data["sees_size"] = False
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
+    path.write_text(text, encoding="utf-8")
+
+
+def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -> LogError:
+    return LogError(message, where=f"{path}:{node.start_mark.line + 1}", hint=hint)
+
+
+def _parse(path: Path) -> yaml.Node:
+    return _compose(path, read_bytes(path))
+
+
+def _compose(path: Path, text: bytes) -> yaml.Node:
+    try:
+        node = yaml.compose(text.decode("utf-8-sig"), Loader=yaml.SafeLoader)
+    except UnicodeDecodeError as error:
+        raise LogError(f"not UTF-8 text (byte {error.start})", where=str(path)) from error
+    except yaml.MarkedYAMLError as error:
+        where = f"{path}:{error.problem_mark.line + 1}" if error.problem_mark else str(path)
+        raise LogError(f"not YAML: {error.problem}", where=where, hint="ROS camera_info keys are expected") from error
+    except yaml.YAMLError as error:
+        raise LogError(f"not YAML: {str(error).splitlines()[0]}", where=str(path)) from error
+    except RecursionError as error:
+        raise LogError("not a camera file: nested too deeply", where=str(path)) from error
+    if node is None:
+        raise LogError("nothing in it", where=str(path), hint="ROS camera_info keys are expected")
+    return node
+
+
+def _mapping(path: Path, node: yaml.Node, what: str) -> _Mapping:
+    if not isinstance(node, yaml.MappingNode):
+        raise _error(path, node, f"{what} must be a mapping of keys to values")
+    result: _Mapping = {}
+    for key, value in node.value:
+        if key.value in result if isinstance(key, yaml.ScalarNode) else True:
+            raise _error(path, key, f"a key of {what} is there twice, or is not a word")
+        result[key.value] = value
+    return result
+
+
+def _get(path: Path, mapping: _Mapping, key: str, inside: str = "", at: yaml.Node | None = None) -> yaml.Node:
+    if key not in mapping:
+        where = f"{path}:{at.start_mark.line + 1}" if at else str(path)
+        here = ", ".join(mapping) or "nothing"
+        raise LogError(f"{inside}{key} is missing", where=where, hint=f"found: {here}"[:200])
+    return mapping[key]
+
+
+def _text(path: Path, node: yaml.Node, what: str) -> str:
+    if not isinstance(node, yaml.ScalarNode):
+        raise _error(path, node, f"{what} must be one value")
+    return str(node.value)
+
+
+def _flag(path: Path, node: yaml.Node, what: str) -> bool:
+    text = _text(path, node, what)
+    if text not in ("true", "false"):
+        raise _error(path, node, f"{what} must be true or false, not {text[:40]!r}")
+    return text == "true"
+
+
+def _number(path: Path, node: yaml.Node, what: str) -> float:
+    text = _text(path, node, what)
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise _error(path, node, f"{what} must be a finite number, got {text[:40]!r}")
+    return number
+
+
+def _size(path: Path, top: _Mapping, key: str) -> int:
+    node = _get(path, top, key)
+    number = _number(path, node, key)
+    if not 1 <= number <= _MAX_SIDE or number != int(number):
+        raise _error(path, node, f"{key} must be a whole number of pixels, 1 to {_MAX_SIDE}, got {number:g}")
+    return int(number)
+
+
+def _numbers(path: Path, node: yaml.Node, what: str) -> tuple[Floats, yaml.Node]:
+    """The numbers of a YAML node, row by row, and the list node that holds them.
+
+    The node may be a mapping {rows, cols, data}, a flat list, or a list of rows.
+    """
+    if isinstance(node, yaml.MappingNode):
+        fields = _mapping(path, node, what)
+        values, data = _numbers(path, _get(path, fields, "data", f"{what}.", node), f"{what}.data")
+        if "rows" in fields and "cols" in fields:
+            rows, cols = (_number(path, fields[key], f"{what}.{key}") for key in ("rows", "cols"))
+            if rows * cols != len(values):
+                raise _error(path, data, f"{what} says {rows:g} x {cols:g} but has {len(values)} numbers")
+        return values, data
+    if not isinstance(node, yaml.SequenceNode):
+        raise _error(path, node, f"{what} must be a list of numbers")
+    items: list[yaml.Node] = []
+    for item in node.value:
+        items += item.value if isinstance(item, yaml.SequenceNode) else [item]
+    return np.array([_number(path, item, f"each value of {what}") for item in items], dtype=np.float64), node
+
+
+def _matrix(path: Path, node: yaml.Node) -> Floats:
+    values, data = _numbers(path, node, "camera_matrix")
+    form = "fx 0 cx, 0 fy cy, 0 0 1"
+    if len(values) != 9:
+        raise _error(path, data, f"camera_matrix must be 3x3, got {len(values)} numbers", form)
+    matrix = values.reshape(3, 3)
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
+        raise _error(path, data, "camera_matrix has a focal length that is not above zero", form)
+    if matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]):
+        raise _error(path, data, "camera_matrix is not a pinhole matrix", form)
+    return matrix
+
+
+def _distortion(path: Path, top: _Mapping) -> tuple[DistortionModel, Floats]:
+    node = _get(path, top, "distortion_model")
+    given = _text(path, node, "distortion_model")
+    coefficients = _get(path, top, "distortion_coefficients")
+    empty = isinstance(coefficients, yaml.ScalarNode) and coefficients.value in ("", "~", "null")
+    values, data = (np.zeros(0), coefficients) if empty else _numbers(path, coefficients, "distortion_coefficients")
+    if given in ("", "plumb_bob") and not len(values):  # as simulators write a camera without distortion
+        return "plumb_bob", np.zeros(5)
+    model = next((known for known in get_args(DistortionModel) if known == given), None)
+    if model is None:
+        raise _error(path, node, f"unknown distortion_model {given[:40]!r}", f"known: {', '.join(COEFFICIENTS)}")
+    if len(values) not in COEFFICIENTS[model]:
+        counts = " or ".join(map(str, COEFFICIENTS[model]))
+        raise _error(path, data, f"{model} takes {counts} distortion_coefficients, got {len(values)}")
+    return model, values
+
+
+def _pose(path: Path, node: yaml.Node) -> Floats:
+    form = "base_T_camera: {translation: [x, y, z], rotation_xyzw: [x, y, z, w]}"
+    fields = _mapping(path, node, "base_T_camera")
+    parts = []
+    for key, size in (("translation", 3), ("rotation_xyzw", 4)):
+        part = _get(path, fields, key, "base_T_camera.", node)
+        values, data = _numbers(path, part, key)
+        if len(values) != size:
+            raise _error(path, data, f"{key} must be {size} numbers, got {len(values)}", form)
+        parts.append(values)
+    translation, xyzw = parts
+    length = float(np.linalg.norm(xyzw))
+    if not abs(length - 1) < 0.01:
+        raise _error(path, fields["rotation_xyzw"], f"rotation_xyzw must have length 1, has {length:g}", "x, y, z, w")
+    return pose_from_quaternion(translation[None], xyzw[None])[0]

@@ -1,0 +1,139 @@
+"""detections.jsonl: one camera frame a line, as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import MAX_BOXES, Detections
+from objslam.errors import LogError
+from objslam.io.box_collector import BoxCollector
+from objslam.io.text import read_lines
+
+_NUMBERS = (int, float)  # compared by type(): a bool is an int to isinstance
+
+
+class Malformed(ValueError):
+    """What is wrong with a line."""
+
+
+def read_detections(path: Path, ledger: Ledger) -> Detections:
+    """Read a detections file; pixels of the raw image, stamps in s, depths z along the optical axis in m.
+
+    A line that is malformed, or whose stamp repeats or goes back, is dropped and counted as a frame, a box that cannot be
+    right as a box. The detections are `whole` where every frame says so. LogError where no frame is left.
+    """
+    collector = BoxCollector()
+    lines = read_lines(path, ledger)
+    whole = True
+    for number, text in lines:
+        place = f"{path}:{number}"
+        try:
+            whole &= add_frame(parse_object(text), place, collector)
+        except Malformed as malformed:
+            ledger.drop(f"detection frame malformed: {malformed}", where=place)
+    if not collector.stamps:
+        state = f"none of its {len(lines)} lines is a detection frame" if lines else "no detection frame in it"
+        hint = "take the file away to run a detector on rgb.txt"
+        raise LogError(state, where=str(path), hint=hint)
+    return replace(collector.checked(ledger), whole=whole)
+
+
+def write_detections(detections: Detections, path: Path) -> None:
+    """Write a detections file; every number reads back as the same float. Unknown depths and track ids are null."""
+    bounds = np.searchsorted(detections.frame, np.arange(len(detections.frame_stamps) + 1)).tolist()
+    stamps, boxes, scores = detections.frame_stamps.tolist(), detections.boxes.tolist(), detections.scores.tolist()
+    labels = [detections.label_names[i] for i in detections.label.tolist()]
+    depths = [None if math.isnan(depth) else depth for depth in detections.depths.tolist()]
+    track_ids = [None if track_id < 0 else track_id for track_id in detections.track_ids.tolist()]
+    optional = {"depths": depths, "track_ids": track_ids}
+    columns: dict[str, list[Any]] = {"boxes": boxes, "labels": labels, "scores": scores}
+    columns |= {name: column for name, column in optional.items() if any(value is not None for value in column)}
+    whole = {"whole": True} if detections.whole else {}
+    with path.open("w", encoding="utf-8") as file:
+        for stamp, start, end in zip(stamps, bounds[:-1], bounds[1:], strict=True):
+            frame = {"stamp": stamp} | {name: column[start:end] for name, column in columns.items()} | whole
+            file.write(json.dumps(frame, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def parse_object(text: str | bytes) -> dict[str, Any]:
+    """The JSON object that a line is; Malformed otherwise."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise Malformed("not JSON") from error
+    if type(value) is not dict:
+        raise Malformed("not a JSON object")
+    return value
+
+
+def read_stamp(message: dict[str, Any]) -> float:
+    """The stamp of a message, s; Malformed where it is not a finite number."""
+    (stamp,) = read_numbers([message.get("stamp")], "stamp")
+    if not math.isfinite(stamp):
+        raise Malformed("stamp is not a finite number")
+    return stamp
+
+
+def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
+    """Add a frame with its boxes; whether it says that they are whole. Malformed where it is no frame."""
+    stamp = read_stamp(frame)
+    if len(_list(frame, "boxes")) > MAX_BOXES:
+        raise Malformed(f"more than {MAX_BOXES} boxes")
+    boxes = [read_numbers(box, "a box") for box in _list(frame, "boxes")]
+    labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
+    depths = [_depth(depth) for depth in _list(frame, "depths")] if "depths" in frame else [math.nan] * len(boxes)
+    track_ids = (
+        [_track_id(track_id) for track_id in _list(frame, "track_ids")] if "track_ids" in frame else [-1] * len(boxes)
+    )
+    if any(type(label) is not str for label in labels):
+        raise Malformed("a label is not a string")
+    if any(len(box) != 4 for box in boxes):
+        raise Malformed("a box is not 4 numbers")
+    if not len(boxes) == len(labels) == len(scores) == len(depths) == len(track_ids):
+        raise Malformed("boxes, labels, scores, depths and track_ids differ in length")
+    whole = frame.get("whole", False)
+    if type(whole) is not bool:
+        raise Malformed("whole is neither true nor false")
+    collector.add_frame(stamp, place)
+    for box, label, score, depth, track_id in zip(boxes, labels, scores, depths, track_ids, strict=True):
+        collector.add_box(box, label, score, place, depth, track_id)
+    return whole
+
+
+def _list(frame: dict[str, Any], name: str, default: list[None] | None = None) -> list[Any]:
+    value = frame.get(name, default)
+    if type(value) is not list:
+        raise Malformed(f"{name} is missing or not a list")
+    return value
+
+
+def read_numbers(value: Any, name: str) -> list[float]:
+    """A list of numbers as floats; Malformed where it is none."""
+    if type(value) is not list or not all(type(item) in _NUMBERS for item in value):
+        raise Malformed(f"{name} must hold numbers only")
+    try:
+        return [float(item) for item in value]
+    except OverflowError as error:
+        raise Malformed(f"{name} holds an integer beyond every float") from error
+
+
+def _depth(value: Any) -> float:
+    if value is None:
+        return math.nan
+    (depth,) = read_numbers([value], "depths")
+    return 0.0 if math.isnan(depth) else depth  # a NaN in the file is no measurement: counted like a zero
+
+
+def _track_id(value: Any) -> int:
+    if value is None:
+        return -1
+    if type(value) is not int or abs(value) >= 2**63:
+        raise Malformed("track_ids must hold integers and null only")
+    return max(value, -1)

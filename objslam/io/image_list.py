@@ -1,0 +1,58 @@
+"""Image lists in TUM format, rgb.txt and depth.txt: "stamp relative/path" a line, '#' comments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Images
+from objslam.errors import LogError
+from objslam.io.safe_paths import Inside
+from objslam.io.text import count_drops, in_order, parse_numbers, read_lines
+
+
+def read_images(path: Path, ledger: Ledger) -> Images:
+    """Read an image list; the images are found, not opened.
+
+    Dropped and counted: malformed lines, stamps that repeat or go back, files that are missing or leave the list's folder
+    (absolute, '..', symbolic links). LogError where no image is left.
+    """
+    folder = path.parent
+    inside = Inside(folder)
+    name = path.name
+    stamps, files, places = [], [], []
+    lines = read_lines(path, ledger)
+    for number, text in lines:
+        place = f"{path}:{number}"
+        first, *rest = text.split(maxsplit=1)
+        stamp = parse_numbers([first])
+        if stamp is None or not np.isfinite(stamp[0]) or not rest:
+            ledger.drop(f'{name} line that is not "stamp path"', where=place)
+            continue
+        relative = Path(rest[0])
+        file = folder / relative
+        outside = relative.is_absolute() or ".." in relative.parts
+        reason = "leaves the folder" if outside else inside.reason_against(file)
+        if reason is not None:
+            ledger.drop(f"{name} line whose file {reason}", where=place)
+            continue
+        stamps.append(stamp[0])
+        files.append(file)
+        places.append(place)
+    times = np.array(stamps, dtype=np.float64)
+    forward = in_order(times)
+    late = np.flatnonzero(~forward)
+    count_drops(f"{name} line with a stamp that repeats or goes back", len(late), (places[i] for i in late), ledger)
+    if not forward.any():
+        state = f"none of its {len(lines)} lines leads to an image" if lines else "nothing in it"
+        raise LogError(state, where=str(path), hint='a line is "stamp path", the path relative to this file')
+    return Images(times[forward], tuple(files[i] for i in np.flatnonzero(forward)))
+
+
+def write_images(images: Images, path: Path) -> None:
+    """Write an image list; the paths are made relative to the list's folder, where they must lie."""
+    pairs = zip(images.stamps.tolist(), images.paths, strict=True)
+    text = "".join(f"{stamp!r} {file.relative_to(path.parent).as_posix()}\n" for stamp, file in pairs)
+    path.write_text("# stamp path\n" + text, encoding="utf-8")

@@ -1,0 +1,101 @@
+"""How large a packed image says it is, read off its first bytes: nothing is unpacked."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+_STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})
+"""JPEG markers that no segment follows."""
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG markers of a frame's header, which holds the size."""
+_WIDTH_TAG, _HEIGHT_TAG = 256, 257
+_TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}
+"""The integers of TIFF fields by their type, as `struct` calls them."""
+
+
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """The width and height, px, that the header of a PNG, JPEG, TIFF, WebP, GIF or BMP file states.
+
+    None for other formats. ValueError where the header is damaged or cut off.
+    """
+    for magic, read in _READERS.items():
+        if data.startswith(magic):
+            try:
+                return read(data)
+            except (struct.error, IndexError, ValueError) as error:
+                raise ValueError("the header of an image is damaged or cut off") from error
+    return None
+
+
+def _png(data: bytes) -> tuple[int, int]:
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def _jpeg(data: bytes) -> tuple[int, int]:
+    at = 2
+    while True:
+        at = data.index(0xFF, at) + 1  # decoders skip what lies between two segments, too
+        marker = data[at]
+        if marker in _FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 4)
+            return width, height
+        if marker not in (0x00, 0xFF):
+            at += 1
+            if marker not in _STANDALONE:
+                at += struct.unpack_from(">H", data, at)[0]
+
+
+def _tiff(data: bytes) -> tuple[int, int]:
+    order = "<" if data.startswith(b"II") else ">"
+    if struct.unpack_from(order + "H", data, 2)[0] == 43:  # BigTIFF
+        at = struct.unpack_from(order + "Q", data, 8)[0]
+        number, first, step, value = struct.unpack_from(order + "Q", data, at)[0], at + 8, 20, 12
+    else:
+        at = struct.unpack_from(order + "I", data, 4)[0]
+        number, first, step, value = struct.unpack_from(order + "H", data, at)[0], at + 2, 12, 8
+    size = {_WIDTH_TAG: 0, _HEIGHT_TAG: 0}
+    for entry in range(first, first + step * min(number, 1 << 16), step):
+        tag, kind = struct.unpack_from(order + "HH", data, entry)
+        if tag in size and kind in _TIFF_INTEGERS:
+            stated = struct.unpack_from(order + _TIFF_INTEGERS[kind], data, entry + value)[0]
+            size[tag] = max(size[tag], abs(stated))
+    return size[_WIDTH_TAG], size[_HEIGHT_TAG]
+
+
+def _webp(data: bytes) -> tuple[int, int]:
+    if data[8:15] == b"WEBPVP8" and data[15:16] in (b" ", b"L", b"X"):
+        if data[15:16] == b" ":
+            width, height = struct.unpack_from("<HH", data, 26)
+            return width & 0x3FFF, height & 0x3FFF
+        if data[15:16] == b"L":
+            bits = struct.unpack_from("<I", data, 21)[0]
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        less = struct.unpack_from("<Q", data, 22)[0] >> 16
+        return (less & 0xFFFFFF) + 1, (less >> 24) + 1
+    raise ValueError("not a WebP image")
+
+
+def _gif(data: bytes) -> tuple[int, int]:
+    width, height = struct.unpack_from("<HH", data, 6)
+    return width, height
+
+
+def _bmp(data: bytes) -> tuple[int, int]:
+    old = struct.unpack_from("<I", data, 14)[0] == 12
+    width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
+    return abs(width), abs(height)
+
+
+_READERS: dict[bytes, Callable[[bytes], tuple[int, int]]] = {
+    b"\x89PNG\r\n\x1a\n": _png,
+    b"\xff\xd8\xff": _jpeg,
+    b"II*\0": _tiff,
+    b"MM\0*": _tiff,
+    b"II+\0": _tiff,
+    b"MM\0+": _tiff,
+    b"RIFF": _webp,
+    b"GIF8": _gif,
+    b"BM": _bmp,
+}

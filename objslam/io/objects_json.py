@@ -1,0 +1,220 @@
+"""objects.json, the file of a map's objects and of the ground truth: the one place that writes and reads it."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.types import TruthObject
+from objslam.errors import LogError, ObjslamError, OutputError
+
+FORMAT = "objslam.objects/1"  # What the member "format" says: the kind of file and its version.
+
+_T = TypeVar("_T")
+
+
+class _Malformed(OutputError):
+    """What is wrong with an entry; a reader of files adds the file and raises its own kind of error."""
+
+
+def dump_objects(objects: ObjectMap) -> str:
+    """The text of objects.json for a map; `read_objects` gives the same map back, to the last bit.
+
+    What is not finite becomes null, because JSON has no NaN.
+    """
+    return _dump([_entry(o) for o in objects.objects], objects.frame)
+
+
+def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
+    """The text of a ground truth file; `read_truth_objects` gives the same objects back."""
+    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map")
+
+
+def read_objects(file: Path) -> ObjectMap:
+    """The map that an objects.json holds; OutputError names the file and the object that is not as `dump_objects` writes."""
+    try:
+        return parse_objects(_load(file))
+    except _Malformed as malformed:
+        raise OutputError(str(malformed), where=str(file)) from malformed
+
+
+def parse_objects(data: dict[str, Any]) -> ObjectMap:
+    """The map in the data of an objects.json, as `json.loads` gives it; OutputError where that is something else."""
+    if data.get("format") != FORMAT:
+        raise _Malformed(f"format is {data.get('format')!r}, not {FORMAT!r}")
+    frame = _text(data.get("frame", "map"), "frame")
+    return ObjectMap(_each(data, _map_object), frame)
+
+
+def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
+    """The objects of a ground truth file: objects.json with at least id, label and position (m, in map) of each.
+
+    The map of another run serves as well; its unresolved objects have no position to compare with and are left out.
+    `error` is raised, with the file and the object, where the file is malformed.
+    """
+    try:
+        data = _load(file)
+        if data.get("format", FORMAT) != FORMAT:
+            raise _Malformed(f"format is {data['format']!r}, not {FORMAT!r}")
+        return tuple(o for o in _each(data, _truth_object) if o is not None)
+    except _Malformed as malformed:
+        raise error(str(malformed), where=str(file)) from malformed
+
+
+def _dump(entries: list[dict[str, Any]], frame: str) -> str:
+    """One line per object, so that two files can be compared line by line."""
+    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": ['
+    lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
+    return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
+
+
+def _entry(o: MapObject) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "id": int(o.id),
+        "label": o.label,
+        "position": [_null(x) for x in o.position.tolist()],
+        "covariance": None if o.covariance is None or not np.isfinite(o.covariance).all() else o.covariance.tolist(),
+        "status": o.status,
+        "rays": int(o.rays),
+        "frames": int(o.frames),
+        "parallax_deg": _null(o.parallax_deg),
+        "rms_deg": _null(o.rms_deg),
+        "extent": None if o.extent is None or not np.isfinite(o.extent).all() else [float(x) for x in o.extent],
+        "first_seen": _null(o.first_seen),
+        "last_seen": _null(o.last_seen),
+    }
+    if o.labels is not None:
+        entry["labels"] = {name: float(share) for name, share in o.labels.items()}
+    if o.existence is not None:
+        entry["existence"] = float(o.existence)
+    if o.ray is not None:
+        entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
+    return entry
+
+
+def _null(x: float) -> float | None:
+    return float(x) if math.isfinite(x) else None
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise _Malformed(f"cannot read the objects: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise _Malformed(f"not text in UTF-8 (byte {error.start})") from error
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise _Malformed(f"not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
+    except (ValueError, RecursionError) as error:  # an integer of thousands of digits, or deeply nested brackets
+        raise _Malformed(f"not JSON that can be read: {error}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
+        raise _Malformed('not an objects file: a mapping with a list under "objects" is needed')
+    return data
+
+
+def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[_T, ...]:
+    parsed: list[_T] = []
+    seen: set[int] = set()
+    for i, entry in enumerate(data["objects"]):
+        try:
+            if not isinstance(entry, dict):
+                raise _Malformed("not a mapping")
+            number = _integer(entry, "id")
+            if number in seen:
+                raise _Malformed(f"id {number} is there twice")
+            seen.add(number)
+            parsed.append(parse(entry))
+        except _Malformed as malformed:
+            raise _Malformed(f"objects[{i}]: {malformed}") from malformed
+    return tuple(parsed)
+
+
+def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
+    if entry.get("status") == "unresolved":
+        return None
+    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), _vector(entry.get("position"), "position"))
+
+
+def _map_object(entry: dict[str, Any]) -> MapObject:
+    status = entry.get("status")
+    if status not in ("ok", "unresolved"):
+        raise _Malformed(f'status must be "ok" or "unresolved", got {status!r}')
+    covariance, extent, ray = entry.get("covariance"), entry.get("extent"), entry.get("ray")
+    if covariance is not None:
+        if not isinstance(covariance, list) or len(covariance) != 3:
+            raise _Malformed("covariance must be 3 rows of 3 numbers, or null")
+        covariance = np.stack([_vector(row, "a row of covariance") for row in covariance])
+    if extent is not None:
+        width, height = _vector(extent, "extent", 2).tolist()
+        extent = (width, height)
+    if ray is not None:
+        if not isinstance(ray, dict):
+            raise _Malformed("ray must have an origin and a direction")
+        ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
+    labels, existence = entry.get("labels"), entry.get("existence")
+    if labels is not None:
+        if not isinstance(labels, dict):
+            raise _Malformed("labels must be a mapping of labels to shares")
+        labels = {_text(name, "a name in labels"): _number(share, "a share in labels") for name, share in labels.items()}
+    return MapObject(
+        id=_integer(entry, "id"),
+        label=_text(entry.get("label"), "label"),
+        position=_vector(entry.get("position"), "position", null=status == "unresolved"),
+        covariance=covariance,
+        status=status,
+        rays=_integer(entry, "rays"),
+        frames=_integer(entry, "frames"),
+        parallax_deg=_number(entry.get("parallax_deg"), "parallax_deg", null=True),
+        rms_deg=_number(entry.get("rms_deg"), "rms_deg", null=True),
+        first_seen=_number(entry.get("first_seen"), "first_seen", null=True),
+        last_seen=_number(entry.get("last_seen"), "last_seen", null=True),
+        extent=extent,
+        ray=ray,
+        labels=labels,
+        existence=None if existence is None else _number(existence, "existence"),
+    )
+
+
+def _integer(entry: dict[str, Any], name: str) -> int:
+    value = entry.get(name)
+    if not isinstance(value, int) or isinstance(value, bool) or not -(2**63) <= value < 2**63:
+        raise _Malformed(f"{name} must be an integer, got {_short(value)}")
+    return value
+
+
+def _text(value: Any, name: str) -> str:
+    # half of a surrogate pair is valid JSON, but cannot be written to a file
+    if not isinstance(value, str) or not value or any("\ud800" <= c <= "\udfff" for c in value):
+        raise _Malformed(f"{name} must be text, got {_short(value)}")
+    return value
+
+
+def _number(value: Any, name: str, null: bool = False) -> float:
+    if value is None and null:
+        return math.nan
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    # compared before float(): an integer may be greater than any float
+    if not good or not -sys.float_info.max <= value <= sys.float_info.max:
+        raise _Malformed(f"{name} must be a finite number, got {_short(value)}")
+    return float(value)
+
+
+def _vector(value: Any, name: str, size: int = 3, null: bool = False) -> Floats:
+    if not isinstance(value, list) or len(value) != size:
+        raise _Malformed(f"{name} must be {size} numbers, got {_short(value)}")
+    return np.array([_number(x, name, null) for x in value], dtype=np.float64)
+
+
+def _short(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,59 @@
+"""motions.parquet: what the odometry measured between the poses of a result, for exports and other optimisers."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.errors import OutputError
+
+_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # How many numbers each column has in a row.
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Measured motions between consecutive poses of the base."""
+
+    before: Floats  # (M,) s, the stamps of the poses before.
+    after: Floats  # (M,) s, the stamps of the poses after.
+    motion: Floats  # (M, 4, 4) before_T_after.
+    covariance: Floats  # (M, 6, 6), translation (m) first, then rotation (rad), in the frame of the pose after.
+
+
+def dump_motions(motions: Motions) -> bytes:
+    """The content of motions.parquet: one row per motion, matrices row by row."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {}
+    for name, size in _COLUMNS.items():
+        flat = pa.array(getattr(motions, name).reshape(-1))
+        columns[name] = flat if size == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+    buffer = io.BytesIO()
+    pq.write_table(pa.table(columns), buffer)
+    return buffer.getvalue()
+
+
+def read_motions(file: Path) -> Motions:
+    """What `dump_motions` wrote; OutputError where the file is not that."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(file, columns=list(_COLUMNS))
+        found = {}
+        for name, size in _COLUMNS.items():
+            column = table.column(name).combine_chunks()
+            values = column if size == 1 else column.flatten()
+            found[name] = values.to_numpy(zero_copy_only=False).astype(np.float64)
+        count = table.num_rows
+        motion, covariance = found["motion"].reshape(count, 4, 4), found["covariance"].reshape(count, 6, 6)
+        if not all(np.isfinite(values).all() for values in found.values()):
+            raise ValueError("a value is not finite")
+    except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError) as error:
+        raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
+    return Motions(found["before"], found["after"], motion, covariance)

@@ -1,0 +1,43 @@
+"""Surfaces as PLY files (binary, little endian), for MeshLab, CloudCompare, Blender and Open3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from objslam.core.types import Surface
+
+
+def write_mesh(surface: Surface, file: Path) -> None:
+    """Write vertices (m) with their colours, and triangles; OSError when the file cannot be written."""
+    _write(surface, file, normals=False, triangles=True)
+
+
+def write_cloud(surface: Surface, file: Path) -> None:
+    """Write the vertices alone, with normals and colours; OSError when the file cannot be written."""
+    _write(surface, file, normals=True, triangles=False)
+
+
+def _write(surface: Surface, file: Path, *, normals: bool, triangles: bool) -> None:
+    columns = {"x y z": surface.vertices.astype("<f4")}
+    if normals:
+        columns["nx ny nz"] = surface.normals.astype("<f4")
+    if surface.colours is not None:
+        columns["red green blue"] = surface.colours
+    fields = [(name, values.dtype.str) for names, values in columns.items() for name in names.split()]
+    vertices = np.empty(len(surface.vertices), dtype=fields)
+    for names, values in columns.items():
+        for i, name in enumerate(names.split()):
+            vertices[name] = values[:, i]
+    header = ["ply", "format binary_little_endian 1.0", "comment frame map, metres", f"element vertex {len(vertices)}"]
+    header += [f"property {'uchar' if kind == '|u1' else 'float'} {name}" for name, kind in fields]
+    with file.open("wb") as stream:
+        if triangles:
+            faces = np.empty(len(surface.triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
+            faces["count"], faces["index"] = 3, surface.triangles
+            header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        stream.write("\n".join([*header, "end_header\n"]).encode())
+        stream.write(vertices.tobytes())
+        if triangles:
+            stream.write(faces.tobytes())

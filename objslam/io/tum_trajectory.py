@@ -1,0 +1,53 @@
+"""Trajectories in TUM format: "stamp tx ty tz qx qy qz qw" a line, '#' comments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import pose_from_quaternion, quaternion
+from objslam.core.types import Trajectory
+from objslam.errors import LogError
+from objslam.io.text import Table, in_order, read_table, select
+
+_HEADER = "# stamp tx ty tz qx qy qz qw\n"
+
+
+def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
+    """Read a trajectory file (also packed, .gz); stamps in s, translations in m, quaternions x y z w of any length but zero.
+
+    Malformed lines and stamps that repeat or go back are dropped and counted. LogError where no pose is left.
+    """
+    return to_trajectory(read_pose_table(path, ledger))
+
+
+def read_pose_table(path: Path, ledger: Ledger) -> Table:
+    """As `read_trajectory`, as a table of 8 columns."""
+    table = read_table(path, 8, ledger, "pose")
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(table.values[:, 4:], axis=1)
+    turns = (length > 1e-6) & np.isfinite(length)
+    table = select(table, turns, "pose line with a zero quaternion", path, ledger)
+    forward = in_order(table.values[:, 0])
+    table = select(table, forward, "pose line with a stamp that repeats or goes back", path, ledger)
+    if not len(table.lines):
+        raise LogError("no usable pose, every quaternion is zero", where=str(path))
+    off = np.abs(np.linalg.norm(table.values[:, 4:], axis=1) - 1) > 0.01
+    if off.any():
+        first = f"{path}:{table.lines[off][0]}"
+        ledger.warn(f"{first}: {int(off.sum())} quaternions are not of length 1: are the columns tx ty tz qx qy qz qw?")
+    return table
+
+
+def to_trajectory(table: Table) -> Trajectory:
+    """The trajectory of a table that `read_pose_table` gave."""
+    return Trajectory(table.values[:, 0], pose_from_quaternion(table.values[:, 1:4], table.values[:, 4:]))
+
+
+def write_trajectory(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory file; every number reads back as the same float."""
+    poses = trajectory.poses
+    values = np.column_stack([trajectory.stamps, poses[:, :3, 3], quaternion(poses)]).tolist()
+    path.write_text(_HEADER + "".join(" ".join(map(repr, row)) + "\n" for row in values), encoding="utf-8")

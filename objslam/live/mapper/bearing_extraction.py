@@ -1,0 +1,79 @@
+"""From frames to bearings: cameras and their mounts as they come, and the numbers of labels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.frontend.bearings import box_rays, surest
+from objslam.live.mapper.frame_association import FrameRays
+from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
+
+_MOUNTS = 4096
+"""Mounts of one camera that are kept; more let a frame be later on a camera that is moved often, and cost memory."""
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A frame as the map takes it: the number of its camera, base_T_camera (4, 4), and the bearings of its usable boxes."""
+
+    camera: int
+    base_T_camera: Floats
+    rays: FrameRays
+
+
+class BearingExtractor:
+    """Numbers cameras and labels in the order in which they come, and makes bearings of boxes.
+
+    cameras, labels: the map's own lists, which grow here.
+    """
+
+    def __init__(self, settings: Settings, ledger: Ledger, cameras: list[Camera], labels: list[str]) -> None:
+        self._settings, self._ledger = settings, ledger
+        self._cameras, self._labels = cameras, labels
+        self._camera_number: dict[str, int] = {}
+        self._label_number: dict[str, int] = {}
+        self._mounts: dict[str, HeldMounts] = {}
+
+    def add_camera(self, camera: Camera) -> None:
+        """A camera, or another calibration of one."""
+        if camera.name in self._camera_number:
+            self._cameras[self._camera_number[camera.name]] = camera
+        else:
+            self._camera_number[camera.name] = len(self._cameras)
+            self._cameras.append(camera)
+
+    def add_mount(self, message: MountMessage) -> None:
+        """Where a camera is from now on."""
+        self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
+
+    def extract(self, frame: FrameMessage) -> FrameView:
+        """The bearings of a frame, from its camera as it was mounted by then; dropped boxes are counted."""
+        number, settings = self._camera_number[frame.camera], self._settings
+        camera = self._cameras[number]
+        held = self._mounts.get(frame.camera)
+        base_T_camera = camera.base_T_camera if held is None else held.at(frame.stamp, camera)
+        kept, direction, sigma = box_rays(frame.boxes, frame.scores, camera, settings, self._ledger, frame.whole)
+        for name in sorted(set(frame.labels) - self._label_number.keys()):
+            self._label_number[name] = len(self._labels)
+            self._labels.append(name)
+        label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
+        few = surest(np.zeros(len(kept), dtype=np.int64), label[kept], frame.scores[kept], camera, self._ledger)
+        kept, direction, sigma = kept[few], direction[few], sigma[few]
+        reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
+        rays = FrameRays(
+            direction=direction,
+            sigma=sigma,
+            range=reach,
+            range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * reach,
+            label=label[kept],
+            score=frame.scores[kept],
+            box=frame.boxes[kept],
+            track=frame.track_ids[kept],
+        )
+        return FrameView(number, base_T_camera, rays)

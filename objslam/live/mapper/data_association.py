@@ -1,0 +1,79 @@
+"""A new keyframe's rays to landmarks and tracks, and those that are of landmarks into the graph."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.association.landmarks import PredictedLandmarks
+from objslam.core.arrays import Floats
+from objslam.live.mapper.frame_association import FrameRays, best_of_label, match, match_by_label
+from objslam.live.mapper.landmark_table import predict_landmarks
+from objslam.live.mapper.landmark_update import LandmarkUpdate
+from objslam.live.mapper.pose_uncertainty import PoseUncertainty
+from objslam.live.mapper.state import MapState
+from objslam.live.mapper.tracks import Track
+
+_NOVELTY_WEIGHT = 0.02
+"""Weight of a frame in the share of boxes that showed nothing known; larger follows a new room sooner, and varies more."""
+
+
+def associate(
+    m: MapState,
+    rays: FrameRays,
+    map_T_camera: Floats,
+    uncertainty: PoseUncertainty,
+    predicted: PredictedLandmarks | None,
+) -> LandmarkUpdate:
+    """Give every ray of the newest keyframe its landmark or track, and the graph what it can use of them.
+
+    Args:
+        m: the map, with the keyframe.
+        rays: (n,) of the keyframe.
+        map_T_camera: (4, 4) pose that is predicted for its camera, and how well by `uncertainty`.
+        predicted: `predict_landmarks` of the map as it is, None where that is still to be made.
+    """
+    landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
+    if m.by_label and settings.method == "auto" and len(set(rays.label.tolist())) < count:
+        m.tell_apart_within_labels()  # two boxes of one label
+    numbers = m.next_id.ray + np.arange(count)
+    m.next_id.ray += count
+    owner, used = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=bool)
+    waiting: dict[int, Track] = {}  # by label
+    tracks: dict[int, Track] = {}  # by ray
+    if m.by_label:
+        best = best_of_label(rays)
+        row = np.full(count, -1, dtype=np.int64)
+        row[best], missed = match_by_label(rays.take(best), map_T_camera, landmarks, uncertainty, settings.gate)
+        lost = missed >= 0
+        landmarks.rejected[missed[lost]] += 1
+        owner[best[lost]] = landmarks.id[missed[lost]]
+        free = best[(row[best] < 0) & ~lost]
+        waiting = {track.label: track for track in m.tracks}
+    else:
+        if predicted is None:
+            predicted = predict_landmarks(landmarks, m.tracks)
+        row = match(rays, map_T_camera, predicted, uncertainty, len(m.labels), settings.gate, m.landmark_of_track, m.novelty)
+        of_track = row >= predicted.landmarks
+        m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0)).mean()) - m.novelty)
+        tracks = {i: m.tracks[row[i] - predicted.landmarks] for i in np.flatnonzero(of_track).tolist()}
+        free = np.flatnonzero(row < 0)
+        row[of_track] = -1
+    matched = np.flatnonzero(row >= 0)
+    owner[matched], used[matched] = landmarks.id[row[matched]], True
+    m.rays.add(number=numbers, keyframe=np.full(count, k), owner=owner, used=used, **vars(rays))
+    stamp = float(m.keyframes.stamp[-1])
+    for i in free.tolist():
+        label = int(rays.label[i])
+        if label not in waiting:
+            tracks[i] = Track(m.next_id.track, label, m.by_label, stamp, stamp, uncertainty.drift)
+            m.next_id.track += 1
+            m.tracks.append(tracks[i])
+        else:
+            tracks[i] = waiting[label]
+    for i, track in tracks.items():
+        ray = (int(numbers[i]), k, rays.direction[i], float(rays.sigma[i]), float(rays.range[i]), float(rays.range_sigma[i]))
+        track.extend(ray, map_T_camera, stamp, uncertainty.drift)
+    if len(matched):
+        m.graph.add_rays(m.bearings(len(m.rays.number) - count + matched))
+    m.graph.update()
+    return LandmarkUpdate(rays, matched, row[matched], list(tracks.values()))

@@ -1,0 +1,85 @@
+"""What holds keyframes besides their boxes: absolute poses by localisation, and motions from one to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import inverse, is_planar
+from objslam.graph.factors import odometry
+from objslam.graph.factors.localization import localizations
+from objslam.live.mapper.state import MapState
+
+
+def localize(m: MapState) -> bool:
+    """Absolute poses for the keyframes that the localisation covers by now; whether that moved the map.
+
+    The first one does: it says where the map is, which so far lay where the odometry began.
+    """
+    if not m.localization.received or not m.localization.pending:
+        return False
+    left, moved, path = [], False, m.course.localization
+    for k in m.localization.pending:
+        row = int(np.searchsorted(m.keyframes.id, k))
+        if row == len(m.keyframes) or m.keyframes.id[row] != k:
+            continue
+        stamp = float(m.keyframes.stamp[row])
+        if stamp > path.newest:
+            left.append(k)
+            continue
+        found = path.at(stamp)
+        if found is None:
+            continue
+        planar = m.localization.planar and is_planar(np.stack([np.eye(4), path.from_start(found.pose)]))
+        m.localization.planar = planar
+        first = not m.keyframes.localized.any() and bool(m.keyframes.by_odometry.any())
+        if first:
+            _move_onto(m, row, found.pose)
+        m.keyframes.map_T_base[row] = found.pose
+        m.keyframes.localized[row] = True
+        one = m.keyframe_arrays(np.array([row]))
+        m.graph.add_absolute(k, localizations(one, m.settings, k, planar)[0])
+        if first:
+            moved = True
+            if len(np.unique(m.keyframes.piece)) > 1:  # from now on, what the odometry says across its gaps does not count
+                chain_keyframes(m)
+            m.graph.rebuild()
+    m.localization.pending = left
+    return moved
+
+
+def chain_keyframes(m: MapState) -> None:
+    """Tie each keyframe to the one before where it is not tied as it should be; the graph's `rebuild` must follow.
+
+    Motions are those of the odometry. Where it measured nothing, a weak tie holds the keyframes that the localisation does
+    not.
+    """
+    k = m.keyframes
+    order = np.argsort(k.stamp, kind="stable")
+    every = m.keyframe_arrays(order)
+    if every.odom_T_base is None:
+        return
+    ids, localized, measured = k.id[order].tolist(), k.localized[order], every.measured
+    tied = measured | ~localized[1:] | ~np.logical_or.accumulate(localized)[:-1]
+    wrong = [i for i in range(1, len(ids)) if not measured[i - 1] or m.graph.before(ids[i]) != ids[i - 1]]
+    for i in wrong:
+        m.graph.drop_motion(ids[i])
+    to_tie = [i for i in wrong if tied[i - 1]]
+    pairs = np.array([[i - 1, i] for i in to_tie], dtype=np.int64).ravel()
+    on_plane = m.course.odometry.planar
+    motion, covariance = odometry.motions(every.take(pairs), m.settings, on_plane)
+    loose = odometry.unknown_motion(every.base_T_camera, m.settings, on_plane)
+    for i, step, spread in zip(to_tie, motion[::2], covariance[::2], strict=True):
+        m.graph.add_motion(ids[i - 1], ids[i], step, spread if measured[i - 1] else loose[i])
+
+
+def _move_onto(m: MapState, row: int, map_T_base: Floats) -> None:
+    """Move the whole map so that the keyframe in a row has that pose (4, 4)."""
+    m.graph.update()
+    there = map_T_base @ m.keyframes.base_T_camera[row] @ inverse(m.graph.pose(int(m.keyframes.id[row])))
+    m.graph.drop_absolute()
+    m.graph.move(there)
+    turn, landmarks = there[:3, :3], m.landmarks
+    landmarks.position[:] = landmarks.position @ turn.T + there[:3, 3]
+    landmarks.information[:] = turn @ landmarks.information @ turn.T
+    m.move_tracks(there, -np.inf)

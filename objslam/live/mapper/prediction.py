@@ -1,0 +1,105 @@
+"""Where a frame's camera is before its boxes are looked at, and how well that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import adjoint, inverse
+from objslam.graph.factors import odometry
+from objslam.live.mapper.course import Placed
+from objslam.live.mapper.pose_uncertainty import PoseUncertainty
+from objslam.live.mapper.state import MapState
+
+_ASK = 10
+"""Keyframes after which the graph is asked how well it knows its newest pose, which takes time; between, the odometry adds
+to that. Larger takes less time, and takes the pose for less certain than it is."""
+
+
+@dataclass(frozen=True)
+class PosePrediction:
+    """The pose of a frame's camera in map (4, 4), and how well it is known.
+
+    camera_T_start: (4, 4) the beginning of the course in the camera's frame.
+    motion: id of the keyframe before, the motion (4, 4) from its camera, and the covariance (6, 6) of that in the new
+    camera's frame; None where there is no keyframe before, or the localisation holds the frame and the odometry did not
+    measure it.
+    """
+
+    map_T_camera: Floats
+    camera_T_start: Floats
+    uncertainty: PoseUncertainty
+    motion: tuple[int, Floats, Floats] | None
+
+
+class PosePredictor:
+    """Predicts poses from the map and the course, and remembers what of the graph takes long to ask."""
+
+    def __init__(self, state: MapState) -> None:
+        self._state = state
+        self._covariances: dict[int, Floats] = {}
+        self._floor: tuple[Floats | None, bool, Floats] = (None, True, np.zeros((6, 6)))
+
+    def predict(
+        self, before: int | None, stamp: float, placed: Placed, base_T_camera: Floats, start_T_camera: Floats
+    ) -> PosePrediction:
+        """The pose of a frame's camera.
+
+        Args:
+            before: row of the keyframe before it.
+            stamp: of the frame, s.
+            placed: where the course has the robot.
+            base_T_camera, start_T_camera: (4, 4) of the camera, on the robot and on the course.
+        """
+        m, k = self._state, self._state.keyframes
+        camera_T_start = inverse(start_T_camera)
+        camera_from_drift = adjoint(camera_T_start)
+        if before is None:
+            certain = PoseUncertainty(placed.drift, camera_from_drift, np.zeros((6, 6)))
+            return PosePrediction(placed.map_T_base @ base_T_camera, camera_T_start, certain, None)
+        held = k.localized.any()
+        measured = placed.by_odometry and (k.piece[before] == placed.piece or not held)
+        there = m.course.localization.at(stamp) if held and not measured else None
+        if there is not None:
+            noise = m.settings.localization
+            variance = np.diag([noise.yaw] * 3 + [noise.xy] * 3) ** 2
+            localized = PoseUncertainty(placed.drift, camera_from_drift, variance)
+            return PosePrediction(there.pose @ base_T_camera, camera_T_start, localized, None)
+        motion = k.camera_T_start[before] @ start_T_camera
+        if measured:
+            floor = self._motion_floor(base_T_camera)
+            covariance = odometry.motion_covariance(placed.drift - k.drift[before], camera_from_drift, floor)
+        else:
+            covariance = odometry.unknown_motion(base_T_camera, m.settings, m.course.odometry.planar)
+        number = int(k.id[before])
+        back = adjoint(camera_T_start @ k.start_T_base[before] @ k.base_T_camera[before])
+        pose = back @ self.covariance_of(number) @ back.T + covariance
+        reckoned = PoseUncertainty(placed.drift, camera_from_drift, pose)
+        return PosePrediction(m.graph.pose(number) @ motion, camera_T_start, reckoned, (number, motion, covariance))
+
+    def accept(self, prediction: PosePrediction) -> None:
+        """Keep the pose covariance of a prediction whose frame became the newest keyframe."""
+        m, number = self._state, int(self._state.keyframes.id[-1])
+        if prediction.motion is None:
+            m.pose_covariance = np.full((6, 6), np.nan)
+            return
+        m.pose_covariance = prediction.uncertainty.pose
+        if number % _ASK:
+            self._covariances[number] = m.pose_covariance
+
+    def covariance_of(self, keyframe: int) -> Floats:
+        """Covariance (6, 6) of a keyframe's camera, in its frame: as remembered, else as the graph has it."""
+        if keyframe not in self._covariances:
+            self._covariances = {keyframe: self._state.graph.pose_covariance(keyframe)}
+        return self._covariances[keyframe]
+
+    def _motion_floor(self, base_T_camera: Floats) -> Floats:
+        """`odometry.motion_floor`, which stays the same as long as the mount and the plane do."""
+        mount, planar, floor = self._floor
+        on_plane = self._state.course.odometry.planar
+        if mount is not base_T_camera or planar != on_plane:
+            floor = odometry.motion_floor(base_T_camera, self._state.settings, on_plane)
+            self._floor = base_T_camera, on_plane, floor
+        return floor

@@ -1,0 +1,137 @@
+"""A detector on live images, in a thread of its own: the newest image of each topic counts, older ones are dropped."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from objslam.errors import ObjslamError, first_line
+from objslam.live.ros.boxes import Boxes, Drop
+from objslam.ros.bag.records import frame_name
+from objslam.ros.messages.decode import DecodeError
+from objslam.ros.messages.images import colour_image
+
+if TYPE_CHECKING:
+    from objslam.detection import Detector
+
+_MAX_TOPICS = 64  # The most topics whose images wait; chosen to bound the memory.
+_IN_A_ROW = 5  # The images of a topic that fail one after the other before a user is told; larger: told later.
+_FAILED, _ENDED = "image that the detector failed on", "image that came after the detector had ended"
+
+
+class DetectorWorker:
+    """Runs a detector on the images that are offered and hands on what it finds.
+
+    One image a topic waits at a time; a newer one takes its place, so boxes are never older than one detection takes for
+    each topic. What is dropped is counted.
+    """
+
+    def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
+        self._detector, self._clock = detector, clock
+        self._waiting: dict[str, tuple[Any, float]] = {}
+        self._ready = threading.Condition()
+        self._thread: threading.Thread | None = None
+        self._closed = self._ended = False
+        self._in_a_row: Counter[str] = Counter()
+        self._told: set[str] = set()
+
+    def start(self, deliver: Callable[[Boxes], None], drop: Drop, warn: Callable[[str], None]) -> None:
+        """Start the thread that runs the detector.
+
+        The three functions may be called from any thread, also from the detector's own.
+
+        Args:
+            deliver: receives the boxes of an image.
+            drop: receives the reason and the place of each drop.
+            warn: receives what a user should know.
+        """
+        self._deliver, self._drop, self._warn = deliver, drop, warn
+        self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
+        self._thread.start()
+
+    def offer(self, topic: str, message: Any, stamp: float) -> None:
+        """Take an image message; returns at once."""
+        with self._ready:
+            ended = self._ended
+            late = self._waiting.pop(topic, None)
+            full = late is None and len(self._waiting) >= _MAX_TOPICS
+            if not full and not ended:
+                self._waiting[topic] = message, stamp
+                self._ready.notify()
+        if ended:
+            self._drop(_ENDED, f"{topic} at {stamp:.3f} s")
+        elif late is not None:
+            self._drop("image that a newer one overtook before the detector had time for it", f"{topic} at {late[1]:.3f} s")
+        elif full:
+            self._drop(f"image of a topic beyond the first {_MAX_TOPICS}", topic)
+
+    def close(self) -> None:
+        """End the thread, after the image that it is at."""
+        with self._ready:
+            self._closed = True
+            self._ready.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _work(self) -> None:
+        try:
+            while (waiting := self._next()) is not None:
+                self._look(*waiting)
+        except BaseException as error:  # noqa: BLE001 - a thread that is told to exit has nobody else to tell
+            with self._ready:
+                self._ended = True
+                left, self._waiting = self._waiting, {}
+            self._warn(f"the detector has ended, no image is looked at any more: {_one_line(error)}")
+            for topic, (_, stamp) in left.items():
+                self._drop(_ENDED, f"{topic} at {stamp:.3f} s")
+
+    def _next(self) -> tuple[str, Any, float] | None:
+        """The topic, message and stamp of the image that has waited longest; None in the end."""
+        with self._ready:
+            self._ready.wait_for(lambda: self._waiting or self._closed)
+            if self._closed:
+                return None
+            topic = next(iter(self._waiting))
+            return topic, *self._waiting.pop(topic)
+
+    def _look(self, topic: str, message: Any, stamp: float) -> None:
+        """Find the boxes of an image and hand them on; whatever goes wrong is counted, and the next image may do better."""
+        reason = _FAILED
+        try:
+            image = colour_image(message)
+            found = self._detector.detect([image])[0]
+            size, frame = (image.shape[1], image.shape[0]), frame_name(message.header.frame_id)
+            what = found.boxes, found.labels, found.scores
+            boxes = Boxes(topic, stamp, frame, self._clock(), *what, size=size, image=image)
+            reason = "image whose boxes could not be handed on"
+            self._deliver(boxes)
+        except DecodeError as error:
+            self._fail("image that cannot be decoded", topic, stamp, error)
+        except BaseException as error:
+            self._fail(reason, topic, stamp, error)
+            if not isinstance(error, Exception):
+                raise
+        else:
+            self._in_a_row.pop(topic, None)
+
+    def _fail(self, reason: str, topic: str, stamp: float, error: BaseException) -> None:
+        """Count an image without boxes; where one of a topic follows the other, say so, once."""
+        why = _one_line(error)
+        self._drop(reason, f"{topic} at {stamp:.3f} s: {why}")
+        self._in_a_row[topic] += 1
+        if self._in_a_row[topic] == _IN_A_ROW and topic not in self._told:
+            self._told.add(topic)
+            self._warn(
+                f"{topic}: the detector gave no boxes for {_IN_A_ROW} images in a row, the last at {stamp:.3f} s: {why}"
+            )
+
+
+def _one_line(error: BaseException) -> str:
+    """What went wrong; whose message is no sentence of ours is named by its kind."""
+    if isinstance(error, (ObjslamError, DecodeError)):
+        return first_line(error)
+    kind = type(error).__name__
+    return f"{kind}: {first_line(error)}" if str(error).strip() else kind

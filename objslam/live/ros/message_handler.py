@@ -1,0 +1,260 @@
+"""ROS messages become pushes: odometry, transforms, calibrations, boxes, images, whatever middleware brought them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.io.camera_yaml import read_calibrations
+from objslam.live.interface import Sink
+from objslam.live.ros.boxes import Boxes
+from objslam.live.ros.camera_registry import Cameras
+from objslam.ros.bag.records import frame_name, plain
+from objslam.ros.messages.detections import MAX_BOXES, WRONG_LAYOUT, find_boxes, track_number
+from objslam.ros.messages.poses import one_pose
+from objslam.ros.messages.topic_types import CAMERA_INFO, IMAGES, ODOMETRY, POSES, TRANSFORMS, is_boxes, is_tags
+from objslam.ros.tf.buffer import TfBuffer, UnknownTransform
+from objslam.ros.tf.frames import find_base, find_odom, find_world, is_world, unchanged
+from objslam.ros.topics import TF, parse_topics
+from objslam.sources.ros_bag.options import RosOptions
+
+if TYPE_CHECKING:
+    from objslam.live.ros.detector_worker import DetectorWorker
+
+_GRACE = 2.0  # The time before tf stands in for an odometry topic, s; larger: a robot without one starts later.
+_LONGEST = 160  # The most letters of a place that the ledger keeps; chosen for a line that can be read.
+_MAX_TRACKS = 100_000  # The most names of tracks that are kept; chosen to bound the memory.
+
+
+class RosMessages:
+    """Takes messages of ROS 1 or 2 by type and pushes what they say into a sink; callable from any thread.
+
+    Odometry comes from one topic, else from tf; localisation from tf (each new map -> odom, with the odometry that follows
+    it), or from poses in map. What cannot be used is counted in `ledger`. `chosen` holds the topics that the options choose.
+    """
+
+    def __init__(
+        self,
+        sink: Sink,
+        options: RosOptions | None = None,
+        detector: DetectorWorker | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        ledger: Ledger | None = None,
+    ) -> None:
+        self.ledger = ledger if ledger is not None else Ledger()
+        self._sink, self._detector, self._clock = sink, detector, clock
+        options = self._options = options or RosOptions()
+        self.chosen = parse_topics(options.topics, live=True)
+        calibrations = read_calibrations(options.camera_info, self.ledger) if options.camera_info is not None else ()
+        self._lock = threading.RLock()
+        self._tf = TfBuffer()
+        self._cameras = Cameras(sink, self._tf, self._base, self.refuse, calibrations, options.rectified)
+        self._sources = {role: names[0] for (_, role), names in self.chosen.names.items() if len(names) == 1}
+        self._child = ""
+        self._odom = ""
+        self._correction: Floats | None = None
+        self._corrected = False
+        self._tf_since: float | None = None
+        self._tf_stamp: float | None = None
+        self._tracks: dict[str, int] = {}
+        if detector is not None:
+            detector.start(self.add_boxes, self.refuse, self._warn)
+
+    def receive(self, type_: str, topic: str, message: Any, received: float) -> None:
+        """Take a message. type_: as ROS 2 writes it (nav_msgs/msg/Odometry). received: s since 1970, for unset stamps."""
+        with self._lock:
+            if type_ == ODOMETRY:
+                self._take_odometry(topic, message, received)
+            elif type_ in POSES:
+                self._take_pose(topic, message, received)
+            elif type_ in TRANSFORMS:
+                self._take_transforms(topic, message, received)
+            elif is_boxes(type_):
+                self._take_boxes(type_, topic, message, received)
+            elif type_ == CAMERA_INFO:
+                self._cameras.add_info(topic, message)
+                self._cameras.settle(self._clock())
+            elif type_ in IMAGES and topic in self.chosen.of("depth"):
+                self._cameras.add_depth(topic, message, _stamp(message.header, received))
+                self._cameras.settle(self._clock())
+            elif type_ in IMAGES and self._detector is not None:
+                self._detector.offer(topic, message, _stamp(message.header, received))
+
+    def refuse(self, reason: str, where: str, count: int = 1) -> None:
+        """Count what cannot be used, from any thread."""
+        with self._lock:
+            self.ledger.drop(reason, count, where[:_LONGEST] or None)
+
+    def tick(self) -> None:
+        """To be called some times a second: gives up on what has waited too long."""
+        with self._lock:
+            self._cameras.settle(self._clock())
+
+    def add_boxes(self, boxes: Boxes) -> None:
+        """Push the boxes of an image, however they were found."""
+        with self._lock:
+            self._cameras.add(boxes)
+
+    def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
+        """The image (H, W, 3), uint8 BGR, that the detector saw at a stamp, s; None where it is not one of the newest."""
+        with self._lock:
+            return self._cameras.image(camera, stamp)
+
+    def serves(self, role: str) -> str | None:
+        """The topic (or "tf") that plays a role by now."""
+        return self._sources.get(role)
+
+    def _warn(self, message: str) -> None:
+        with self._lock:
+            self.ledger.warn(message)
+
+    def _takes(self, role: str, source: str) -> bool:
+        """Whether a source plays a role: the one that was chosen, else the first that came."""
+        if self._sources.setdefault(role, source) == source:
+            return True
+        if source != TF:
+            self.refuse(f"{role} from another topic than the one taken", source)
+        return False
+
+    def _base(self) -> str:
+        return find_base(self._tf.frames, self._options.base_frame, self._child)
+
+    def _take_odometry(self, topic: str, message: Any, received: float) -> None:
+        frame, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
+        stamp, pose = _stamp(message.header, received), one_pose(message.pose.pose.position, message.pose.pose.orientation)
+        covariance = _covariance(message.pose.covariance)
+        role = "localization" if is_world(frame) or topic in self.chosen.of("localization") else "odometry"
+        if not self._takes(role, topic):
+            return
+        if pose is None:
+            self.refuse(f"{role} message that is no pose (not finite, or a zero quaternion)", f"{topic} at {stamp:.3f} s")
+            return
+        base = self._base() if child else ""
+        if child and base != child and {child, base} <= self._tf.frames:
+            try:
+                pose, covariance = pose @ self._tf.at(child, base, stamp), None
+            except UnknownTransform as unknown:
+                self.refuse(f"{role} message at whose time its frame's place on the robot is not known", str(unknown))
+                return
+        if role == "localization":
+            self._sink.push_localization(stamp, pose, covariance)
+            return
+        if (frame, child) != (self._odom, self._child):
+            self._odom, self._child = frame, child
+            with suppress(UnknownTransform):  # no localisation by tf, so far
+                self._correct(frame)
+        self._push_odometry(stamp, pose, covariance)
+
+    def _push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> None:
+        self._sink.push_odometry(stamp, odom_T_base, covariance)
+        if self._corrected and self._correction is not None:
+            self._corrected = False
+            self._sink.push_localization(stamp, self._correction @ odom_T_base)
+
+    def _take_pose(self, topic: str, message: Any, received: float) -> None:
+        if topic not in self.chosen.of("localization"):  # a goal is a pose too: nothing is taken unasked
+            return
+        stamp, covariant = _stamp(message.header, received), hasattr(message.pose, "pose")
+        place = message.pose.pose if covariant else message.pose
+        pose = one_pose(place.position, place.orientation)
+        if pose is None:
+            self.refuse("localization message that is no pose (not finite, or a zero quaternion)", topic)
+            return
+        self._sink.push_localization(stamp, pose, _covariance(message.pose.covariance) if covariant else None)
+
+    def _take_transforms(self, topic: str, message: Any, received: float) -> None:
+        static = topic.endswith("tf_static")
+        changed: set[str] = set()
+        for transform in message.transforms:
+            try:
+                changed.add(self._tf.add(transform, received, static))
+            except ValueError as error:
+                frames = f"{transform.header.frame_id} -> {transform.child_frame_id}"
+                self.refuse(str(error), f"{topic}: {plain(frames)}")
+        with suppress(UnknownTransform):  # the tree is not whole yet: the boxes that wait for what is missing will say so
+            self._read_path(changed)
+        self._cameras.settle(self._clock())
+
+    def _read_path(self, changed: set[str]) -> None:
+        """Odometry and localisation out of the transforms that have just changed."""
+        base = self._base()
+        above = self._tf.above(base)
+        odom = self._odom or find_odom(above)
+        if odom:
+            if any(frame in changed for frame in self._tf.above(odom)):
+                self._correct(odom)
+            if odom in above[1:] and self._odometry_by_tf():
+                stamp = self._news(odom, base)
+                if stamp is not None and self._takes("odometry", TF):
+                    self._push_odometry(stamp, self._tf.at(odom, base, stamp))
+            return
+        world = find_world(above[1:])
+        stamp = self._news(world, base) if world else None
+        if stamp is not None and self._takes("localization", TF):
+            self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
+
+    def _news(self, top: str, base: str) -> float | None:
+        """The newest stamp at which top_T_base is known, None where it is the same as last time, or all is static."""
+        stamp = self._tf.newest(top, base)
+        news = None if stamp == self._tf_stamp else stamp
+        self._tf_stamp = stamp
+        return news
+
+    def _correct(self, odom: str) -> None:
+        """A new map -> odom: it is pushed with the odometry that comes next. One that is only repeated tells nothing new."""
+        world = find_world(self._tf.above(odom)[1:])
+        if not world or not self._takes("localization", TF):
+            return
+        correction = self._tf.at(world, odom, self._tf.newest(world, odom) or 0.0)
+        if self._correction is None or not unchanged(correction, self._correction):
+            self._correction, self._corrected = correction, True
+
+    def _odometry_by_tf(self) -> bool:
+        """Whether tf gives the odometry: where a user says so, or no topic has come up for a while."""
+        if "odometry" in self._sources:
+            return self._sources["odometry"] == TF
+        now = self._clock()
+        self._tf_since = now if self._tf_since is None else self._tf_since
+        return now - self._tf_since > _GRACE
+
+    def _take_boxes(self, type_: str, topic: str, message: Any, received: float) -> None:
+        stamp = _stamp(message.header, received)
+        try:
+            found = list(find_boxes(type_, message))
+            rows = np.array([box for box, *_ in found], dtype=np.float64).reshape(-1, 4)
+            scores = np.array([score for _, _, score, _, _ in found], dtype=np.float64)
+        except WRONG_LAYOUT as error:
+            self.refuse("message not laid out as detections are", f"{topic}: {error}")
+            return
+        if len(found) > MAX_BOXES:
+            self.refuse(f"message with more than {MAX_BOXES} detections", topic)
+            return
+        frame = message.header.frame_id
+        if not frame and found:  # some detectors fill in the header of each box alone
+            frame = getattr(getattr(next(iter(getattr(message, "detections", ())), None), "header", None), "frame_id", "")
+        labels = [label or self._options.label or "" for _, label, _, _, _ in found]
+        if len(self._tracks) > _MAX_TRACKS:  # a tracker that never repeats a name says nothing by them
+            self._tracks.clear()
+        tracks = [track_number(track, self._tracks) for _, _, _, track, _ in found]
+        points = {index: place for index, (*_, place) in enumerate(found) if place is not None}
+        known = tracks if any(track >= 0 for track in tracks) else None
+        place = topic, stamp, frame_name(frame), self._clock()
+        self._cameras.add(Boxes(*place, rows, labels, scores, known, points, whole=is_tags(type_)))
+
+
+def _stamp(header: Any, received: float) -> float:
+    return float(header.stamp.sec + header.stamp.nanosec * 1e-9) or received
+
+
+def _covariance(values: Any) -> Floats | None:
+    """(6, 6), None where nobody has filled it in."""
+    matrix = np.array(values, dtype=np.float64)
+    return matrix.reshape(6, 6) if matrix.size == 36 and np.isfinite(matrix).all() and matrix.any() else None

@@ -1,0 +1,169 @@
+"""The end of a session: everything it kept, solved once more as offline does, becomes a result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
+from objslam.core.result import RunResult
+from objslam.core.types import Association, Keyframes, Rays, Trajectory
+from objslam.errors import SolveError
+from objslam.live.mapper.state import MapState
+from objslam.mapping.alternation import Solution, seen_something, solve
+from objslam.mapping.describe import describe, summarise
+
+
+def finish(m: MapState, name: str, path: Path | None) -> RunResult:
+    """The result of a session: the joint mode's association and solve in turns, from what the session knows.
+
+    Where labels tell objects apart, or there are more rays than live.reassociate, its association stands.
+
+    SolveError where nothing was seen.
+    """
+    from objslam.graph.init_unknown_correspondences import InitialEstimate
+
+    begin = time.perf_counter()
+    settings = m.settings.model_copy(update={"mode": "joint"})
+    ledger = m.counters.ledger
+    keyframes, rays, association, poses, positions = collected(m)
+    if not len(rays):
+        kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
+        came = m.counters.accepted()
+        came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
+        missing = [f"no {what} came" for what, kind in kinds.items() if not came.get(kind)]
+        hint = "; ".join(missing + ledger.lines())
+        raise SolveError("nothing was seen that could be mapped", where=name, hint=hint or None)
+    cameras = tuple(m.cameras)
+    if m.by_label or len(rays) > settings.live.reassociate:
+        estimate = _solve_joint(keyframes, rays, association, settings, ledger, poses)
+        solution = Solution(keyframes, rays, association, estimate, ())
+    else:
+        start = InitialEstimate(poses, association, positions)
+        solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start)
+    keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
+    objects, residual = describe(solution, cameras, settings)
+    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
+    accepted = m.counters.accepted()
+    counts = {
+        "detection_frames": accepted.get("frames", 0),
+        "frames_on_path": sum(m.frames.values()),
+        "detections": accepted.get("boxes", 0),
+    }
+    seconds = {"finish": round(time.perf_counter() - begin, 4)}
+    summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
+    stamps, first = np.unique(keyframes.stamps, return_index=True)
+    return RunResult(
+        map=objects,
+        keyframes=keyframes,
+        map_T_base=estimate.map_T_base,
+        rays=rays,
+        association=association,
+        origins=origins,
+        directions=directions,
+        residual=residual,
+        weight=estimate.weight,
+        summary={**summary, "live": {**accepted, "rebuilds": m.graph.rebuilds}},
+        settings=settings,
+        cameras=cameras,
+        path=Trajectory(stamps, keyframes.map_T_base[first]),
+        path_after=Trajectory(stamps, estimate.map_T_base[first]),
+    )
+
+
+def _solve_joint(
+    keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
+) -> Estimate:
+    """The joint solve from the session's poses (K, 4, 4), or the one that offline would make, if that fits better.
+
+    What a session rejected early on, when little was known, it may never have looked at in a better light.
+    """
+    from objslam.graph import batch_solver
+    from objslam.graph.assembly import Measurements
+    from objslam.graph.outlier_rejection import misfit
+
+    found = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+    if not association.count or len(rays) > settings.live.reassociate:
+        return found
+    if keyframes.odom_T_base is None or keyframes.localized_every:
+        return found
+    said = Ledger()
+    try:
+        other = batch_solver.solve_joint(keyframes, rays, association, settings, said)
+    except SolveError:  # then there is nothing to choose from
+        return found
+    measured = Measurements.of(keyframes, rays, settings)
+    before, after = (
+        misfit(one.map_T_base @ keyframes.base_T_camera, one.positions, measured, association) for one in (found, other)
+    )
+    if not after < before:
+        return found
+    ledger.add(said)
+    return other
+
+
+def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats]:
+    """Keyframes in the order of time, rays in theirs, who is whose, camera poses (K, 4, 4) and places (N, 3).
+
+    With a localisation, keyframes that it does not cover are left out, as offline does. Tracks with enough rays are
+    objects too, which the solve may leave unresolved.
+    """
+    m.graph.refresh()
+    k, r = m.keyframes, m.rays
+    order = np.argsort(k.stamp, kind="stable")
+    if k.localized.any():
+        off = order[~k.localized[order]]
+        if len(off):
+            boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
+            m.counters.drop("keyframes that the localisation does not cover", where, len(off))
+            m.counters.drop("boxes that the localisation does not cover", where, boxes)
+        order = order[k.localized[order]]
+    number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
+    number[k.id[order]] = np.arange(len(order))
+    owner, label, place = _owners(m)
+    at = number[r.keyframe]
+    rows = np.flatnonzero(at >= 0)
+    rows = rows[np.argsort(at[rows], kind="stable")]
+    rays = Rays(
+        keyframe=at[rows],
+        direction=r.direction[rows],
+        sigma=r.sigma[rows],
+        range=r.range[rows],
+        range_sigma=r.range_sigma[rows],
+        label=r.label[rows],
+        score=r.score[rows],
+        box=r.box[rows],
+        track_id=r.track[rows],
+        label_names=tuple(m.labels),
+    )
+    poses = m.graph.poses(k.id[order])
+    frames = m.keyframe_arrays(order)
+    frames = replace(frames, map_T_base=frames.map_T_base.copy())
+    kept = np.unique(rays.keyframe)
+    keyframes, rays = seen_something(frames, rays)
+    held, object_ = np.unique(owner[rows], return_inverse=True)
+    none = len(held) > 0 and held[0] < 0
+    association = Association(object_ - int(none), label[held[int(none) :]])
+    return keyframes, rays, association, poses[kept], place[held[int(none) :]]
+
+
+def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
+    """The object (R,) of each ray, -1 none, tracks after the landmarks, and the label and place of each object."""
+    landmarks, rays = m.landmarks, m.rays
+    owner = rays.owner.copy()
+    first = int(landmarks.id.max(initial=-1)) + 1
+    enough = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
+    label = np.zeros(first + len(enough), dtype=np.int64)
+    label[landmarks.id] = landmarks.label
+    place = np.zeros((len(label), 3))
+    place[landmarks.id] = landmarks.position
+    for i, track in enumerate(enough, first):
+        owner[np.searchsorted(rays.number, track.numbers())] = i
+        label[i], place[i] = track.label, track.position
+    return owner, label, place

@@ -1,0 +1,67 @@
+"""The frames of a session wait here until the path covers them, and then go into the map in their order."""
+
+from __future__ import annotations
+
+import bisect
+import time
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.live.counters import Counters
+from objslam.live.mapper.mapper import Mapper
+from objslam.sources.journal.records import FrameMessage, Message
+
+TOO_SLOW = "frames that waited too long (live.max_lag)"
+"""Why a frame was left out that the session had no time for."""
+_RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or it is too short"
+_NEVER_COVERED = "frames that the path never covered"
+
+
+class FrameQueue:
+    """Works messages into the map. patient: no frame is too old.
+
+    lag: s from the arrival of the newest frame to its place in the map. worked: when the last one was done, by the clock of
+    `time.perf_counter`.
+    """
+
+    def __init__(self, settings: Settings, counters: Counters, mapper: Mapper, patient: bool) -> None:
+        self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
+        self._counters, self._mapper, self._patient = counters, mapper, patient
+        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, which it was to come, frame, arrival
+        self._frames = 0
+        self.lag = 0.0
+        self.worked = -np.inf
+
+    def recall(self, message: Message) -> None:
+        """Take a message that a journal holds: it is not measured, and no frame is too old."""
+        self._take(message, time.perf_counter(), measured=False)
+
+    def take(self, message: Message, arrival: float) -> bool:
+        """Take a message that arrived then; whether it was a frame's turn."""
+        return self._take(message, arrival, measured=True)
+
+    def _take(self, message: Message, arrival: float, measured: bool) -> bool:
+        if isinstance(message, FrameMessage):
+            self._frames += 1
+            bisect.insort(self._waiting, (message.stamp, self._frames, message, arrival))
+            while len(self._waiting) > self._most:
+                self._counters.drop_frame(self._waiting.pop(0)[2], _NEVER_COVERED)
+        else:
+            self._mapper.feed(message)
+        worked = False
+        while self._waiting and self._mapper.is_ready(self._waiting[0][0]):
+            worked = True
+            _, _, frame, came = self._waiting.pop(0)
+            if measured and not self._patient and time.perf_counter() - came > self._limit:
+                self._counters.drop_frame(frame, _RARE_POSES if arrival - came > self._limit else TOO_SLOW)
+                continue
+            update = self._mapper.take(frame)
+            if update is not None:
+                self.lag = time.perf_counter() - came
+                if measured:
+                    self._counters.updated(self.lag)
+                self._mapper.look_after(update)
+        if worked:
+            self.worked = time.perf_counter()
+        return worked

@@ -1,0 +1,128 @@
+"""What can be said of a solution: each object with its evidence, and the summary of the run."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam import __version__
+from objslam.association.observations import extents
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import angles_off, widest_angle
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.status import reach, status_of
+from objslam.core.types import Association
+from objslam.mapping.alternation import Solution
+
+
+def describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> tuple[ObjectMap, Floats]:
+    """The objects with what can be said of each, counting rays not rejected; and how far off the rays are (R,), rad."""
+    keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
+    map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
+    origins, directions = rays.in_map(map_T_camera)
+    residual = np.full(len(rays), np.nan)
+    held = association.object >= 0
+    residual[held] = angles_off(origins[held], directions[held], estimate.positions[association.object[held]])
+    sizes = extents(rays, association, estimate.positions, map_T_camera, keyframes, cameras)
+    order = np.argsort(association.object, kind="stable")
+    bounds = np.searchsorted(association.object[order], np.arange(association.count + 1))
+    objects = []
+    for j in range(association.count):
+        mine = order[bounds[j] : bounds[j + 1]]
+        kept = mine[estimate.weight[mine] > 0] if (estimate.weight[mine] > 0).any() else mine
+        covariance = estimate.covariance[j]
+        parallax = widest_angle(directions[kept])
+        solved = bool(estimate.solved[j] and np.isfinite(covariance).all())
+        status = status_of(
+            sigma=float(estimate.seen_sigma[j]) if solved else np.inf,
+            reach=reach(estimate.positions[j], origins[kept]),
+            rays=len(kept),
+            parallax=parallax,
+            ranged=bool(np.isfinite(rays.range[kept]).any()),
+            limits=settings.triangulation,
+        )
+        known = status == "ok"
+        stamps = keyframes.stamps[rays.keyframe[mine]]
+        middle = kept[len(kept) // 2]
+        objects.append(
+            MapObject(
+                id=j,
+                label=rays.label_names[association.label[j]],
+                position=estimate.positions[j],
+                covariance=covariance if known else None,
+                status=status,
+                rays=len(kept),
+                frames=len(np.unique(rays.keyframe[kept])),
+                parallax_deg=round(float(np.degrees(parallax)), 3),
+                rms_deg=round(float(np.degrees(np.sqrt(np.mean(residual[kept] ** 2)))), 4),
+                first_seen=float(stamps.min()),
+                last_seen=float(stamps.max()),
+                extent=(float(sizes[j, 0]), float(sizes[j, 1])) if np.isfinite(sizes[j]).all() else None,
+                ray=None if known else (origins[middle], directions[middle]),
+                labels=_label_shares(association, j, rays.label_names),
+                existence=None if association.existence is None else round(float(association.existence[j]), 4),
+            )
+        )
+    return ObjectMap(tuple(objects)), residual
+
+
+def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
+    if association.label_weights is None:
+        return None
+    shares = association.label_weights[j]
+    return {names[i]: round(float(shares[i]), 4) for i in np.argsort(-shares, kind="stable") if shares[i] > 0}
+
+
+def summarise(
+    name: str,
+    path: Path | None,
+    counts: dict[str, int],
+    settings: Settings,
+    ledger: Ledger,
+    solution: Solution,
+    objects: ObjectMap,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """What summary.json gets; counts: what the driver counted on the way to the solution."""
+    estimate, rays = solution.estimate, solution.rays
+    unexplained = rays.label[solution.association.object < 0]
+    total = np.bincount(rays.label, minlength=len(rays.label_names))
+    left = np.bincount(unexplained, minlength=len(rays.label_names))
+    packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
+    return {
+        "log": name,
+        "log_path": None if path is None else str(path),
+        "mode": settings.mode,
+        "counts": {
+            **counts,
+            "keyframes": len(solution.keyframes),
+            "rays": len(rays),
+            "rays_rejected": int((estimate.weight[solution.association.object >= 0] == 0).sum()),
+            "rays_unexplained": len(unexplained),
+            "objects": len(objects),
+            "unresolved": len(objects) - len(objects.resolved()),
+        },
+        "unexplained_share": {
+            label: round(float(n / of), 4) for label, n, of in zip(rays.label_names, left, total, strict=True) if n
+        },
+        "rounds": list(solution.rounds),
+        "dropped": dict(ledger.dropped),
+        "dropped_examples": {k: v for k, v in ledger.examples.items() if v},
+        "cost_before": estimate.cost_before,
+        "cost_after": estimate.cost_after,
+        "iterations": estimate.iterations,
+        "seconds": seconds,
+        "versions": {
+            "objslam": __version__,
+            "python": platform.python_version(),
+            **{package: importlib.metadata.version(package) for package in packages},
+        },
+        "warnings": list(ledger.warnings),
+    }

@@ -1,0 +1,30 @@
+"""The odometry between the poses of a result, for exports and other optimisers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from objslam.core.result import RunResult
+from objslam.io.odometry_parquet import Motions
+
+_TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
+
+
+def motions_of(result: RunResult) -> Motions | None:
+    """What the odometry measured between the poses of trajectory.txt, None where the run used none, as in fixed mode."""
+    from objslam.graph.factors.odometry import motions
+
+    keyframes = result.keyframes
+    if keyframes.odom_T_base is None:
+        return None
+    stamps, first = np.unique(keyframes.stamps, return_index=True)
+    at = keyframes.take(first)
+    at = replace(at, base_T_camera=np.broadcast_to(np.eye(4), at.base_T_camera.shape))
+    motion, covariance = motions(at, result.settings)
+    swapped = covariance[:, _TRANSLATION_FIRST][:, :, _TRANSLATION_FIRST]
+    there = at.measured
+    return Motions(stamps[:-1][there], stamps[1:][there], motion[there], swapped[there])

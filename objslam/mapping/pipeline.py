@@ -1,0 +1,129 @@
+"""The offline driver: a whole log becomes a map of objects."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
+from objslam.core.object_map import ObjectMap
+from objslam.core.result import RunResult
+from objslam.core.trajectory import correct_path
+from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.errors import LogError, SolveError
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping.alternation import Progress, Solution, solve
+from objslam.mapping.describe import describe, summarise
+from objslam.mapping.reconstruction import has_depth, reconstruct
+
+
+def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
+    """The object map of a log, with everything that a result holds.
+
+    SolveError when no ray is left to solve; LogError when no frame lies on the path. What was dropped is in the ledger, and
+    with it in the summary.
+    """
+    log = _chosen_poses(log, settings)
+    seconds: dict[str, float] = {}
+    with _stage("rays", seconds, progress):
+        frames = build_keyframes(log, settings, ledger)
+        rays = build_rays(log, frames, settings, ledger)
+    if len(rays) == 0:
+        raise SolveError(
+            "no box gives a usable ray", where=log.name, hint="; ".join(ledger.lines()) or "the detections are empty"
+        )
+    cameras = tuple(c.camera for c in log.cameras)
+    with _stage("solve", seconds, progress):
+        solution = solve(frames, rays, cameras, settings, ledger, progress)
+    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
+    objects, residual = describe(solution, cameras, settings)
+    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
+    path = log.localization or log.odometry
+    assert path is not None  # build_keyframes has refused such a log
+    path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
+    surface, before = None, None
+    if settings.reconstruction.use and has_depth(log):
+        with _stage("reconstruction", seconds, progress):
+            surface = reconstruct(log, path_after, settings, ledger, progress)
+            if settings.reconstruction.before:
+                before = reconstruct(log, path, settings, Ledger(), progress)  # what it drops has been said
+    return RunResult(
+        map=objects,
+        keyframes=keyframes,
+        map_T_base=estimate.map_T_base,
+        rays=rays,
+        association=solution.association,
+        origins=origins,
+        directions=directions,
+        residual=residual,
+        weight=estimate.weight,
+        summary=_summary(log, settings, ledger, len(frames), solution, objects, seconds),
+        settings=settings,
+        cameras=cameras,
+        path=path,
+        path_after=path_after,
+        trace=solution.trace,
+        images=tuple(c.rgb for c in log.cameras),
+        surface=surface,
+        surface_before=before,
+    )
+
+
+def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
+    """The path through the solved poses (K, 4, 4) of the keyframes.
+
+    Between two of them the odometry tells the way, in joint mode: a localisation's jitter is what the solve has taken out.
+    """
+    after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
+    way = log.odometry
+    if settings.mode == "fixed" or way is None or way is path:
+        return after
+    before, _ = interpolate(way.stamps, way.poses, keyframes.stamps, float("inf"))
+    smooth = correct_path(way, keyframes.stamps, before, map_T_base)
+    poses, inside = interpolate(way.stamps, smooth.poses, path.stamps, settings.poses.max_gap)
+    return Trajectory(path.stamps, np.where(inside[:, None, None], poses, after.poses))
+
+
+def _chosen_poses(log: Log, settings: Settings) -> Log:
+    use = settings.poses.use
+    if use == "auto":
+        return log
+    if (log.odometry if use == "odometry" else log.localization) is None:
+        raise LogError(f"the log has no {use}", where=log.name, hint="leave poses.use at auto")
+    return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
+
+
+@contextmanager
+def _stage(name: str, seconds: dict[str, float], progress: Progress) -> Iterator[None]:
+    progress(name, 0, 0)
+    begin = time.perf_counter()
+    yield
+    seconds[name] = round(time.perf_counter() - begin, 4)
+
+
+def _summary(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    frames: int,
+    solution: Solution,
+    objects: ObjectMap,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    found = [c.detections for c in log.cameras if c.detections is not None]
+    counts = {
+        "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
+        "detection_frames": sum(len(detections.frame_stamps) for detections in found),
+        "frames_on_path": frames,
+        "detections": sum(len(detections) for detections in found),
+    }
+    return summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds)

@@ -1,0 +1,291 @@
+"""The room around the objects: depth images fused at the solved poses into one coloured surface (Open3D's VoxelBlockGrid).
+
+Truncated signed distances (Curless & Levoy, SIGGRAPH 1996) in blocks of 6^3 voxels that exist only near surfaces (Dong et
+al., ASH, T-PAMI 2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate, inverse
+from objslam.core.types import CameraLog, Log, Surface, Trajectory
+from objslam.errors import LogError
+from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_depth
+from objslam.io.images import decode_colour
+from objslam.io.prefetch import ahead
+from objslam.io.text import read_bytes
+
+_BLOCK = 6  # voxels along a block's edge: a tenth less time and a quarter less memory than with 8, 16 takes twice the time
+_FIRST_BLOCKS = 32_768  # what the grid begins with, enough for a room; it doubles as it fills
+_SPARE = 1024  # blocks kept free: Open3D grows by itself unless all that a call touches would fit, be it there already
+_AHEAD = 4  # images that may be decoded ahead
+_TOUCH = 4  # Open3D looks at one pixel in this many for the blocks that a frame touches.
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A depth image to fuse, its colour image (None where no camera has some), and where it was taken from (4, 4)."""
+
+    camera: int
+    depth: Path
+    rgb: Path | None
+    map_T_camera: Floats
+
+
+def has_depth(log: Log) -> bool:
+    """Whether there are depth images at all."""
+    return any(camera_log.depth is not None for camera_log in log.cameras)
+
+
+def reconstruct(
+    log: Log,
+    path: Trajectory,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Progress = lambda stage, done, total: None,
+) -> Surface | None:
+    """The surface that a log's depth images show from the poses of a path (map_T_base); None, with a warning, without one.
+
+    Frames off the path or the mount, images that cannot be decoded or have another size than the camera, frames without a
+    colour image within 20 ms and frames without a depth in reach are dropped and counted. Depth images are z in the camera
+    image's own pixels. Memory is bounded by reconstruction.max_blocks: what lies in further blocks is left out, with a
+    warning. Where Open3D cannot be imported, or its device has no memory left, there is a warning and no surface.
+    """
+    shots = choose_shots(log, path, settings, ledger)
+    if not shots:
+        ledger.warn("no reconstruction: no depth image has a pose")
+        return None
+    try:
+        return _fuse(shots, tuple(c.camera for c in log.cameras), settings, ledger, progress)
+    except ImportError as error:
+        ledger.warn(f"no reconstruction: Open3D cannot be imported ({error}); tools/setup.sh names the libraries it needs")
+    except RuntimeError as error:  # what Open3D raises, out of memory on a GPU for example; the map is worth more than this
+        ledger.warn(f"no reconstruction: Open3D failed ({_last_line(error)})")
+    return None
+
+
+def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
+    """Every reconstruction.stride-th depth image with a pose, in the order of time; at most max_frames, evenly."""
+    chosen = settings.reconstruction
+    colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)
+    shots: list[tuple[float, Shot]] = []
+    for number, camera_log in enumerate(log.cameras):
+        if camera_log.depth is None:
+            continue
+        stamps = camera_log.depth.stamps
+        poses, valid = _camera_poses(camera_log, path, stamps, settings.poses.max_gap)
+        ledger.drop("depth images off the path", int((~valid).sum()), _first(stamps, ~valid))
+        rgb: list[Path | None] = [None] * len(stamps)
+        if colour and camera_log.rgb is not None:
+            index = nearest_stamps(camera_log.rgb.stamps, stamps)
+            near = np.abs(camera_log.rgb.stamps[index] - stamps) <= MAX_IMAGE_LAG
+            ledger.drop("depth images without a colour image", int((valid & ~near).sum()), _first(stamps, valid & ~near))
+            valid &= near
+            rgb = [camera_log.rgb.paths[i] for i in index.tolist()]
+        for i in np.flatnonzero(valid).tolist():
+            shots.append((stamps[i], Shot(number, camera_log.depth.paths[i], rgb[i], poses[i])))
+    shots.sort(key=lambda shot: shot[0])
+    taken = [shot for _, shot in shots[:: chosen.stride]]
+    return taken[:: -(-len(taken) // chosen.max_frames)] if taken else []
+
+
+def _camera_poses(camera_log: CameraLog, path: Trajectory, stamps: Floats, max_gap: float) -> tuple[Floats, Bools]:
+    """map_T_camera (N, 4, 4) at the stamps, and where it is known (N,)."""
+    map_T_base, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
+    if camera_log.mount is None:
+        return map_T_base @ camera_log.camera.base_T_camera, valid
+    base_T_camera, mounted = interpolate(camera_log.mount.stamps, camera_log.mount.poses, stamps, max_gap)
+    return map_T_base @ base_T_camera, valid & mounted
+
+
+def _fuse(
+    shots: list[Shot], cameras: tuple[Camera, ...], settings: Settings, ledger: Ledger, progress: Progress
+) -> Surface | None:
+    chosen = settings.reconstruction
+    grid: Grid | None = None
+    with _quiet():
+        lenses = [Lens.of(camera) for camera in cameras]
+
+        def load(shot: Shot) -> tuple[Shot, NDArray[np.float32] | None, NDArray[np.float32] | None, Ledger]:
+            noted = Ledger()  # threads must not share one
+            return shot, *load_shot(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
+
+        for done, (shot, depth, colour, noted) in enumerate(ahead(load, shots, _AHEAD)):
+            ledger.add(noted)
+            if depth is not None:
+                if grid is None:
+                    grid = Grid(settings, coloured=colour is not None)
+                grid.add(depth, colour, cameras[shot.camera].matrix, shot.map_T_camera)
+            progress("reconstruction", done + 1, len(shots))
+        if grid is None:
+            ledger.warn("no reconstruction: no depth image could be used")
+            return None
+        if grid.left_out:
+            ledger.warn(
+                f"the reconstruction is not whole: {grid.left_out} times a block of it had no room "
+                "(reconstruction.max_blocks, or a larger voxel)"
+            )
+        surface = grid.surface(chosen.min_views)
+    if surface is None:
+        ledger.warn(f"no reconstruction: no surface was seen by {chosen.min_views} depth images (reconstruction.min_views)")
+    return surface
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How to straighten a camera's images: maps for cv2.remap, None where there is no distortion."""
+
+    maps: tuple[NDArray[Any], NDArray[Any]] | None
+
+    @classmethod
+    def of(cls, camera: Camera) -> Lens:
+        """Onto a pinhole camera with the same matrix."""
+        import cv2
+
+        if camera.distortion_model != "equidistant" and not camera.distortion.any():
+            return cls(None)
+        fisheye = camera.distortion_model == "equidistant"
+        make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+        size = (camera.width, camera.height)
+        first, second = make(camera.matrix, camera.distortion, np.eye(3), camera.matrix, size, cv2.CV_16SC2)
+        return cls((first, second))
+
+    def straighten(self, image: NDArray[Any], *, smooth: bool) -> NDArray[Any]:
+        """The image, straightened; smooth: between pixels, as colour wants and depth must not."""
+        import cv2
+
+        if self.maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self.maps, cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST))
+
+
+def load_shot(
+    shot: Shot, camera: Camera, lens: Lens, max_depth: float, ledger: Ledger
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Depth (H, W), m, 0 where none is in reach, and RGB (H, W, 3) in [0, 1], both straightened; None where unusable."""
+    raw = read_depth(shot.depth, camera, ledger)
+    if raw is None:
+        return None, None
+    depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
+    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # what is not a number compares false
+    if not depth[::_TOUCH, ::_TOUCH].any():
+        ledger.drop("depth images without a depth in reach", where=str(shot.depth))
+        return None, None
+    if shot.rgb is None:
+        return depth, None
+    try:
+        image = decode_colour(read_bytes(shot.rgb))
+    except LogError:
+        image = None
+    if image is None or image.shape[:2] != (camera.height, camera.width):
+        ledger.drop("colour image that cannot be decoded or has not the camera's size", where=str(shot.rgb))
+        return None, None
+    return depth, np.ascontiguousarray(lens.straighten(image, smooth=True)[..., ::-1], dtype=np.float32) / np.float32(255)
+
+
+class Grid:
+    """A voxel block grid that grows up to reconstruction.max_blocks blocks of 6^3 voxels, 20 bytes each (8 without colour).
+
+    left_out: how many times a frame touched a block that had no room.
+    """
+
+    def __init__(self, settings: Settings, *, coloured: bool) -> None:
+        import open3d as o3d
+
+        chosen = settings.reconstruction
+        self._core: Any = o3d.core
+        self._geometry: Any = o3d.t.geometry
+        cuda = chosen.device == "cuda" or (chosen.device == "auto" and o3d.core.cuda.is_available())
+        self._device = o3d.core.Device("CUDA:0" if cuda else "CPU:0")
+        self._max_blocks = chosen.max_blocks
+        self._max_depth = chosen.max_depth
+        self._truncation = max(chosen.truncation / chosen.voxel, 2.0)  # voxels
+        # floats throughout: with its 16-bit colours Open3D rounds each average down, and walls darken by a tenth
+        names, channels = (("tsdf", "weight", "color"), (1, 1, 3)) if coloured else (("tsdf", "weight"), (1, 1))
+        first = min(_FIRST_BLOCKS, self._max_blocks)
+        dtypes = (o3d.core.float32,) * len(names)
+        self._grid = self._geometry.VoxelBlockGrid(names, dtypes, channels, chosen.voxel, _BLOCK, first, self._device)
+        self.left_out = 0
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks there are."""
+        return int(self._grid.hashmap().size())
+
+    def add(self, depth: NDArray[np.float32], colour: NDArray[np.float32] | None, matrix: Floats, pose: Floats) -> None:
+        """Fuse one frame: depth (H, W) m, colour (H, W, 3) in [0, 1], seen from map_T_camera (4, 4) by a pinhole camera."""
+        images = [self._image(image) for image in (depth, colour) if image is not None]
+        # Open3D takes the pixel at the whole number below, we have pixel centres there: half a pixel makes it the nearest
+        shift = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+        k, camera_T_map = self._core.Tensor(matrix + shift), self._core.Tensor(inverse(pose))
+        reach = (1.0, self._max_depth, self._truncation)
+        touched = self._grid.compute_unique_block_coordinates(images[0], k, camera_T_map, *reach)
+        for part in self._with_room(touched):
+            self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
+
+    def _with_room(self, touched: Any) -> Iterator[Any]:
+        """The touched blocks (M, 3) that exist or have room, in portions that make Open3D grow no further than it may."""
+        hashmap = self._grid.hashmap()
+
+        def room() -> int:
+            return int(hashmap.capacity() - _SPARE - hashmap.size())
+
+        while len(touched) > room() and hashmap.capacity() < self._max_blocks:
+            hashmap.reserve(min(2 * hashmap.capacity(), self._max_blocks))
+        if len(touched) <= room():
+            yield touched
+            return
+        known = hashmap.find(touched)[1].cpu().numpy()
+        new, fitting = np.flatnonzero(~known), max(room(), 0)
+        self.left_out += len(new[fitting:])
+        kept = np.concatenate([np.flatnonzero(known), new[:fitting]])
+        for start in range(0, len(kept), _SPARE):
+            yield touched[self._core.Tensor(kept[start : start + _SPARE], device=self._device)]
+
+    def _image(self, image: NDArray[np.float32]) -> Any:
+        return self._geometry.Image(self._core.Tensor.from_numpy(image)).to(self._device)
+
+    def surface(self, min_views: int) -> Surface | None:
+        """The triangles between voxels that enough frames saw; None without one."""
+        if not self.blocks:
+            return None
+        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D wants more than it is told
+        if not len(mesh.triangle.indices):
+            return None
+        colours = None
+        if "colors" in mesh.vertex:
+            colours = np.clip(255 * mesh.vertex.colors.numpy() + 0.5, 0, 255).astype(np.uint8)
+        triangles = mesh.triangle.indices.numpy().astype(np.int32)
+        return Surface(mesh.vertex.positions.numpy().copy(), mesh.vertex.normals.numpy().copy(), colours, triangles)
+
+
+def _first(stamps: Floats, mask: Bools) -> str | None:
+    return f"stamp {stamps[mask][0]:.3f}" if mask.any() else None
+
+
+def _last_line(error: Exception) -> str:
+    """What an error of Open3D says, without the colours and the signature before it."""
+    return str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Open3D prints its warnings to stdout: not here."""
+    import open3d as o3d
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        yield

@@ -1,0 +1,43 @@
+"""Exports: a result in the formats of other tools, one file each. The formats themselves are in `formats`.
+
+What draws or records a result is in `plot`, `viewer` and `report`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from objslam.errors import ConfigError, OutputError
+from objslam.output.export.formats import FORMATS
+
+if TYPE_CHECKING:
+    from objslam.output.export.datum import Datum
+
+
+def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | None = None) -> Path:
+    """Write a result in another tool's format.
+
+    Args:
+        to: the name of a format in `FORMATS`.
+        file: where to write; by default the format's usual file in the result folder `out`.
+    Returns:
+        The path of the file.
+    Raises:
+        ConfigError: the format does not exist, or takes no datum.
+        OutputError: the result cannot be read, lacks what the format needs, or the file cannot be written.
+    """
+    from objslam.io.atomic_files import write_file
+    from objslam.output.export.content import load_content
+
+    if to not in FORMATS:
+        raise ConfigError(f"there is no export format {to!r}", hint=f"--to takes {', '.join(FORMATS)}")
+    chosen = FORMATS[to]
+    if datum is not None and not chosen.takes_datum:
+        takers = " or ".join(f"--to {other.name}" for other in FORMATS.values() if other.takes_datum)
+        raise ConfigError(f"a datum has no meaning for {to}", hint=f"--datum goes with {takers}")
+    file = file or out / chosen.file
+    if file.is_dir():
+        raise OutputError("a folder stands where the file goes", where=str(file))
+    write_file(file, chosen.dump(load_content(out, datum)))
+    return file

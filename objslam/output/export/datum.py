@@ -1,0 +1,57 @@
+"""The place of a map on the earth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.errors import ConfigError
+
+_SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
+_FLATTENING = 1 / 298.257223563  # Its flattening.
+_E2 = _FLATTENING * (2 - _FLATTENING)  # The square of its eccentricity.
+_ROUNDS = 6  # The rounds in which a latitude is found; each divides its error by 150, so two suffice near the ground.
+
+
+@dataclass(frozen=True)
+class Datum:
+    """The WGS 84 position of the map's origin, and the compass heading of its x axis."""
+
+    latitude: float  # Degrees north.
+    longitude: float  # Degrees east.
+    heading: float  # Degrees clockwise from north.
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """The datum in "latitude,longitude,heading"; ConfigError where the text is something else."""
+        try:
+            latitude, longitude, heading = (float(part) for part in text.split(","))
+        except ValueError as error:
+            hint = "for example 52.4006,16.9508,90: degrees; the map's x axis points east"
+            raise ConfigError(f"--datum {text!r} is not latitude,longitude,heading", hint=hint) from error
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(heading) <= 360):
+            raise ConfigError(f"--datum {text!r}: latitude within 90, longitude within 180, heading within 360 degrees")
+        return cls(latitude, longitude, heading)
+
+    def geodetic(self, points: Floats) -> Floats:
+        """Longitude and latitude (N, 2), degrees, of points (N, 3) in map, m; exact to well below 1 mm.
+
+        The points go from east, north and up at the datum to earth-centred coordinates, and from there to the ellipsoid.
+        """
+        latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        to_east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+        to_up = np.array([cosine * np.cos(longitude), cosine * np.sin(longitude), sine])
+        origin = _SEMI_MAJOR / np.sqrt(1 - _E2 * sine**2) * to_up * [1.0, 1.0, 1 - _E2]
+        earth_R_enu = np.stack([to_east, np.cross(to_up, to_east), to_up], axis=1)
+        east = points[:, 0] * np.sin(heading) - points[:, 1] * np.cos(heading)
+        north = points[:, 0] * np.cos(heading) + points[:, 1] * np.sin(heading)
+        x, y, z = earth_R_enu @ np.stack([east, north, points[:, 2]]) + origin[:, None]
+        across = np.hypot(x, y)
+        found = np.arctan2(z, across * (1 - _E2))
+        for _ in range(_ROUNDS):
+            found = np.arctan2(z + _E2 * _SEMI_MAJOR / np.sqrt(1 - _E2 * np.sin(found) ** 2) * np.sin(found), across)
+        return np.degrees(np.column_stack([np.arctan2(y, x), found]))

@@ -1,0 +1,227 @@
+"""map.png: the map at a glance, from above."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.result import RunResult
+from objslam.core.types import Truth
+from objslam.output.plot.label_layout import needs_leader, place_labels
+from objslam.output.plot.style import captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
+
+_MAX_RAYS = 2000  # The largest number of used rays that are drawn; more of them would be one blue area.
+_MAX_REJECTED = 400  # The largest number of rejected rays that are drawn: fewer, because they cross the whole map.
+_MAX_LABELS = 150  # The largest number of labels; the objects with the most rays are named first.
+_MAX_LETTERS = 28  # The largest number of letters of a label; the rest becomes an ellipsis.
+_PATH_POINTS = 1500  # The largest number of points of the path that labels try not to cover.
+_CROSS_POINTS = 5  # How many points of the path one true object counts as for that.
+_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the least width of the figure, inches.
+_FONT = 8.0  # The size of labels and legend, points.
+_USED, _REJECTED = "#8fbfee", "#ef8f86"  # The colours of used and rejected rays.
+_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The colours of both paths, and of objects in the legend.
+
+
+def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
+    """Draw a run's map from above as a PNG: path before and after, rays, objects with 2-sigma ellipses, ground truth.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()  # the user's own style may write in TeX or in white
+        _draw(result, file, truth)
+
+
+def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    objects = result.map.objects
+    points = np.array([o.position[:2] for o in objects]).reshape(-1, 2)
+    crosses = np.array([o.position[:2] for o in truth.objects] if truth else []).reshape(-1, 2)
+    shown, low, high = _frame(result, points, crosses)
+    margin = 0.07 * float((high - low).max()) + 0.05
+    low, high = low - margin, high + margin
+
+    figure = Figure(figsize=_size(high - low), dpi=150, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.grid(True, color="#ececec", linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in axes.spines.values():
+        side.set_color("#c4c4c4")
+
+    _draw_rays(axes, result)
+    _draw_paths(axes, result)
+    if len(crosses):
+        axes.plot(*crosses.T, "+", color="black", markersize=8, markeredgewidth=1.1, zorder=6, label="ground truth")
+    _draw_objects(axes, result, points)
+    axes.set_title(_title(result, int((~shown).sum())), fontsize=10, loc="left")
+    legend = figure.legend(loc="outside lower left", ncols=4, fontsize=_FONT, frameon=False)
+    for handle in legend.get_lines():
+        handle.set(alpha=1.0, linewidth=1.2)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)  # a label in a script the font lacks
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # labels are placed by pixels, which must not move any more
+        left_out = _draw_labels(axes, canvas.get_renderer(), result, points, shown, crosses)
+        if left_out:
+            note = f"{left_out} labels have no room"
+            axes.text(1, 1.005, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=7, color="#777777")
+        with file.open("wb") as stream:
+            figure.savefig(stream, format="png")
+
+
+def _frame(result: RunResult, points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
+    """Which objects are shown, and the lower left and upper right corner of the shown area."""
+    path = result.map_T_base[:, :2, 3]
+    shown, low, high = frame_objects(np.concatenate([points, crosses]), path)
+    side = (high - low).max()
+    # the path before may have drifted anywhere, and an object hardly placed has a huge ellipse: neither may squeeze the map
+    before = np.clip(result.path.poses[:, :2, 3], low - 0.15 * side, high + 0.15 * side)
+    ellipses = np.clip(_ellipse_corners(result, points, shown[: len(points)]), low - side, high + side)
+    both = np.concatenate([before, ellipses, [low, high]])
+    return shown[: len(points)], both.min(axis=0), both.max(axis=0)
+
+
+def _ellipse_corners(result: RunResult, points: Floats, shown: Bools) -> Floats:
+    """The lower left and upper right corners (2 E, 2) of the shown objects' 2-sigma ellipses."""
+    half = np.full_like(points, np.nan)
+    for j, o in enumerate(result.map.objects):
+        if o.status == "ok" and o.covariance is not None and shown[j]:
+            half[j] = 2 * np.sqrt(np.maximum(np.diag(o.covariance)[:2], 0.0))
+    drawn = np.isfinite(half).all(axis=1)
+    return np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
+
+
+def _size(extent: Floats) -> tuple[float, float]:
+    """Width and height in inches that suit the map's proportions, with room for title and legend."""
+    width, height = extent / extent.max() * _LONG_SIDE
+    return max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3
+
+
+def _draw_rays(axes: Any, result: RunResult) -> None:
+    from matplotlib.collections import LineCollection
+
+    kinds, ends = ray_kinds(result), ray_ends(result)
+    rejected = f"rejected rays ({int(kinds['rejected'].sum()):,})"
+    for mask, colour, most, label in (
+        (kinds["used"], _USED, _MAX_RAYS, "rays"),
+        (kinds["rejected"], _REJECTED, _MAX_REJECTED, rejected),
+    ):
+        index = sample(mask, most)
+        if len(index):
+            lines = list(np.stack([result.origins[index, :2], ends[index, :2]], axis=1))
+            # many lines are drawn fainter, so that the objects stand out
+            alpha = float(np.clip(150 / len(index), 0.25, 0.9))
+            axes.add_collection(
+                LineCollection(lines, colors=colour, linewidths=0.4, alpha=alpha, label=label, zorder=1), autolim=False
+            )
+
+
+def _draw_paths(axes: Any, result: RunResult) -> None:
+    before, after = result.path.poses[:, :2, 3], result.path_after.poses[:, :2, 3]
+    moved = not np.array_equal(result.map_T_base, result.keyframes.map_T_base)
+    if moved:
+        axes.plot(*before.T, "--", color=_BEFORE, linewidth=1.0, zorder=2, label="path before")
+    axes.plot(*after.T, "-", color=_AFTER, linewidth=1.1, zorder=3, label="path after" if moved else "path")
+    if len(after):
+        axes.plot(*after[0], "o", color="white", markeredgecolor=_AFTER, markersize=7, zorder=4, label="start", linestyle="")
+
+
+def _draw_objects(axes: Any, result: RunResult, points: Floats) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Ellipse
+
+    colours = label_colours(result.map)
+    for o, point in zip(result.map.objects, points, strict=True):
+        colour = colours[o.label]
+        if o.status == "unresolved":
+            start = o.ray[0][:2] if o.ray is not None else point
+            axes.plot(*np.stack([start, point]).T, "--", color=colour, linewidth=1.0, zorder=5, dashes=(4, 3))
+            axes.plot(*point, "o", color="white", markeredgecolor=colour, markersize=4.5, zorder=7)
+            continue
+        axes.plot(*point, "o", color=colour, markeredgecolor="white", markeredgewidth=0.5, markersize=5, zorder=7)
+        if o.covariance is not None and np.isfinite(o.covariance).all():
+            values, vectors = np.linalg.eigh(o.covariance[:2, :2])
+            width, height = 2 * 2 * np.sqrt(np.maximum(values, 0))
+            angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+            axes.add_patch(
+                Ellipse(point, width, height, angle=angle, facecolor=(*colour, 0.18), edgecolor=colour, lw=0.9, zorder=6)
+            )
+    # the legend shows objects in a neutral colour, because each label has its own
+    dot: dict[str, Any] = {"marker": "o", "color": _NEUTRAL}
+    if result.map.resolved():
+        axes.add_line(Line2D([], [], **dot, linestyle="", markersize=5, label="objects, 2 sigma"))
+    if len(result.map.resolved()) < len(result.map):
+        hollow: dict[str, Any] = {"markerfacecolor": "white", "linestyle": "--", "lw": 1, "markersize": 4.5}
+        axes.add_line(Line2D([], [], **dot, **hollow, label="unresolved"))
+
+
+def _title(result: RunResult, outside: int) -> str:
+    resolved, total, rays = len(result.map.resolved()), len(result.map), len(result.rays)
+    text = f"{resolved} object{'s' * (resolved != 1)}"
+    if total > resolved:
+        text += f" and {total - resolved} unresolved"
+    text += f" from {rays:,} rays of {len(result.keyframes):,} keyframes, {result.settings.mode} mode"
+    if outside:
+        text += f"\n{outside} object{'s' * (outside != 1)} far outside this picture"
+    return text
+
+
+def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, shown: Bools, crosses: Floats) -> int:
+    """Write the objects' labels where they cover neither each other nor a dot; the count of those that found no room.
+
+    The objects with the most rays get theirs first, as long as there are few enough to read.
+    """
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=2.2, foreground="white", alpha=0.85)]
+    colours = label_colours(result.map)
+    style = {"fontsize": _FONT, "ha": "left", "va": "bottom", "parse_math": False, "zorder": 9, "path_effects": halo}
+    order = np.argsort([-o.rays for o in result.map.objects], kind="stable")
+    chosen = [int(j) for j in order if shown[j]][:_MAX_LABELS]
+    names = captions(result.map)
+    texts = [axes.text(0, 0, _short(names[j]), **style) for j in chosen]
+    boxes = [text.get_window_extent(renderer) for text in texts]
+    sizes = np.array([(box.width, box.height) for box in boxes]).reshape(-1, 2)
+    to_pixels = axes.transData
+    anchors = to_pixels.transform(points[chosen]) if chosen else np.zeros((0, 2))
+    frame = axes.get_window_extent(renderer)
+    path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS), :2, 3]
+    avoid = to_pixels.transform(np.concatenate([path, np.repeat(crosses, _CROSS_POINTS, axis=0)]))
+    edges = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
+    corners, found = place_labels(anchors, sizes, edges, avoid)
+    inverse = to_pixels.inverted()
+    led = needs_leader(anchors, corners, sizes)
+    for j, text, anchor, corner, size, has_room, line in zip(
+        chosen, texts, anchors, corners, sizes, found, led, strict=True
+    ):
+        if not has_room:
+            text.remove()
+            continue
+        colour = colours[result.map.objects[j].label]
+        text.set_position(inverse.transform(corner))
+        text.set_color(colour)
+        if line:
+            near = np.clip(anchor, corner, corner + size)
+            ends = inverse.transform(np.stack([anchor, near]))
+            axes.plot(*ends.T, "-", color=colour, linewidth=0.6, alpha=0.8, zorder=8)
+    return int(shown.sum() - found.sum())
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _MAX_LETTERS else line[: _MAX_LETTERS - 1] + "…"

@@ -1,0 +1,236 @@
+"""The page of a result folder: everything is gathered here, and the template only lays it out."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.config import Settings, dump_settings, load_settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.errors import ConfigError, OutputError
+from objslam.evaluation.alignment import lay_truth
+from objslam.evaluation.evaluate import Evaluation, evaluate
+from objslam.io.atomic_files import write_file
+from objslam.io.rays_parquet import RaysTable
+from objslam.output.plot.style import REJECTED_BELOW, captions, is_date, label_colours
+from objslam.output.report.charts import Histogram, axis_end, histogram
+from objslam.output.report.crops import Crop, best_rays, cut_crops, images_of
+from objslam.results.files import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY
+from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
+
+_BINS, _FEW_BINS = 32, 16  # The number of bins in the histogram of all rays, and in that of one object.
+_COUNTS = {
+    "images": "colour images",
+    "detection_frames": "camera frames",
+    "frames_on_path": "camera frames on the path",
+    "keyframes": "keyframes (with a usable box)",
+    "detections": "boxes",
+    "rays": "usable boxes (rays)",
+    "rays_rejected": "rays rejected as outliers",
+    "rays_unexplained": "rays that no object explains",
+    "objects": "objects",
+    "unresolved": "unresolved objects",
+}
+"""What the page calls the counts of summary.json."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """An object with all that the page says of it."""
+
+    object: MapObject
+    caption: str
+    colour: str
+    sigma: list[float] | None  # Along x, y and z, m.
+    seen: tuple[float, float]  # When it was seen first and last, s since the first ray.
+    rejected: int  # The number of its rejected rays.
+    error: float | None  # The distance from the true object, m; None where it matches none.
+    matched: str | None  # The true object that it matches, in words.
+    histogram: Histogram | None
+    crops: tuple[Crop, ...]
+
+
+def write_report(
+    out: Path,
+    *,
+    log: Path | None = None,
+    crops: int = 4,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> Path:
+    """Write report.html into the result folder `out` and return its path.
+
+    Args:
+        log: the log that the result is from, for the pictures; by default where summary.json says it is.
+        crops: the number of pictures per object.
+    Raises:
+        OutputError: the result cannot be read, or the page cannot be written.
+        LogError: the ground truth cannot be read.
+    """
+    file = out / REPORT
+    write_file(file, render(out, log=log, crops=crops, progress=progress).encode("utf-8", errors="replace"))
+    return file
+
+
+def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, int, int], None]) -> str:
+    """The page of a result folder as text; all text that comes from the result is escaped."""
+    import jinja2
+
+    progress("reading the result", 0, 0)
+    objects, rays, summary = load_map(out), load_rays(out), _json(out / SUMMARY)
+    settings = _settings(out / CONFIG)
+    errors, scores = _evaluation(out, objects)
+    mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
+    chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
+    counts = summary.get("counts", {})
+    images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
+    wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
+    pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
+    crops_of = {number: tuple(pictures[i] for i in index.tolist() if i in pictures) for number, index in chosen.items()}
+    begin = float(rays.stamp.min()) if len(rays) else 0.0
+    residual_deg = np.degrees(rays.residual)
+    cards = _cards(objects, rays, residual_deg, mine, crops_of, errors, begin)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("objslam.output.report", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
+    picture = out / PICTURE
+    return environment.get_template("page.html.jinja").render(
+        style=_resource("page.css"),
+        script=_resource("page.js"),
+        name=str(summary.get("log", out.resolve().name)),
+        folder=out.resolve().name,
+        mode=settings.mode,
+        frame=objects.frame,
+        start=datetime.fromtimestamp(begin, UTC).strftime("%Y-%m-%d %H:%M:%S UTC") if is_date(begin) else None,
+        duration=float(rays.stamp.max()) - begin if len(rays) else 0.0,
+        picture=picture.read_bytes() if picture.is_file() else None,
+        cards=cards,
+        with_errors=any(card.error is not None for card in cards),
+        with_existence=any(card.object.existence is not None for card in cards),
+        histogram=histogram(residual_deg, rays.weight, _BINS),
+        scores=scores,
+        no_images=no_images,
+        counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
+        unexplained=summary.get("unexplained_share", {}),
+        dropped=_dropped(summary),
+        warnings=summary.get("warnings", []),
+        seconds=summary.get("seconds", {}),
+        versions=summary.get("versions", {}),
+        costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if key in summary},
+        changed=_changed(settings),
+        settings=dump_settings(settings),
+    )
+
+
+def _cards(
+    objects: ObjectMap,
+    rays: RaysTable,
+    residual_deg: Floats,
+    mine: dict[int, Ints],
+    crops: dict[int, tuple[Crop, ...]],
+    errors: dict[int, tuple[float, str]],
+    begin: float,
+) -> list[Card]:
+    """The cards in the order of labels; mine: the rays of each object; begin: the stamp, s, from which times count."""
+    kept = residual_deg[(rays.weight >= REJECTED_BELOW) & np.isfinite(residual_deg)]
+    top = axis_end(kept) if len(kept) else None
+    colours, cards = label_colours(objects), []
+    for o, caption in zip(objects.objects, captions(objects), strict=True):
+        weight = rays.weight[mine[o.id]]
+        error, matched = errors.get(o.id, (None, None))
+        card = Card(
+            object=o,
+            caption=caption,
+            colour="#" + "".join(f"{round(255 * c):02x}" for c in colours[o.label]),
+            sigma=None if o.covariance is None else np.sqrt(np.diag(o.covariance)).tolist(),
+            seen=(o.first_seen - begin, o.last_seen - begin),
+            rejected=int((weight < REJECTED_BELOW).sum()),
+            error=error,
+            matched=matched,
+            histogram=histogram(residual_deg[mine[o.id]], weight, _FEW_BINS, top),
+            crops=crops[o.id],
+        )
+        cards.append(card)
+    return sorted(cards, key=lambda card: (_natural(card.object.label), card.object.id))
+
+
+def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
+    """The errors of the matched objects by id, and what evaluation.json holds.
+
+    Without that file the map is compared with the truth here; one with a frame of its own is laid onto the truth first.
+    """
+    if (out / EVALUATION).is_file():
+        scores = _json(out / EVALUATION)
+    else:
+        truth = load_truth(out)
+        if truth is None:
+            return {}, None
+        align = "none" if lay_truth(objects, truth) is truth else "se2"
+        evaluation: Evaluation = evaluate(objects, truth, load_trajectory(out), align=align)  # type: ignore[arg-type]
+        scores = evaluation.to_dict()
+    matched = scores.get("objects", [])
+    whose = "to id {} there" if scores.get("truth") else "truth id {}"
+    return {o["id"]: (float(o["error"]), whose.format(o["truth_id"])) for o in matched}, scores
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
+    except ValueError as error:
+        raise OutputError(f"is not JSON: {error}", where=str(file)) from error
+    if not isinstance(data, dict):
+        raise OutputError("is not a JSON object", where=str(file))
+    return data
+
+
+def _settings(file: Path) -> Settings:
+    try:
+        return load_settings(file)
+    except ConfigError as error:
+        raise OutputError(error.message.splitlines()[0], where=error.where) from error
+
+
+def _dropped(summary: dict[str, Any]) -> list[tuple[str, int, str]]:
+    examples = summary.get("dropped_examples", {})
+    return [(why, count, ", ".join(examples.get(why, []))) for why, count in summary.get("dropped", {}).items()]
+
+
+def _changed(settings: Settings) -> list[tuple[str, str, str]]:
+    """The settings that are not at their default: name, value, default."""
+    now, default = _flat(settings.model_dump(mode="json")), _flat(Settings().model_dump(mode="json"))
+    shown = partial(json.dumps, ensure_ascii=False)
+    return [(key, shown(value), shown(default.get(key))) for key, value in now.items() if value != default.get(key)]
+
+
+def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
+    return flat
+
+
+def _natural(text: str) -> tuple[str, int]:
+    """The key to sort a text by, so that landmark_9 comes before landmark_10."""
+    head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    return head, int(number or -1)
+
+
+def _resource(name: str) -> str:
+    return resources.files("objslam.output.report").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,180 @@
+"""The result folder: what writes each of its files, and how a new result takes the place of an older one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from objslam.config import dump_settings
+from objslam.core.result import RunResult
+from objslam.core.types import CameraLog, Trajectory, Truth
+from objslam.errors import OutputError
+from objslam.evaluation.alignment import lay_truth
+from objslam.io.atomic_files import FileSet, disk_errors, encode, is_cut_short, replace_files, try_folder
+from objslam.io.detections_jsonl import write_detections
+from objslam.io.folders import no_empty_folders
+from objslam.io.objects_json import dump_objects, dump_truth_objects
+from objslam.io.odometry_parquet import dump_motions
+from objslam.io.ply import write_cloud, write_mesh
+from objslam.io.rays_parquet import RaysTable, dump_rays
+from objslam.io.tum_trajectory import write_trajectory
+from objslam.mapping.measured_motions import motions_of
+from objslam.output.export.formats import FORMATS
+from objslam.results import files
+from objslam.results.files import dump_json
+from objslam.results.read import load_map
+from objslam.sources.log_folder import resembles_log
+
+_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
+"""Every file that a new result replaces or removes, what was exported of the older one included."""
+
+
+def prepare_output(out: Path) -> None:
+    """Make the folder for a result and try to write there, before the long work.
+
+    Raises:
+        OutputError: no result could be written there, or only in the place of files that no run wrote: those of a log, those
+            of a ground truth, or others with the names of ours.
+    """
+    with disk_errors(out):
+        if out.exists() and not out.is_dir():
+            raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
+        _check_foreign(out)
+        for name in _FILES.names(out):
+            if (out / name).is_dir() and not (out / name).is_symlink():
+                raise OutputError("a folder stands where a file of the result goes", where=str(out / name))
+    try_folder(out, _FILES)
+
+
+@contextmanager
+def output_folder(out: Path) -> Iterator[None]:
+    """Make the folder for a result, and check that it can be written before the work in the `with` block begins.
+
+    If the work fails, no new empty folder is left behind.
+    """
+    with no_empty_folders(out):
+        prepare_output(out)
+        yield
+
+
+def write_result(
+    result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()
+) -> tuple[str, ...]:
+    """Write the whole result into a folder, in place of an older one; other files there stay.
+
+    A run that is killed, at any moment, leaves no half file and no mix of two results. There is a summary.json only with
+    everything that belongs to it.
+
+    Args:
+        truth: kept beside the result for `load_truth`, and drawn as it lies on the map.
+        detected: cameras whose boxes this run found. They are kept as detections.jsonl (of several cameras, with the
+            camera's name in front), which a log can take over.
+    Returns:
+        The names of the older result's files that went and have no successor, such as an export or a report.
+    Raises:
+        OutputError: the disk refuses, or another run writes there.
+    """
+    prepare_output(out)
+    return replace_files(out, _FILES, _writers(result, truth, detected))
+
+
+def clear_result(out: Path) -> tuple[str, ...]:
+    """Remove what an earlier run wrote, except objects.json, which a live session replaces; the names of what went.
+
+    What stayed would be taken for the session's own. summary.json goes last: as long as it is there, the folder is known as
+    a result.
+    """
+    names = tuple(name for name in reversed(_FILES.names(out)) if name != files.OBJECTS and (out / name).is_file())
+    with disk_errors(out):
+        for name in names:
+            (out / name).unlink(missing_ok=True)
+    return names
+
+
+def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:
+    """What writes each file of a result, by the file's name."""
+    stamps, first = np.unique(result.keyframes.stamps, return_index=True)
+    writers: dict[str, Callable[[Path], object]] = {
+        files.OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
+        files.TRAJECTORY: partial(write_trajectory, Trajectory(stamps, result.map_T_base[first])),
+        files.RAYS: lambda file: file.write_bytes(dump_rays(_rays_table(result))),
+        files.CONFIG: lambda file: file.write_bytes(encode(dump_settings(result.settings))),
+        files.SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),
+    }
+    motions = motions_of(result)
+    if motions is not None:
+        writers[files.MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))
+    if truth is not None and truth.objects:
+        true = truth.objects
+        writers[files.TRUTH_OBJECTS] = lambda file: file.write_bytes(encode(dump_truth_objects(true)))
+    if truth is not None and truth.trajectory is not None:
+        writers[files.TRUTH_TRAJECTORY] = partial(write_trajectory, truth.trajectory)
+    for camera_log in detected:
+        if camera_log.detections is not None:
+            name = files.DETECTIONS if len(detected) == 1 else f"{camera_log.camera.name}.{files.DETECTIONS}"
+            writers[name] = partial(write_detections, camera_log.detections)
+    if result.surface is not None:
+        writers[files.SURFACE] = partial(write_mesh, result.surface)
+        if result.settings.reconstruction.cloud:
+            writers[files.CLOUD] = partial(write_cloud, result.surface)
+    if result.surface_before is not None:
+        writers[files.SURFACE_BEFORE] = partial(write_mesh, result.surface_before)
+    drawn = lay_truth(result.map, truth) if truth is not None else None
+    if result.settings.output.picture:
+        from objslam.output.plot.map_plot import draw_map
+
+        writers[files.PICTURE] = lambda file: draw_map(result, file, drawn)
+    if result.settings.output.recording:
+        from objslam.output.viewer.recording import write_recording
+
+        writers[files.RECORDING] = lambda file: write_recording(result, file, drawn)
+    return writers
+
+
+def _rays_table(result: RunResult) -> RaysTable:
+    """The rays of a run as rays.parquet holds them; an object is its id in objects.json."""
+    rays, keyframes = result.rays, result.keyframes
+    index = result.association.object
+    ids = np.array([*(o.id for o in result.map.objects), -1], dtype=np.int64)
+    cameras = np.array([camera.name for camera in result.cameras], dtype=object)
+    return RaysTable(
+        object=ids[index],
+        stamp=keyframes.stamps[rays.keyframe],
+        origin=result.origins,
+        direction=result.directions,
+        residual=result.residual,
+        weight=result.weight,
+        score=rays.score,
+        camera=cameras[keyframes.camera[rays.keyframe]],
+        box=rays.box,
+        label=np.array(rays.label_names, dtype=object)[rays.label],
+    )
+
+
+def _check_foreign(out: Path) -> None:
+    """OutputError where the folder holds files that a result would replace and that no run wrote."""
+    if resembles_log(out):
+        raise OutputError("this is a log, not a place for its result", where=str(out), hint="name another folder with -o")
+    names = [name for name in _FILES.names(out) if (out / name).is_file()]
+    if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
+        raise OutputError(
+            f"in the way of a result, and not written by a run: {', '.join(names)}",
+            where=str(out),
+            hint="name another folder with -o, or move them",
+        )
+
+
+def _is_result(out: Path, names: list[str]) -> bool:
+    """Whether the files with these names are those of a result, or of a live session that has not ended."""
+    if out.resolve().name == files.GROUNDTRUTH:
+        return False
+    try:
+        load_map(out)
+        return names == [files.OBJECTS] or isinstance(json.loads((out / files.SUMMARY).read_bytes()), dict)
+    except (OutputError, OSError, ValueError):
+        return False

@@ -1,0 +1,263 @@
+"""The rerun viewer as a program of its own: on the screen, in a browser, or without either for a picture."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.errors import ConfigError, OutputError
+from objslam.output.viewer.times import STAMP
+from objslam.results.files import RECORDING, hint_below
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient
+
+Viewer = subprocess.Popen[bytes]
+"""A viewer that runs as a process of its own."""
+
+_LOOPBACK = "127.0.0.1"  # The address that viewers listen at: nobody outside this machine can reach it.
+_PATIENCE = 60.0  # The longest time, s, for a viewer to start and to load a recording.
+_SETTLE = 1.5  # The time, s, for a viewer to draw after its clock was set; a larger one suits slower machines.
+_NO_DRIVER = ("render context", "No graphics adapter", "Failed to find a suitable", "NoSuitableAdapter", "adapter was found")
+"""What the viewer says, among other things, on a machine without a Vulkan driver."""
+_NO_SCREEN = ("XOpenDisplay", "neither WAYLAND", "WAYLAND_DISPLAY", "WinitEventLoop", "Failed to open connection")
+"""What it says on a machine without a screen."""
+
+
+def program() -> Path:
+    """The viewer's executable; OutputError where rerun was installed without it."""
+    import rerun_cli
+
+    found = Path(rerun_cli.__file__).parent / ("rerun.exe" if os.name == "nt" else "rerun")
+    if not found.is_file():
+        hint = "pip install --force-reinstall rerun-sdk"
+        raise OutputError("rerun's viewer is not installed", where=str(found), hint=hint)
+    return found
+
+
+def find_rrd(out: Path) -> Path:
+    """The recording of a result folder, or the file itself; OutputError where there is none, or it is damaged."""
+    file = out if out.is_file() else out / RECORDING
+    if not out.exists():
+        raise OutputError("there is no such result folder", where=str(out))
+    if not file.is_file():
+        hint = hint_below(out) or "run with output.recording=true, and name its result"
+        raise OutputError("no recording here", where=str(out), hint=hint)
+    _check_rrd(file)
+    return file
+
+
+def _check_rrd(file: Path) -> None:
+    """Read a recording through; OutputError where it is damaged, because the viewer would wait for the rest of it."""
+    from rerun.chunk import RrdReader
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a recording of a live session has no footer, yet can be shown
+            reader = RrdReader(file)
+            for store in [*reader.recordings(), *reader.blueprints()]:
+                for _ in reader.stream(store=store).to_chunks():
+                    pass
+        if not reader.recordings():
+            raise ValueError("it is empty")
+    except (RuntimeError, ValueError, OSError) as error:
+        why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {file}: ")
+        raise OutputError(f"the recording is damaged or cut off ({why})", where=str(file), hint="run again") from error
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody listens on."""
+    with socket.socket() as s:
+        s.bind((_LOOPBACK, 0))
+        port: int = s.getsockname()[1]
+        return port
+
+
+def address(port: int) -> str:
+    """The address at which a viewer on this machine takes data."""
+    return f"rerun+http://{_LOOPBACK}:{port}/proxy"
+
+
+def web_address(web: int, port: int) -> str:
+    """The address to open in a browser: the page, and the port of its data."""
+    return f"http://{_LOOPBACK}:{web}?url={address(port).replace('+', '%2B')}"
+
+
+def start(*arguments: str) -> Viewer:
+    """Start the viewer, bound to the loopback interface; by itself it would listen to the whole network."""
+    return subprocess.Popen(
+        [str(program()), "--bind", _LOOPBACK, *arguments],
+        env={**os.environ, "RUST_LOG": "error"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+
+
+def show(files: list[Path]) -> None:
+    """Open recordings in the native viewer and wait until it is closed; OutputError where it cannot open."""
+    viewer = start("--port", str(free_port()), *map(str, files))
+    _, said = _until_closed(viewer)
+    if viewer.returncode not in (0, -15, -2):
+        raise _failure(viewer.returncode, said, "use --web, or --screenshot FILE.png")
+
+
+def serve(files: list[Path], say: Callable[[str], None]) -> None:
+    """Serve recordings to a browser on this machine until interrupted; say(text) gets the address."""
+    web, data = free_port(), free_port()
+    viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))
+    try:
+        with suppress(KeyboardInterrupt):  # Ctrl+C is how serving ends
+            _wait_for(viewer, web)
+            say(f"{web_address(web, data)} (Ctrl+C ends it)")
+            _, said = _until_closed(viewer)
+            raise _failure(viewer.returncode, said, None)
+    finally:
+        stop(viewer)
+
+
+def screenshot(
+    files: list[Path], picture: Path, size: tuple[int, int] = (1600, 900), at: float = 0.5, timeline: str = STAMP
+) -> None:
+    """Write a picture of recordings as they look when first opened; no screen is needed.
+
+    Args:
+        size: width and height in points.
+        at: the time of the picture, as a share of the timeline's length.
+    Raises:
+        ConfigError: the picture's name does not end in .png.
+        OutputError: there is no Vulkan driver, the viewer fails, or the picture cannot be written.
+    """
+    if picture.suffix.lower() != ".png":
+        raise ConfigError("a picture is a PNG", where=str(picture), hint="name it FILE.png")
+    if not picture.parent.is_dir():
+        raise OutputError("no such folder for the picture", where=str(picture.parent))
+    temporary = picture.with_name(f".{picture.stem}.{os.getpid()}.png")
+    port = free_port()
+    window = f"{size[0]}x{size[1]}"
+    viewer = start("--headless", "--hide-welcome-screen", "--port", str(port), "--window-size", window, *map(str, files))
+    try:
+        client = _connect(viewer, port, files)
+        _set_time(client, at, timeline)
+        time.sleep(_SETTLE)
+        client.save_screenshot(str(temporary.resolve()))
+        temporary.replace(picture)
+    except RuntimeError as error:
+        raise OutputError(f"the viewer took no picture: {str(error).splitlines()[0]}", where=str(picture)) from error
+    except FileNotFoundError as error:
+        raise OutputError("the viewer wrote no picture", where=str(picture)) from error
+    finally:
+        stop(viewer)
+        temporary.unlink(missing_ok=True)
+
+
+def _connect(viewer: Viewer, port: int, files: list[Path]) -> ViewerClient:
+    """A connection to a viewer, once it has loaded what it was given."""
+    from rerun.experimental import ViewerClient
+
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+        _check_running(viewer)
+        with suppress(RuntimeError, OSError):  # it does not answer yet
+            client = ViewerClient.connect(address(port))
+            state = client.get_state()
+            if state.recordings and not state.loading and state.views:
+                return client
+        time.sleep(0.1)
+    where = ", ".join(map(str, files))
+    raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
+
+
+def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
+    """Stop the viewer's clock at a share of a timeline."""
+    state = client.get_state()
+    recording = next((r for r in state.recordings if r.store_id == state.active_recording), state.recordings[0])
+    lines = [t for t in recording.timelines if t.name == timeline]
+    if not lines:
+        return
+    line = lines[0]
+    start, end = line.start or 0, line.end or 0
+    moment = round(start + share * (end - start))
+    if line.time_type == "sequence":
+        client.set_time(line.name, sequence=moment, play_state="paused")
+    elif line.time_type == "timestamp":
+        client.set_time(line.name, timestamp=np.datetime64(moment, "ns"), play_state="paused")
+    else:
+        client.set_time(line.name, duration=np.timedelta64(moment, "ns"), play_state="paused")
+
+
+def _check_running(viewer: Viewer) -> None:
+    """OutputError where the viewer has ended by itself."""
+    if viewer.poll() is not None:
+        _, said = viewer.communicate()
+        raise _failure(viewer.returncode, said, None)
+
+
+def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputError:
+    """An error of one line for a viewer that ended by itself, from its exit code and what it said."""
+    text = (said or b"").decode(errors="replace")
+    if any(sign in text for sign in _NO_DRIVER):
+        return OutputError(
+            "the viewer finds no Vulkan driver to draw with",
+            hint="Debian and Ubuntu: apt install libvulkan1 mesa-vulkan-drivers",
+        )
+    if any(sign in text for sign in _NO_SCREEN):
+        return OutputError("the viewer finds no screen", hint=hint)
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines = [line for line in lines if "XDG_RUNTIME_DIR" not in line]  # every machine without a desktop says that
+    panic = next((" ".join(lines[i : i + 2]) for i, line in enumerate(lines) if "panicked" in line), None)
+    reason = panic or next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
+    return OutputError(f"the viewer ended with code {code}" + (f": {reason[:200]}" if reason else ""), hint=hint)
+
+
+def _wait_for(viewer: Viewer, port: int) -> None:
+    """Wait until a viewer listens on a port; OutputError where it ends instead."""
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end:
+        _check_running(viewer)
+        try:
+            socket.create_connection((_LOOPBACK, port), timeout=0.5).close()
+            return
+        except OSError:
+            time.sleep(0.1)
+    stop(viewer)
+    raise OutputError("the viewer does not answer")
+
+
+def start_listening(port: int, *arguments: str) -> Viewer:
+    """Start a viewer, and wait until it listens on a port; OutputError where it ends instead."""
+    viewer = start(*arguments)
+    _wait_for(viewer, port)
+    assert viewer.stderr is not None
+    # what it says from now on is read and forgotten: it would stop at a full pipe
+    threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True).start()
+    return viewer
+
+
+def _until_closed(viewer: Viewer) -> tuple[bytes, bytes]:
+    try:
+        return viewer.communicate()
+    except KeyboardInterrupt:
+        stop(viewer)
+        raise
+
+
+def stop(viewer: Viewer) -> None:
+    """End a viewer that `start` started."""
+    if viewer.poll() is None:
+        viewer.terminate()
+        try:
+            viewer.wait(5.0)
+        except subprocess.TimeoutExpired:
+            viewer.kill()
+            viewer.wait()

@@ -1,0 +1,174 @@
+"""The decisions of a run in words: when an object was seen, why it is unresolved, what each round changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.result import RunResult
+from objslam.core.trace import Round
+from objslam.output.plot.style import captions, ray_kinds
+
+Level = Literal["INFO", "WARN"]
+_MAX_CHANGES = 40  # The largest number of changes of objects that are told of one round.
+_MERGED = 0.5  # An object that vanishes within this distance, m, of another of its label has become that one.
+_WHY = {
+    "fixed": "association at the poses as they are",
+    "labels": "every label taken for one object",
+    "association": "association at the poses so far",
+    "merge": "objects that the poses brought together are one",
+}
+"""What the reasons for a round are called."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One line of the log, at a stamp (s) or an iteration."""
+
+    at: float
+    level: Level
+    text: str
+
+
+def drive_events(result: RunResult) -> list[Event]:
+    """The events of a drive in the order of time: first the whole, then each object."""
+    start = float(result.keyframes.stamps[0])
+    resolved = len(result.map.resolved())
+    objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
+    events = [Event(start, "INFO", f"{objects}, {len(result.rays)} rays, {len(result.keyframes)} keyframes")]
+    events += [Event(start, "WARN", str(text)) for text in result.summary.get("warnings", [])]
+    for reason, count in result.summary.get("dropped", {}).items():
+        events.append(Event(start, "WARN", f"dropped {count}: {reason}"))
+    enough = _enough_parallax(result)
+    rejected = np.bincount(result.association.object[ray_kinds(result)["rejected"]], minlength=max(len(result.map), 1))
+    later: list[Event] = []
+
+    def add(stamp: float, level: Level, text: str) -> None:
+        later.append(Event(stamp, level, f"{stamp - start:.1f} s {text}"))
+
+    for j, (o, name) in enumerate(zip(result.map.objects, captions(result.map), strict=True)):
+        add(o.first_seen, "INFO", f"{name}: first seen")
+        if o.status != "ok":
+            add(o.last_seen, "WARN", f"{name}: unresolved, {_why_unresolved(o, result)}")
+            continue
+        if np.isfinite(enough[j]):
+            limit = result.settings.triangulation.min_parallax_deg
+            add(float(enough[j]), "INFO", f"{name}: its rays now span {limit:g} deg, enough for a place")
+        out = f", {rejected[j]} rejected" if rejected[j] else ""
+        sigma = "" if o.sigma is None else f", sigma {100 * o.sigma:.1f} cm"
+        text = f"{name}: {o.rays} rays{out}, parallax {o.parallax_deg:.0f} deg, rms {o.rms_deg:.2f} deg{sigma}"
+        add(o.last_seen, "INFO", text)
+    return events + sorted(later, key=lambda event: event.at)
+
+
+def _why_unresolved(o: MapObject, result: RunResult) -> str:
+    """Why an object has no position to rely on, by the limits of the settings."""
+    limits = result.settings.triangulation
+    if o.rays < 2:
+        return "a single ray says where to look, not how far"
+    if o.parallax_deg < limits.min_parallax_deg:
+        return (
+            f"its {o.rays} rays span {o.parallax_deg:.1f} deg (triangulation.min_parallax_deg {limits.min_parallax_deg:g})"
+        )
+    return (
+        f"its {o.rays} rays leave it less certain than {limits.max_rel_sigma:g} of its distance "
+        "(triangulation.max_rel_sigma), or do not agree"
+    )
+
+
+def _enough_parallax(result: RunResult) -> Floats:
+    """The stamp (N,), s, at which each object's used rays first spanned enough parallax, seen from the first; else NaN."""
+    stamps = np.full(len(result.map), np.nan)
+    used = np.flatnonzero(ray_kinds(result)["used"])
+    order = used[np.lexsort((result.rays.keyframe[used], result.association.object[used]))]
+    index = result.association.object[order]
+    if len(order) == 0:
+        return stamps
+    first = np.flatnonzero(np.append(True, index[1:] != index[:-1]))
+    leader = np.repeat(first, np.diff(np.append(first, len(index))))
+    n = result.directions[order]
+    turned = np.degrees(np.arccos(np.clip(np.einsum("ri,ri->r", n, n[leader]), -1.0, 1.0)))
+    enough = np.flatnonzero(turned >= result.settings.triangulation.min_parallax_deg)
+    found, at = np.unique(index[enough], return_index=True)
+    stamps[found] = result.keyframes.stamps[result.rays.keyframe[order[enough[at]]]]
+    return stamps
+
+
+def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list[Event]:
+    """What each round changed, at its first iteration, and the outcome of its solve, at its last."""
+    events: list[Event] = []
+    at, before = 0, None
+    for number, r in enumerate(trace):
+        names = [f"{label_names[k]} #{j}" for j, k in enumerate(r.association.label.tolist())]
+        free = int((r.association.object < 0).sum())
+        head = f"round {number + 1}, {_WHY[r.why]}: {r.association.count} objects, {free} rays that none explains"
+        events.append(Event(at, "INFO", head))
+        if before is not None and before.why == "labels":
+            text = "labels are no identities: too many rays disagreed with the one object of theirs"
+            events.append(Event(at, "WARN", text))
+        changes = _changes(before, r, names, label_names)
+        events += [Event(at, "INFO", text) for text in changes[:_MAX_CHANGES]]
+        if len(changes) > _MAX_CHANGES:
+            events.append(Event(at, "INFO", f"... and {len(changes) - _MAX_CHANGES} more"))
+        solves = [i.cost for i in r.iterations if i.stage == "solve"]
+        if solves:
+            held = r.association.object >= 0
+            rejected = int((r.weight[held] == 0).sum())
+            text = f"solved in {len(solves)} iterations, cost {solves[0]:.4g} to {solves[-1]:.4g}, {rejected} rays rejected"
+            events.append(Event(at + len(r.iterations) - 1, "INFO", text))
+        at, before = at + len(r.iterations), r
+    return events
+
+
+def _changes(before: Round | None, now: Round, names: list[str], label_names: tuple[str, ...]) -> list[str]:
+    """Objects born, merged and dropped between two rounds, by where the rays went."""
+    rays = np.bincount(now.association.object[now.association.object >= 0], minlength=now.association.count)
+    if before is None:
+        return [f"born: {name}, {n} rays" for name, n in zip(names, rays.tolist(), strict=True)]
+    old = before.association
+    old_names = [f"{label_names[k]} #{i}" for i, k in enumerate(old.label.tolist())]
+    held, news = old.object >= 0, now.association.count
+    to = np.where(now.association.object[held] < 0, news, now.association.object[held])
+    went = np.bincount(old.object[held] * (news + 1) + to, minlength=old.count * (news + 1)).reshape(old.count, news + 1)
+    heir = np.where(went.sum(axis=1) > 0, went.argmax(axis=1), -1)
+    heir[heir == news] = -1  # the last column of `went`: no object explains the rays any more
+    texts = []
+    for j in range(news):
+        parents = np.flatnonzero(heir == j)
+        if len(parents) == 0:
+            texts.append(f"born: {names[j]}, {rays[j]} rays that were others' or nobody's")
+        elif len(parents) > 1:
+            merged = ", ".join(f"{old_names[i]} ({int(went[i].sum())} rays)" for i in parents)
+            gap = float(np.linalg.norm(before.positions[parents[0]] - before.positions[parents[1]]))
+            apart = f", {gap:.2f} m apart" if np.isfinite(gap) else ""
+            texts.append(f"merged: {merged} are {names[j]}{apart}")
+    for i in np.flatnonzero(heir < 0):
+        lost, total = int(went[i, -1]), int(went[i].sum())
+        texts.append(f"dropped: {old_names[i]}, {lost} of its {total} rays are explained by nothing now")
+    return texts
+
+
+def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
+    """What changed in a live map, by the objects' ids: born, placed, no longer sure, renamed, dropped."""
+    old, new = ({o.id: o for o in m.objects} for m in (before, now))
+    lines: list[tuple[Level, str]] = []
+    for j, o in new.items():
+        name, was = f"{o.label} #{j}", old.get(j)
+        if was is None:
+            lines.append(("INFO", f"born: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+        if o.status == "ok" and (was is None or was.status != "ok"):
+            sigma = "" if o.sigma is None else f", sigma {100 * o.sigma:.0f} cm"
+            lines.append(("INFO", f"placed: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg{sigma}"))
+        if o.status != "ok" and was is not None and was.status == "ok":
+            lines.append(("WARN", f"no longer sure: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+        if was is not None and was.label != o.label:
+            lines.append(("INFO", f"renamed: {was.label} #{j} is a {o.label}"))
+    for o in (o for j, o in old.items() if j not in new):
+        near = [n for n in new.values() if n.label == o.label and np.linalg.norm(n.position - o.position) < _MERGED]
+        into = f"merged into {near[0].label} #{near[0].id}" if near else "nothing explains it any more"
+        lines.append(("INFO", f"dropped: {o.label} #{o.id}, {o.rays} rays, {into}"))
+    return lines

@@ -1,0 +1,95 @@
+"""Objects: points with labels, covariance ellipsoids, boxes of their size, and a ray for each unresolved one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Truth
+from objslam.output.plot.style import captions, ellipsoid, object_colours
+from objslam.output.viewer.view_point import ViewPoint, label_places
+
+_MAX_LABELS = 60  # The largest number of objects whose labels are shown at first: more cannot keep clear of each other.
+_TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # RGB: black, white, grey.
+
+
+def colours(objects: ObjectMap) -> list[tuple[int, int, int]]:
+    """Each object's RGB colour, 0 to 255."""
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in object_colours(objects)]
+
+
+def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path: Floats, *, static: bool = True) -> None:
+    """Log the objects: `map/objects` are the resolved ones as points.
+
+    Below it, `uncertainty` are their 2-sigma ellipsoids, `extent` boxes of their size, `unresolved` the rays on which the
+    unresolved ones lie, and `labels` all names.
+
+    Args:
+        path: (K, 3) points that labels try not to cover.
+        static: whether the objects are there for the whole recording. Otherwise they are logged at the recording's current
+            time, and what is empty is logged too, so that what was shown before goes.
+    """
+    every, texts, colour = objects.objects, captions(objects), colours(objects)
+
+    def log(name: str, archetype: Any, some: bool) -> None:
+        if some or not static:
+            recording.log(f"map/objects{name}", archetype, static=static)
+
+    resolved = [i for i, o in enumerate(every) if o.status == "ok"]
+    points = rr.Points3D(
+        [every[i].position for i in resolved],
+        colors=[colour[i] for i in resolved],
+        radii=rr.Radius.ui_points(5),
+        labels=[texts[i] for i in resolved],
+        show_labels=False,
+    )
+    log("", points, bool(resolved))
+    shapes = [(i, shape) for i in resolved if (shape := ellipsoid(every[i])) is not None]
+    bodies = rr.Ellipsoids3D(
+        centers=[every[i].position for i, _ in shapes],
+        half_sizes=[half for _, (half, _) in shapes],
+        quaternions=Rotation.from_matrix(np.stack([a for _, (_, a) in shapes])).as_quat() if shapes else [],
+        colors=[colour[i] for i, _ in shapes],
+        line_radii=rr.Radius.ui_points(0.6),
+    )
+    log("/uncertainty", bodies, bool(shapes))
+    sized = [(i, every[i].extent) for i in resolved if every[i].extent is not None]
+    boxes = rr.Boxes3D(
+        centers=[every[i].position for i, _ in sized],
+        half_sizes=[[e[0] / 2, e[0] / 2, e[1] / 2] for _, e in sized if e is not None],
+        colors=[colour[i] for i, _ in sized],
+        radii=rr.Radius.ui_points(0.8),
+    )
+    log("/extent", boxes, bool(sized))
+    named = [i for i, o in enumerate(every) if np.isfinite(o.position).all()]
+    unresolved = [(i, (ray[0], every[i].position)) for i in named if (ray := every[i].ray) is not None]
+    strips = rr.LineStrips3D(
+        [way for _, way in unresolved], colors=[colour[i] for i, _ in unresolved], radii=rr.Radius.ui_points(1)
+    )
+    log("/unresolved", strips, bool(unresolved))
+    words = [texts[i] if every[i].status == "ok" else f"{texts[i]}, unresolved" for i in named]
+    places = np.array([every[i].position for i in named]).reshape(-1, 3)
+    shown = len(named) <= _MAX_LABELS
+    hung, ends = label_places(view_point, places, words, path) if shown else (places, places)
+    # the viewer writes a label into a dark box, in its point's colour: only white can be read there
+    names = rr.Points3D(hung, colors=[_TEXT], radii=0.0, labels=words, show_labels=shown)
+    log("/labels", names, bool(named))
+    lines = rr.LineStrips3D(np.stack([places, ends], axis=1), colors=[_LEADER], radii=rr.Radius.ui_points(0.4))
+    log("/labels/lines", lines, bool(named) and shown)
+
+
+def log_truth(recording: Any, truth: Truth) -> None:
+    """The true objects as black dots: `map/truth`, static."""
+    points = rr.Points3D(
+        [o.position for o in truth.objects],
+        colors=[_TRUTH],
+        radii=rr.Radius.ui_points(3),
+        labels=[o.label for o in truth.objects],
+        show_labels=False,
+    )
+    recording.log("map/truth", points, static=True)

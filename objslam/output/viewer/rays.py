@@ -1,0 +1,49 @@
+"""Rays: blue where they hold an object, red where the robust loss rejects them, grey where no object explains them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from objslam.core.result import RunResult
+from objslam.output.plot.style import RayKind, ray_ends, ray_kinds, sample
+from objslam.output.viewer.times import moments, stamp_column
+
+RAY_COLOURS: dict[RayKind, tuple[int, int, int]] = {
+    "used": (62, 128, 214),
+    "rejected": (224, 62, 50),
+    "unexplained": (150, 150, 150),
+}
+"""The RGB colour of each kind of ray."""
+_FAINT: dict[RayKind, tuple[int, int, int]] = {
+    "used": (186, 212, 243),
+    "rejected": (246, 205, 200),
+    "unexplained": (222, 222, 222),
+}
+"""The same on white at about a third of their strength, for the rays that stay on the map."""
+_MAX_RAYS = 240  # The largest number of rays of a kind that stay on the map: lines are opaque, and many would cover it.
+
+
+def log_rays(recording: Any, result: RunResult) -> None:
+    """The rays of the moment in `map/rays/now`; a sample of all rays in `map/rays/used`, `rejected` and `unexplained`."""
+    strips = np.stack([result.origins, ray_ends(result)], axis=1).astype(np.float32)
+    for kind, mask in ray_kinds(result).items():
+        index = sample(mask, _MAX_RAYS)
+        if len(index):
+            lines = rr.LineStrips3D(strips[index], colors=[_FAINT[kind]], radii=rr.Radius.ui_points(0.4))
+            recording.log(f"map/rays/{kind}", lines, static=True)
+    stamps, counts, order = moments(result.keyframes.stamps, result.rays.keyframe)
+    columns = rr.LineStrips3D.columns(strips=strips[order], colors=kind_colours(result)[order]).partition(counts)
+    recording.send_columns("map/rays/now", [stamp_column(stamps)], columns)
+    recording.log("map/rays/now", rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5)), static=True)
+
+
+def kind_colours(result: RunResult) -> NDArray[np.uint8]:
+    """(R, 3) the colour of each ray's kind."""
+    colours = np.zeros((len(result.rays), 3), dtype=np.uint8)
+    for kind, mask in ray_kinds(result).items():
+        colours[mask] = RAY_COLOURS[kind]
+    return colours

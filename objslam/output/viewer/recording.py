@@ -1,0 +1,78 @@
+"""recording.rrd: a run to look at and to play back with the rerun viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from objslam.core.arrays import Floats
+from objslam.core.result import RunResult
+from objslam.core.types import Truth
+from objslam.output.viewer.blueprint import blueprint
+from objslam.output.viewer.cameras import camera_path, log_cameras
+from objslam.output.viewer.event_log import Event, drive_events, round_events
+from objslam.output.viewer.objects import log_objects, log_truth
+from objslam.output.viewer.paths import log_base, log_paths, thinned
+from objslam.output.viewer.plots import log_costs, log_residuals, log_seconds
+from objslam.output.viewer.rays import log_rays
+from objslam.output.viewer.steps import log_steps
+from objslam.output.viewer.summary import summary_text
+from objslam.output.viewer.surface import log_surfaces
+from objslam.output.viewer.times import iteration_column, stamp_column
+from objslam.output.viewer.view_point import first_view_point
+
+_AVOIDED = 500  # The largest number of points of the path that labels try not to cover.
+
+
+def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -> None:
+    """Write a run as a rerun recording (.rrd) with its blueprint.
+
+    `map` (z up, m) holds what does not move: the paths, the objects, the truth, a sample of all rays, the reconstruction. On
+    the timeline `stamp` it also holds the robot, its cameras with their images, boxes and objects, and the rays of the
+    moment; on the timeline `iteration`, the path and the objects after each step of the solver. `plots` holds the curves,
+    `log` the decisions on both timelines, `summary` the run as a table.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    recording = rr.RecordingStream("objslam")
+    # in memory: a file sink writes in a thread of its own, where a full disk is no error but a line on stderr
+    memory = recording.memory_recording()
+    recording.send_recording_name(str(result.summary.get("log", "objslam")))
+    view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])
+    used = [c for i, c in enumerate(result.cameras) if (result.keyframes.camera == i).any()]
+    cameras = [(camera_path(c), c.name) for c in used]
+    recording.send_blueprint(blueprint(view_point, cameras, solver=bool(result.trace)))
+    recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    log_paths(recording, result, truth)
+    log_surfaces(recording, result)
+    log_objects(recording, result.map, view_point, thinned(result.path_after, _AVOIDED))
+    if truth is not None and truth.objects:
+        log_truth(recording, truth)
+    if len(result.keyframes):
+        log_base(recording, result)
+        log_rays(recording, result)
+        unread = log_cameras(recording, result, view_point.distance)
+        log_residuals(recording, result)
+        events = drive_events(result)
+        if unread:
+            events.insert(1, Event(events[0].at, "WARN", f"{unread} images could not be read"))
+        _log_events(recording, events, stamp_column)
+    log_steps(recording, result)
+    log_costs(recording, result)
+    log_seconds(recording, result.summary.get("seconds", {}))
+    rounds = round_events(result.trace, result.rays.label_names)
+    _log_events(recording, rounds, lambda at: iteration_column(at.astype(np.int64)))
+    recording.log("summary", rr.TextDocument(summary_text(result), media_type="text/markdown"), static=True)
+    file.write_bytes(memory.drain_as_bytes())
+
+
+def _log_events(recording: Any, events: list[Event], column: Callable[[Floats], Any]) -> None:
+    if events:
+        at = np.array([event.at for event in events], dtype=np.float64)
+        columns = rr.TextLog.columns(text=[event.text for event in events], level=[event.level for event in events])
+        recording.send_columns("log", [column(at)], columns)

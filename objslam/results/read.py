@@ -1,0 +1,80 @@
+"""A result folder read back: its map, path, rays, odometry and ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Trajectory, Truth
+from objslam.errors import LogError, OutputError
+from objslam.io.atomic_files import has_staging
+from objslam.io.objects_json import read_objects, read_truth_objects
+from objslam.io.odometry_parquet import Motions, read_motions
+from objslam.io.rays_parquet import RaysTable, read_rays
+from objslam.io.tum_trajectory import read_trajectory
+from objslam.results import files
+
+
+def load_map(out: Path) -> ObjectMap:
+    """The object map of the result in the folder `out`; OutputError says what is missing or malformed."""
+    return read_objects(_existing(out, files.OBJECTS))
+
+
+def load_trajectory(out: Path) -> Trajectory:
+    """map_T_base of the result in the folder `out`; OutputError, with file and line, says what is missing or malformed."""
+    file, ledger = _existing(out, files.TRAJECTORY), Ledger()
+    try:
+        trajectory = read_trajectory(file, ledger)
+    except LogError as error:
+        raise OutputError(error.message, where=error.where, hint=error.hint) from error
+    if ledger.dropped:  # a log may be damaged, a result of our own may not
+        raise OutputError(f"the trajectory is damaged: {ledger.lines()[0]}", where=str(file))
+    return trajectory
+
+
+def load_motions(out: Path) -> Motions | None:
+    """The odometry between the poses of the result in the folder `out`, None where it had none; OutputError as above."""
+    _existing(out, files.OBJECTS)
+    file = out / files.MOTIONS
+    return read_motions(file) if file.is_file() else None
+
+
+def load_rays(out: Path) -> RaysTable:
+    """The rays of the result in the folder `out`; OutputError where the file is missing, damaged, or of an older version."""
+    return read_rays(out / files.RAYS)
+
+
+def load_truth(path: Path) -> Truth | None:
+    """The ground truth in a path, None when a folder holds none.
+
+    Args:
+        path: an objects file, a folder named groundtruth, a log folder with one, or a result whose log brought a truth. The
+            objects.json of a result folder is its estimate, never its truth: to compare two results, name that file itself.
+    Raises:
+        LogError: there is no such path, or the truth is malformed.
+    """
+    if path.is_file():
+        return Truth(read_truth_objects(path))
+    if not path.is_dir():
+        raise LogError("no such ground truth", where=str(path), hint="give --truth FILE")
+    inner = path if path.resolve().name == files.GROUNDTRUTH else path / files.GROUNDTRUTH
+    for objects, trajectory in (
+        (path / files.TRUTH_OBJECTS, path / files.TRUTH_TRAJECTORY),
+        (inner / files.OBJECTS, inner / files.TRAJECTORY),
+    ):
+        if objects.is_file() or trajectory.is_file():
+            return Truth(
+                read_truth_objects(objects) if objects.is_file() else (),
+                read_trajectory(trajectory, Ledger()) if trajectory.is_file() else None,
+            )
+    return None
+
+
+def _existing(out: Path, name: str) -> Path:
+    if not out.is_dir():
+        raise OutputError("there is no such result folder", where=str(out))
+    if not (out / name).is_file():
+        hint = "was its run killed? run again" if has_staging(out) else files.hint_below(out)
+        raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
+    return out / name

@@ -1,0 +1,159 @@
+"""Rows of a damaged SQLite file, found page by page: where the tree above a leaf page is gone, its rows are still there.
+
+https://www.sqlite.org/fileformat2.html, sections 1.3 (header), 1.6 (b-tree pages, cells, overflow), 2.1 (records).
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from objslam.ros.bag.records import MAX_RECORD
+
+Row = tuple[int, int, int, bytes]
+"""rowid, topic id, time of recording (ns), message."""
+
+_LEAF = 13  # The kind of a page that holds rows.
+_INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # The bytes of an integer, by its serial type.
+_MAX_COLUMNS = 32  # The most columns of a table of messages; a cell with more is none of its rows.
+
+
+class _CellError(ValueError):
+    """A cell that is not whole, or no row of messages."""
+
+
+def missing_pages(path: Path) -> tuple[int, int]:
+    """How many whole pages a file has, and how many fewer that is than its header says (0 if that cannot be trusted)."""
+    with path.open("rb") as file:
+        header = file.read(100)
+    if len(header) < 100:
+        return 0, 0
+    changes, pages, valid_for = (struct.unpack_from(">I", header, at)[0] for at in (24, 28, 92))
+    there = path.stat().st_size // _page_size(header)
+    return there, max(pages - there, 0) if changes == valid_for else 0
+
+
+def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
+    """The rows with rowids above `after` on every leaf page of a file, whole rows only, in the order of their rowids.
+
+    columns: where topic id, time and message stand in the table. A leaf page says nothing of its table: rows count that have
+    the right types in these columns and one of the `topics`.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        size = _page_size(data[:100])
+        rowids, places = array("q"), array("q")
+        for start in range(size, len(data), size):
+            if data[start] != _LEAF or start + 8 > len(data):
+                continue
+            (cells,) = struct.unpack_from(">H", data, start + 3)
+            for at in range(start + 8, min(start + 8 + 2 * cells, start + size - 1, len(data) - 1), 2):
+                place = start + int.from_bytes(data[at : at + 2], "big")
+                try:
+                    rowid = _varint(data, _varint(data, place)[1])[0]
+                    if rowid > after:
+                        _read_row(data, place, size, columns, topics, whole=False)
+                        rowids.append(rowid)
+                        places.append(place)
+                except (_CellError, IndexError, OverflowError):
+                    continue
+        keys, first = np.unique(np.frombuffer(rowids, dtype=np.int64), return_index=True)
+        for rowid, place in zip(keys.tolist(), np.frombuffer(places, dtype=np.int64)[first].tolist(), strict=True):
+            try:
+                yield (rowid, *_read_row(data, place, size, columns, topics, whole=True))
+            except (_CellError, IndexError):
+                continue
+
+
+def _page_size(header: bytes) -> int:
+    (size,) = struct.unpack_from(">H", header, 16)
+    return 65536 if size == 1 else max(int(size), 512)
+
+
+def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
+    value = 0
+    for i in range(9):
+        byte = data[at + i]
+        if i == 8:
+            return _signed(value << 8 | byte, 8), at + 9
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            break
+    return value, at + i + 1
+
+
+def _signed(value: int, size: int) -> int:
+    return value - (1 << 8 * size) if value >> (8 * size - 1) else value
+
+
+def _read_row(
+    data: mmap.mmap, at: int, page: int, columns: tuple[int, int, int], topics: frozenset[int], whole: bool
+) -> tuple[int, int, bytes]:
+    """Topic, time and, if `whole`, message of the cell at a byte of a leaf page."""
+    size, at = _varint(data, at)
+    _, at = _varint(data, at)
+    usable = page - data[20]
+    local = _local_size(size, usable)
+    if not 4 <= size <= MAX_RECORD or at + local > len(data):
+        raise _CellError
+    head, start = _varint(data, at)
+    end = at + head
+    if not 2 <= head <= min(local, 9 * _MAX_COLUMNS):
+        raise _CellError
+    kinds = []
+    while start < end:
+        kind, start = _varint(data, start)
+        kinds.append(kind)
+    if max(columns) >= len(kinds):
+        raise _CellError
+    offsets = np.cumsum([head] + [_column_size(kind) for kind in kinds]).tolist()
+    if offsets[-1] != size:
+        raise _CellError
+    topic, stamp = (_integer(data, kinds[c], at + offsets[c], at + local) for c in columns[:2])
+    kind = kinds[columns[2]]
+    if topic not in topics or kind < 12 or kind % 2:
+        raise _CellError
+    if not whole:
+        return topic, stamp, b""
+    payload = data[at : at + local] if local == size else _with_overflow(data, at, local, size, page, usable)
+    return topic, stamp, payload[offsets[columns[2]] : offsets[columns[2] + 1]]
+
+
+def _local_size(size: int, usable: int) -> int:
+    """How much of a payload lies in the cell itself; the rest overflows to other pages."""
+    if size <= usable - 35:
+        return size
+    least = (usable - 12) * 32 // 255 - 23
+    local = least + (size - least) % (usable - 4)
+    return local if local <= usable - 35 else least
+
+
+def _column_size(kind: int) -> int:
+    return (kind - 12) // 2 if kind >= 12 else 8 if kind == 7 else _INTEGERS.get(kind, 0)
+
+
+def _integer(data: mmap.mmap, kind: int, at: int, end: int) -> int:
+    if kind in (8, 9):
+        return kind - 8
+    size = _INTEGERS.get(kind)
+    if size is None or at + size > end:
+        raise _CellError
+    return _signed(int.from_bytes(data[at : at + size], "big"), size)
+
+
+def _with_overflow(data: mmap.mmap, at: int, local: int, size: int, page: int, usable: int) -> bytes:
+    parts = [data[at : at + local]]
+    rest, link = size - local, at + local
+    while rest > 0:
+        start = (int.from_bytes(data[link : link + 4], "big") - 1) * page
+        part = data[start + 4 : start + 4 + min(rest, usable - 4)] if start > 0 else b""
+        if len(part) < min(rest, usable - 4):
+            raise _CellError
+        parts.append(part)
+        rest -= len(part)
+        link = start
+    return b"".join(parts)

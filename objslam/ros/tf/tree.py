@@ -1,0 +1,185 @@
+"""The tree of coordinate frames that /tf and /tf_static describe, at rest and over time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate, inverse
+from objslam.errors import LogError
+from objslam.ros.messages.poses import PoseRows
+from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
+
+_NAMED = 6  # The most frames that a message lists; chosen for a line that can be read.
+
+
+@dataclass
+class TfRows:
+    """Transforms as they came, by (parent, child): the moving ones over time, of the static ones the last."""
+
+    moving: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
+    static: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def add(self, transform: Any, logged: int, static: bool) -> None:
+        """Add a geometry_msgs/TransformStamped; what cannot be one is refused and counted."""
+        try:
+            parent, child = link(transform)
+        except ValueError as error:
+            self.refused[str(error)] += 1
+            return
+        table = self.static if static else self.moving
+        rows = table.get((parent, child))
+        if rows is None or static:
+            if rows is None and len(self.static) + len(self.moving) >= MAX_TRANSFORMS:
+                self.refused[f"transform beyond the first {MAX_TRANSFORMS} pairs of frames"] += 1
+                return
+            rows = table[parent, child] = PoseRows()
+        stamp = transform.header.stamp
+        nanoseconds = stamp.sec * 10**9 + stamp.nanosec
+        rows.add(nanoseconds or logged, logged, transform.transform.translation, transform.transform.rotation)
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """parent_T_child at stamps (N,), s, increasing; one pose (1, 4, 4) where it never changes."""
+
+    parent: str
+    stamps: Floats
+    poses: Floats
+
+    @property
+    def still(self) -> bool:
+        return len(self.poses) == 1
+
+
+class TfTree:
+    """The frames and how they hang together. Poses a_T_b take b coordinates to a coordinates.
+
+    A frame with several parents keeps the one that most transforms name, with a warning; of two transforms of one stamp the
+    later counts. Methods that need a way between two frames raise LogError where there is none, naming the two parts that
+    nothing connects, or where the tree runs in a circle.
+    """
+
+    def __init__(self, rows: TfRows, ledger: Ledger) -> None:
+        self._rows, self._ledger = rows, ledger
+        self._edges: dict[str, _Edge] = {}
+        parents: dict[str, Counter[str]] = {}
+        for parent, child in rows.static:
+            parents.setdefault(child, Counter())[parent] += 1
+        for (parent, child), samples in rows.moving.items():
+            parents.setdefault(child, Counter())[parent] += len(samples)
+        self._parent = {child: max(found, key=lambda name: found[name]) for child, found in parents.items()}
+        self._torn = {child: sorted(found) for child, found in parents.items() if len(found) > 1}
+        for reason, count in rows.refused.items():
+            ledger.drop(reason, count)
+
+    @cached_property
+    def frames(self) -> frozenset[str]:
+        """All frames."""
+        return frozenset(self._parent) | frozenset(self._parent.values())
+
+    def chain(self, a: str, b: str) -> tuple[str, ...]:
+        """The frames on the way from a to b, both included."""
+        up, down = self._ways(a, b)
+        top = self._parent[up[-1]] if up else a
+        return (*up, top, *reversed(down))
+
+    def still(self, a: str, b: str) -> Floats | None:
+        """a_T_b (4, 4), None if it changes over time."""
+        still = all(self._edge(child).still for way in self._ways(a, b) for child in way)
+        return self.at(a, b, np.zeros(1))[0][0] if still else None
+
+    def stamps(self, a: str, b: str) -> Floats:
+        """The stamps (N,), s, at which any of the moving transforms between a and b was given, where all are known."""
+        moving = [edge for way in self._ways(a, b) for child in way if not (edge := self._edge(child)).still]
+        if not moving:
+            return np.zeros(0)
+        stamps = np.unique(np.concatenate([edge.stamps for edge in moving]))
+        first, last = max(edge.stamps[0] for edge in moving), min(edge.stamps[-1] for edge in moving)
+        return stamps[(stamps >= first) & (stamps <= last)]
+
+    def above(self, frame: str) -> Sequence[str]:
+        """A frame, its parent, and so on up to the root."""
+        way, circle = climb(frame, self._parent.get)
+        if circle is not None:
+            names = " -> ".join([*way[way.index(circle) :], circle][:_NAMED])
+            raise LogError(f"the tf tree runs in a circle: {names}")
+        return way
+
+    def at(self, a: str, b: str, stamps: Floats) -> tuple[Floats, Bools]:
+        """a_T_b (Q, 4, 4) at stamps (Q,), s, each transform interpolated, and where (Q,) all of them are known."""
+        up, down = self._ways(a, b)
+        top_T_a, known_a = self._down(up, stamps)
+        top_T_b, known_b = self._down(down, stamps)
+        return inverse(top_T_a) @ top_T_b, known_a & known_b
+
+    def _down(self, way: Sequence[str], stamps: Floats) -> tuple[Floats, Bools]:
+        pose = np.broadcast_to(np.eye(4), (len(stamps), 4, 4))
+        known = np.ones(len(stamps), dtype=bool)
+        for child in way:
+            edge = self._edge(child)
+            if edge.still:
+                pose = edge.poses @ pose
+            else:
+                step, valid = interpolate(edge.stamps, edge.poses, stamps, MAX_GAP)
+                pose, known = step @ pose, known & valid
+        return pose, known
+
+    def _ways(self, a: str, b: str) -> tuple[Sequence[str], Sequence[str]]:
+        """The frames from a and from b up to, and without, the first frame above both."""
+        ways = part(self.above(a), self.above(b))
+        if ways is None:
+            raise LogError(
+                f"tf does not connect {a!r} and {b!r}: {self._part(a)}; {self._part(b)}",
+                hint="was /tf_static recorded? a camera's place can be given in --camera-info FILE",
+            )
+        return ways
+
+    def _part(self, frame: str) -> str:
+        if frame not in self.frames:
+            return f"{frame!r} is in no transform"
+        others = sorted(self._connected(frame) - {frame})
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        return f"{frame!r} hangs together with {', '.join(others[:_NAMED])}{more}"
+
+    def _connected(self, frame: str) -> set[str]:
+        near: dict[str, list[str]] = {}
+        for child, parent in self._parent.items():
+            near.setdefault(child, []).append(parent)
+            near.setdefault(parent, []).append(child)
+        found, edge = {frame}, [frame]
+        while edge:
+            edge = [other for name in edge for other in near.get(name, ()) if other not in found]
+            found.update(edge)
+        return found
+
+    def _edge(self, child: str) -> _Edge:
+        if child not in self._edges:
+            self._edges[child] = self._make_edge(child)
+        return self._edges[child]
+
+    def _make_edge(self, child: str) -> _Edge:
+        parent = self._parent[child]
+        if child in self._torn:
+            others = ", ".join(other for other in self._torn[child] if other != parent)
+            self._ledger.warn(f"tf: {child} has several parents, {parent} is taken, not {others}")
+        what = f"transform {parent} -> {child}"
+        moving, static = self._rows.moving.get((parent, child)), self._rows.static.get((parent, child))
+        stamps, poses = (moving or static or PoseRows()).checked(what, self._ledger)
+        if not len(stamps):
+            raise LogError(f"no usable {what} in tf")
+        order = np.argsort(stamps, kind="stable")
+        stamps, poses = stamps[order], poses[order]
+        last = np.concatenate([np.diff(stamps) > 0, [True]])
+        stamps, poses = stamps[last], poses[last]
+        if unchanged(poses, poses[0]):
+            stamps, poses = stamps[:1], poses[:1]
+        return _Edge(parent, stamps, poses)

@@ -1,0 +1,156 @@
+"""What the cameras see of the objects, and what their detector makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera, depths, in_view
+from objslam.core.geometry import inverse
+from objslam.core.types import Detections
+from objslam.simulation.settings import DriveSettings
+
+FALSE_SIZES = (20.0, 120.0)
+"""px; between these are width and height of a box of nothing."""
+
+TRACK_PATIENCE = 1.0
+"""s; a tracker gives up an object that was out of sight for longer."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Objects in the image before any error: frame (M,), object (M,), box centre and size (M, 2) px, depth (M,) z in m."""
+
+    frame: Ints
+    object: Ints
+    centre: Floats
+    size: Floats
+    depth: Floats
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes of one camera, in no order: like Detections, but object (M,) says what each box is of, -1 for nothing."""
+
+    frame: Ints
+    object: Ints
+    label: Ints
+    box: Floats
+    score: Floats
+    depth: Floats
+
+    @classmethod
+    def join(cls, *parts: Self) -> Self:
+        """All boxes of several parts."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    def take(self, boxes: Bools) -> Self:
+        """A selection of the boxes."""
+        return type(self)(*(getattr(self, f.name)[boxes] for f in fields(self)))
+
+
+def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points: Floats, extents: Floats) -> Views:
+    """What a camera at poses (F, 4, 4) sees of points (N, 3) or, moving, (F, N, 3), of extents (N, 2), m, in map."""
+    camera_T_map = inverse(map_T_camera)
+    local = points @ np.swapaxes(camera_T_map[:, :3, :3], 1, 2) + camera_T_map[:, None, :3, 3]  # (F, N, 3)
+    distance = np.linalg.norm(local, axis=-1)
+    near = (distance <= settings.max_range) & (local[..., 2] > distance * np.cos(camera.view_angle))
+    frame, index = np.nonzero(near)
+    local = local[frame, index]
+    size = extents[index] * np.diag(camera.matrix)[:2] / depths(camera, local)[:, None]
+    reach = _reach(settings, size)
+    seen, centre = in_view(camera, local, reach, _corner(camera) - reach)
+    return Views(frame[seen], index[seen], centre, size[seen], local[seen, 2])
+
+
+def _reach(settings: DriveSettings, size: Floats) -> Floats:
+    """How far (M, 2), px, the centres of boxes of a size (M, 2) must stay from the image's edge."""
+    return np.zeros_like(size) if settings.cut_off else size / 2
+
+
+def _corner(camera: Camera) -> Floats:
+    return np.array([camera.width - 1.0, camera.height - 1.0])
+
+
+def detect(
+    settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
+) -> Boxes:
+    """The boxes of what is seen, with noise and misses.
+
+    label: (N,) the label of each object. first_id: the id of the first object in the boxes.
+    """
+    noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
+    count = len(seen.frame)
+    centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
+    box = np.column_stack([centre - seen.size / 2, centre + seen.size / 2])
+    if settings.cut_off:
+        box = np.clip(box, 0.0, np.tile(_corner(camera), 2))
+    boxes = Boxes(
+        frame=seen.frame,
+        object=seen.object + first_id,
+        label=label[seen.object],
+        box=box,
+        score=score.uniform(0.5, 1.0, count),
+        depth=_depths(settings, seen.depth, depth),
+    )
+    reach = _reach(settings, seen.size)
+    inside = np.asarray(((centre - reach >= 0) & (centre + reach <= _corner(camera))).all(axis=1))
+    return boxes.take(inside & (miss.random(count) >= settings.missed))
+
+
+def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.random.SeedSequence) -> Boxes:
+    """Boxes of nothing, anywhere in the image: in each frame, for each class, one with the given probability."""
+    rng, depth = (np.random.default_rng(s) for s in seed.spawn(2))
+    frame, label = np.nonzero(rng.random((settings.frames, classes)) < settings.false)
+    count = len(frame)
+    size = rng.uniform(*FALSE_SIZES, (count, 2))
+    corner = rng.random((count, 2)) * (_corner(camera) - size)
+    return Boxes(
+        frame=frame,
+        object=np.full(count, -1),
+        label=label,
+        box=np.column_stack([corner, corner + size]),
+        score=rng.uniform(0.3, 0.8, count),
+        depth=_depths(settings, depth.uniform(0.3, settings.max_range, count), depth),
+    )
+
+
+def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> Floats:
+    noise, count = settings.depth, len(true)
+    if noise is None:
+        return np.full(count, np.nan)
+    depth = true + np.hypot(noise.sigma, noise.sigma_per_m * true) * rng.standard_normal(count)
+    depth = np.where(rng.random(count) < noise.wrong, rng.uniform(0.3, settings.max_range, count), depth)
+    return np.where(rng.random(count) < noise.missing, np.nan, depth)
+
+
+def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
+    """The boxes as a detector hands them out: frame by frame, the surest first."""
+    order = np.lexsort((-boxes.score, boxes.frame))
+    tracks = _tracks(settings, boxes)
+    return Detections(
+        frame_stamps=frame_stamps,
+        frame=boxes.frame[order],
+        boxes=boxes.box[order],
+        label=boxes.label[order],
+        scores=boxes.score[order],
+        depths=boxes.depth[order],
+        track_ids=tracks[order],
+        label_names=classes,
+    )
+
+
+def _tracks(settings: DriveSettings, boxes: Boxes) -> Ints:
+    if settings.tracks == "none":
+        return np.full(len(boxes.frame), -1)
+    if settings.tracks == "perfect":
+        return boxes.object
+    order = np.lexsort((boxes.frame, boxes.object))
+    patience = TRACK_PATIENCE * settings.frame_rate
+    starts = (np.diff(boxes.object[order], prepend=-1) != 0) | (np.diff(boxes.frame[order], prepend=0) > patience)
+    tracks = np.empty(len(order), dtype=np.int64)
+    tracks[order] = np.cumsum(starts)
+    return np.where(boxes.object < 0, -1, tracks)

@@ -1,0 +1,169 @@
+"""What a session takes in, one dataclass a message, and each as bytes for the journal."""
+
+from __future__ import annotations
+
+import json
+import struct
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera
+from objslam.errors import LogError
+
+PathKind = Literal["odometry", "localization"]
+
+_POSE = struct.Struct("<c13d")  # A pose: its kind, stamp, and upper three rows.
+_MOUNT = struct.Struct("<cd12dH")  # A mount: its kind, stamp, upper three rows, and the length of its camera's name.
+_KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
+_PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
+_MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
+
+
+@dataclass(frozen=True)
+class PoseMessage:
+    """odom_T_base or map_T_base (4, 4) at a stamp, s."""
+
+    path: PathKind
+    stamp: float
+    pose: Floats
+
+
+@dataclass(frozen=True)
+class MountMessage:
+    """base_T_camera (4, 4) of a camera from a stamp, s, on."""
+
+    stamp: float
+    camera: str
+    pose: Floats
+
+
+class HeldMounts:
+    """The mounts of one camera, each of which holds until the next; only the newest are kept where `most` says how many."""
+
+    def __init__(self, most: int | None = None) -> None:
+        self._most = most
+        self._stamps: list[float] = []
+        self._poses: list[Floats] = []
+
+    def add(self, message: MountMessage) -> None:
+        """Add a mount; of several with one stamp the last added holds."""
+        at = bisect_right(self._stamps, message.stamp)
+        self._stamps.insert(at, message.stamp)
+        self._poses.insert(at, message.pose)
+        if self._most is not None and len(self._stamps) > self._most:
+            del self._stamps[0], self._poses[0]
+
+    def at(self, stamp: float, camera: Camera) -> Floats:
+        """base_T_camera (4, 4) at a stamp, s: the last mount by then, before the first that of the camera itself."""
+        at = bisect_right(self._stamps, stamp)
+        return self._poses[at - 1] if at else camera.base_T_camera
+
+
+@dataclass(frozen=True)
+class CameraMessage:
+    """A camera that is known from now on."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class FrameMessage:
+    """The boxes of one image, as `types.Detections` has them: boxes (B, 4), labels B, scores, depths, track_ids (B,)."""
+
+    stamp: float
+    camera: str
+    boxes: Floats
+    labels: tuple[str, ...]
+    scores: Floats
+    depths: Floats
+    track_ids: Ints
+    whole: bool = False
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+@dataclass(frozen=True)
+class NoteMessage:
+    """What a session has to remember besides: {"clock": s added to stamps, "odometry": start_T_odom as 16 numbers}."""
+
+    clock: float
+    odometry: Floats
+
+
+Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage
+
+
+def encode(message: Message) -> bytes:
+    """The message as bytes; `decode` gives back the same to the last bit."""
+    if isinstance(message, PoseMessage):
+        return _POSE.pack(_KINDS[message.path], message.stamp, *message.pose[:3].ravel().tolist())
+    if isinstance(message, MountMessage):
+        name = message.camera.encode()
+        return _MOUNT.pack(_MOUNT_KIND, message.stamp, *message.pose[:3].ravel().tolist(), len(name)) + name
+    if isinstance(message, NoteMessage):
+        return _NOTE_KIND + json.dumps([message.clock, message.odometry.ravel().tolist()]).encode()
+    if isinstance(message, CameraMessage):
+        c = message.camera
+        data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
+        return _CAMERA_KIND + json.dumps([*data, c.base_T_camera.ravel().tolist(), c.depth_scale, c.sees_size]).encode()
+    known = np.where(np.isfinite(message.depths), message.depths, -1.0)
+    columns = (message.boxes, list(message.labels), message.scores, known, message.track_ids)
+    lists = [c if isinstance(c, list) else c.tolist() for c in columns]
+    return _FRAME_KIND + json.dumps([message.stamp, message.camera, *lists, *[True] * message.whole]).encode()
+
+
+def decode(data: bytes) -> Message:
+    """The message that bytes hold; LogError where they hold none."""
+    kind = data[:1]
+    try:
+        if kind in _PATHS:
+            _, stamp, *rows = _POSE.unpack(data)
+            return PoseMessage(_PATHS[kind], stamp, _pose(rows))
+        if kind == _MOUNT_KIND:
+            _, stamp, *rows, length = _MOUNT.unpack_from(data)
+            name = data[_MOUNT.size :]
+            if len(name) != length:
+                raise ValueError("a name of another length")
+            return MountMessage(stamp, name.decode(), _pose(rows))
+        if kind == _NOTE_KIND:
+            clock, odometry = json.loads(data[1:])
+            return NoteMessage(float(clock), _array(odometry, (4, 4)))
+        if kind == _CAMERA_KIND:
+            name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
+            lens = (_array(matrix, (3, 3)), model, _array(distortion, (-1,)))
+            sees_size = bool(more[0]) if more else True  # older journals do not say
+            return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale, sees_size))
+        if kind == _FRAME_KIND:
+            stamp, camera, boxes, labels, scores, depths, tracks, *whole = json.loads(data[1:])
+            if whole not in ([], [True]):
+                raise ValueError("a frame with more than a frame has")
+            known = _array(depths, (len(labels),))
+            return FrameMessage(
+                float(stamp),
+                camera,
+                _array(boxes, (len(labels), 4)),
+                tuple(labels),
+                _array(scores, (len(labels),)),
+                np.where(known > 0, known, np.nan),
+                np.array(tracks, dtype=np.int64).reshape(len(labels)),
+                bool(whole),
+            )
+    except (ValueError, TypeError, struct.error) as error:
+        raise LogError(f"a record that cannot be read: {error}") from error
+    raise LogError(f"a record of an unknown kind {kind!r}")
+
+
+def _pose(rows: list[float]) -> Floats:
+    return np.array([*rows, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+
+
+def _array(values: list[float], shape: tuple[int, ...]) -> Floats:
+    array = np.array(values, dtype=np.float64).reshape(shape)
+    if not np.isfinite(array).all():
+        raise ValueError("a number that is not finite")
+    return array

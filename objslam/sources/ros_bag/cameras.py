@@ -1,0 +1,143 @@
+"""Which topics belong to one camera, and that camera's calibration and place on the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Trajectory
+from objslam.errors import LogError
+from objslam.io.camera_yaml import Calibration
+from objslam.ros.messages.camera_info import camera_names, camera_of
+from objslam.ros.messages.topic_types import COMPRESSED
+from objslam.ros.tf.tree import TfTree
+from objslam.ros.topics import closeness, is_named, is_rectified
+from objslam.sources.ros_bag.survey import Topic
+from objslam.sources.ros_bag.topic_roles import TopicPool
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """The topics of one camera, and its optical frame.
+
+    calibration: where a file gives it. rectified: whether its boxes and images are those of the rectified image.
+    """
+
+    name: str
+    frame: str
+    detections: Topic | None
+    image: Topic | None
+    depth: Topic | None
+    info: Topic | None
+    calibration: Calibration | None
+    rectified: bool
+
+    def roles(self) -> dict[str, Topic]:
+        """Its topics by their roles."""
+        topics = {"detections": self.detections, "image": self.image, "depth": self.depth, "camera_info": self.info}
+        return {role: topic for role, topic in topics.items() if topic is not None}
+
+
+def find_cameras(
+    pool: TopicPool, tree: TfTree, calibrations: Sequence[Calibration], rectified: bool | None
+) -> tuple[CameraTopics, ...]:
+    """The cameras of a recording with their topics.
+
+    With calibrations from a file: these, each with the topics whose frame or name has its name as a part (a single one takes
+    what there is). Else a camera for each frame with detections; where there are none, for each with colour images and a
+    CameraInfo. Topics belong together that share the frame; of several, the nearest by name is taken, with a warning.
+    """
+    detections, images = pool.fitting("detections"), pool.fitting("image")
+    seeds = detections or images
+    if calibrations:
+        alone = len(calibrations) == 1
+        named = {c.camera.name: [t for t in seeds if is_named(c.camera.name, t.frame, t.name)] for c in calibrations}
+        if alone and not any(named.values()):
+            named = {name: list(seeds) for name in named}
+        for name in (name for name, topics in named.items() if not topics):
+            pool.ledger.warn(f"the camera {name!r} has no topics: left out (--topic {name}.detections=/name, or image)")
+        taken = {topic.name for topics in named.values() for topic in topics}
+        for topic in (topic for topic in detections if topic.name not in taken):
+            pool.ledger.warn(f"{topic.name}: left out, no calibration of that name ({', '.join(named)})")
+        cameras = []
+        for calibration in calibrations:
+            name = calibration.camera.name
+            if named[name] or any((name, role) in pool.choices.names for role in ("detections", "image")):
+                frame = named[name][0].frame if named[name] else name
+                cameras.append(_gather(pool, tree, name, frame, named[name], calibration, rectified, alone))
+        return tuple(cameras)
+    if not detections:
+        infos = pool.fitting("camera_info")
+        seeds = [topic for topic in images if len(images) == 1 or any(info.frame == topic.frame for info in infos)]
+    frames = list(dict.fromkeys(topic.frame for topic in seeds))
+    groups = zip(camera_names(frames), frames, strict=True)
+    alone = len(frames) == 1
+    return tuple(
+        _gather(pool, tree, name, frame, [t for t in seeds if t.frame == frame], None, rectified, alone)
+        for name, frame in groups
+    )
+
+
+def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) -> tuple[Camera, Trajectory | None]:
+    """The camera, and base_T_camera over time where it moves on the robot; LogError where either cannot be told."""
+    given = topics.calibration
+    if given is not None and given.placed:
+        return replace(given.camera, name=topics.name), None
+    if given is not None:
+        camera, correction = replace(given.camera, name=topics.name), given.camera.base_T_camera
+    elif topics.info is not None:
+        if len(topics.info.infos) > 1:
+            ledger.warn(f"{topics.info.name}: the calibration changes on the way, the first is taken")
+        info = next(iter(topics.info.infos.values()))
+        camera, correction = camera_of(info, topics.name, topics.info.name, topics.rectified)
+    else:
+        hint = "--topic camera_info=/name, or --camera-info FILE"
+        raise LogError(f"no CameraInfo belongs to it (frame {topics.frame!r})", where=f"camera {topics.name}", hint=hint)
+    base_T_frame = tree.still(base, topics.frame)
+    if base_T_frame is not None:
+        return replace(camera, base_T_camera=base_T_frame @ correction), None
+    stamps = tree.stamps(base, topics.frame)
+    poses, known = tree.at(base, topics.frame, stamps)
+    if not known.any():
+        raise LogError(f"tf {base} -> {topics.frame} is never known as a whole", where=f"camera {topics.name}")
+    return camera, Trajectory(stamps[known], poses[known] @ correction)
+
+
+def _gather(
+    pool: TopicPool,
+    tree: TfTree,
+    name: str,
+    frame: str,
+    seeds: Sequence[Topic],
+    calibration: Calibration | None,
+    rectified: bool | None,
+    alone: bool,
+) -> CameraTopics:
+    """All topics of one camera. A camera that is alone takes what a user chose, or what has no frame, whatever its own."""
+
+    def mine(role: str) -> list[Topic]:
+        rest = alone and (not frame or bool(pool.choices.of(role)))
+        return [topic for topic in pool.fitting(role) if topic in seeds or rest or (frame and topic.frame == frame)]
+
+    detections = pool.choose("detections", [topic for topic in pool.fitting("detections") if topic in seeds], name)
+    near = detections.name if detections else seeds[0].name if seeds else ""
+    info = None
+    if calibration is None:
+        infos = pool.fitting("camera_info")
+        infos = [t for t in infos if t.frame == frame] or [t for t in infos if closeness(t.name, near)] or infos
+        infos = sorted(infos, key=lambda topic: (-closeness(topic.name, near), "depth" in topic.name.lower()))
+        same = len({key for topic in infos for key in topic.infos}) == 1
+        info = pool.choose("camera_info", infos[:1] if same else infos, name)
+        if info is not None and info.frame in tree.frames and frame not in tree.frames:
+            frame = info.frame
+    near = info.name if info else near
+    images = sorted(mine("image"), key=lambda topic: (-closeness(topic.name, near), topic.type == COMPRESSED))
+    images.sort(key=lambda topic: is_rectified(topic.name) != bool(rectified))
+    image = pool.choose("image", images, name)
+    depths = sorted(mine("depth"), key=lambda topic: (topic.type == COMPRESSED, -closeness(topic.name, near)))
+    depth = pool.choose("depth", depths, name)
+    if rectified is None:
+        rectified = is_rectified((image or detections or depth or seeds[0]).name) if image or detections or seeds else False
+    return CameraTopics(name, frame, detections, image, depth, info, calibration, rectified)

@@ -1,0 +1,175 @@
+"""What is inside a recording, and what a run would make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.errors import LogError
+from objslam.ros.messages.topic_types import COMPRESSED, TRANSFORMS
+from objslam.ros.tf.tree import TfTree
+from objslam.sources.ros_bag.log import Assembly, assemble
+from objslam.sources.ros_bag.options import BagOptions
+from objslam.sources.ros_bag.survey import Topic
+from objslam.sources.summary import Timing, off_path, timing
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic.
+
+    messages: all of them. timing: of those that can be used, by the header's stamps where the type matters to objslam, else
+    by the times of recording. role: what a run would use it for, "" for nothing. frame: its frame_id. detail: what its
+    messages hold, in a few words. refused: why messages cannot be used, with their number.
+    """
+
+    name: str
+    type: str
+    messages: int
+    timing: Timing
+    role: str = ""
+    frame: str = ""
+    detail: str = ""
+    refused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """An optical frame and the frames on the way to it; base_T_frame (4, 4), None where it moves on the robot."""
+
+    frame: str
+    chain: tuple[str, ...]
+    base_T_frame: Floats | None
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """A recording at a glance.
+
+    start, end: s, of the times of recording. messages: read, and lost where that is known. base, odometry, localization:
+    the base frame and where the robot's path comes from, "" if it is missing. places: every optical frame that tf connects
+    to base. missing: what a run needs and does not find. damage, warnings: as a run would give them.
+    """
+
+    name: str
+    format: str
+    files: tuple[str, ...]
+    start: float
+    end: float
+    messages: int
+    lost: int
+    topics: tuple[TopicInfo, ...]
+    base: str
+    odometry: str
+    localization: str
+    cameras: tuple[Camera, ...]
+    places: tuple[CameraPlace, ...]
+    missing: tuple[str, ...]
+    damage: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """s, between the first and the last message."""
+        return self.end - self.start
+
+
+def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) -> BagInfo:
+    """What a recording holds, which role each topic would get in a run, and what is missing for one.
+
+    LogError where there is nothing to read; ConfigError for options that do not fit.
+    """
+    options = options or BagOptions()
+    ledger = Ledger()
+    assembly = assemble(paths, ledger, options)
+    survey, found = assembly.survey, assembly.paths
+    roles = _roles(assembly)
+    logged = [np.frombuffer(topic.logged, dtype=np.int64) for topic in survey.topics.values()]
+    return BagInfo(
+        name=survey.recording.name,
+        format=survey.recording.format,
+        files=tuple(str(file.path) for file in survey.recording.files),
+        start=min((float(times.min()) for times in logged), default=0.0) / 1e9,
+        end=max((float(times.max()) for times in logged), default=0.0) / 1e9,
+        messages=sum(report.messages for report in survey.reports),
+        lost=sum(report.lost for report in survey.reports),
+        topics=tuple(_topic_info(topic, roles.get(topic.name, "")) for _, topic in sorted(survey.topics.items())),
+        base=found.base if found else "",
+        odometry=found.odometry_from if found else "",
+        localization=found.localization_from if found else "",
+        cameras=tuple(camera for _, camera, _ in assembly.cameras),
+        places=_places(assembly.tree, found.base if found else options.base_frame or ""),
+        missing=_missing(assembly),
+        damage=tuple(line for report in survey.reports for line in report.lines()),
+        warnings=tuple(ledger.lines()),
+    )
+
+
+def _missing(assembly: Assembly) -> tuple[str, ...]:
+    missing = [str(error) for error in (*assembly.problems, *assembly.left_out)]
+    found = assembly.paths
+    path = (found.localization or found.odometry) if found is not None else None
+    for topics, camera, _ in assembly.cameras:
+        where, frames = f"camera {camera.name}", topics.detections or topics.image
+        if topics.detections is None:
+            missing.append(f"{where}: no detections; run a detector on its images (--detector)")
+        if frames is not None:
+            missing += off_path(where, frames.times() / 1e9, path)
+    return tuple(missing)
+
+
+def _roles(assembly: Assembly) -> dict[str, str]:
+    roles = {}
+    for name, topic in assembly.survey.topics.items():
+        if topic.type in TRANSFORMS:
+            roles[name] = "tf_static" if name.endswith("tf_static") else "tf"
+    if assembly.paths is not None:
+        roles.update(assembly.paths.roles)
+    for topics in assembly.cast:
+        for role, topic in topics.roles().items():
+            roles[topic.name] = f"{topics.name}.{role}" if len(assembly.cast) > 1 else role
+    return roles
+
+
+def _topic_info(topic: Topic, role: str) -> TopicInfo:
+    stamps = topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)
+    return TopicInfo(
+        name=topic.name,
+        type=topic.type,
+        messages=len(topic.logged),
+        timing=timing(stamps / 1e9),
+        role=role,
+        frame=topic.frame,
+        detail=_detail(topic),
+        refused=tuple(f"{count} {reason}" for reason, count in topic.refused.items()),
+    )
+
+
+def _detail(topic: Topic) -> str:
+    if topic.poses:
+        return ", ".join(" -> ".join(filter(None, pair)) for pair in list(topic.poses)[:3])
+    if topic.boxes.stamps:
+        return f"{len(topic.boxes.boxes)} boxes of {len(set(topic.boxes.labels))} labels"
+    if topic.infos:
+        info = next(iter(topic.infos.values()))
+        return f"{info.width}x{info.height} {info.distortion_model}"
+    if topic.image is not None:
+        image = topic.image
+        return str(image.format) if topic.type == COMPRESSED else f"{image.width}x{image.height} {image.encoding}"
+    return ""
+
+
+def _places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
+    places = []
+    for frame in sorted(frame for frame in tree.frames if frame.endswith("optical_frame") or frame.endswith("optical")):
+        try:
+            places.append(CameraPlace(frame, tree.chain(base, frame), tree.still(base, frame)))
+        except LogError:  # not of this robot, as far as tf tells; a camera that needs it says so in `missing`
+            continue
+    return tuple(places)

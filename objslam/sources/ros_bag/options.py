@@ -1,0 +1,41 @@
+"""What may be said of ROS messages, recorded or live, and of bags alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from objslam.sources.options import Label, Option, WithRange
+
+_TOPIC = """ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info; \
+with several cameras CAMERA.ROLE=/NAME). none: no topic. tf: the path from the transforms. May be repeated."""
+_RECTIFIED = "ROS bags, dds, rclpy: images and boxes are those of the rectified image, or not. [default: by name]"
+_CALIBRATION = "ROS bags, dds, rclpy: calibration, as in camera.yaml; several cameras below `cameras:`."
+_BASE = "ROS bags, dds, rclpy: the frame that is the robot's base."
+
+
+@dataclass(frozen=True)
+class RosOptions:
+    """What ROS messages do not say themselves, be they in a bag or live."""
+
+    topics: Annotated[tuple[str, ...], Option("--topic", _TOPIC, metavar="ROLE=/NAME")] = ()
+    camera_info: Annotated[Path | None, Option("--camera-info", _CALIBRATION)] = None
+    base_frame: Annotated[str | None, Option("--base-frame", _BASE)] = None
+    rectified: Annotated[bool | None, Option("--rectified/--raw", _RECTIFIED)] = None
+    label: Label = None
+
+
+@dataclass(frozen=True)
+class BagOptions(RosOptions):
+    """What a bag does not say itself.
+
+    Attributes:
+        extract: the folder that images go to; None: a temporary one, which is there until the program ends.
+        with_images: whether images are read at all.
+        with_range: whether depth images give the boxes their depth.
+    """
+
+    extract: Path | None = None
+    with_images: bool = True
+    with_range: WithRange = True

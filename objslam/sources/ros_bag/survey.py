@@ -1,0 +1,192 @@
+"""One pass over a recording: the times of every topic, and the contents of the topics that objslam may use.
+
+Poses, transforms, boxes and calibrations are small, so all of them are kept. Of images, the times are kept, and the first
+message of each topic.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from objslam.core.arrays import Floats, Ints
+from objslam.io.box_collector import BoxCollector
+from objslam.ros.bag.recording import Recording, read_messages
+from objslam.ros.bag.records import MAX_NAME, Connection, FileReport, frame_name
+from objslam.ros.messages.decode import DecodeError, make_decoder, read_head, read_length
+from objslam.ros.messages.detections import MAX_BOXES, WRONG_LAYOUT, find_boxes, track_number
+from objslam.ros.messages.poses import PoseRows, choose_times
+from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSES, TRANSFORMS, is_boxes
+from objslam.ros.tf.frames import MAX_TRANSFORMS
+from objslam.ros.tf.tree import TfRows
+
+_MAX_SMALL = 64 << 20  # The largest message of detections, bytes; chosen to bound the memory.
+_MAX_TOPICS = 10_000  # The most topics that are kept; chosen to bound the memory.
+_Decoder = Callable[[bytes], Any]
+_Handler = Callable[[bytes, int], None]
+
+
+@dataclass
+class Topic:
+    """What one pass learned of a topic.
+
+    logged: times of recording, ns. stamps: the header's, ns, for the types that matter. frames: frame_ids and how often, as
+    they came.
+    refused: why messages could not be used, and how many. poses: by (frame, child frame). boxes: with the tracker's names
+    and, by the index of the box, the points of tags that come without a box. infos: distinct CameraInfo messages. image:
+    the first message, decoded.
+    """
+
+    connection: Connection
+    logged: array[int] = field(default_factory=lambda: array("q"))
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    frames: Counter[str] = field(default_factory=Counter)
+    refused: Counter[str] = field(default_factory=Counter)
+    poses: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
+    boxes: BoxCollector = field(default_factory=BoxCollector)
+    tracks: dict[str, int] = field(default_factory=dict)
+    points: dict[int, Floats] = field(default_factory=dict)
+    infos: dict[bytes, Any] = field(default_factory=dict)
+    image: Any = None
+
+    @property
+    def name(self) -> str:
+        """The topic's name."""
+        return self.connection.topic
+
+    @property
+    def type(self) -> str:
+        """The type of its messages."""
+        return self.connection.type
+
+    @property
+    def frame(self) -> str:
+        """The frame_id that most messages carry, without a leading slash; "" if none does."""
+        return frame_name(max(self.frames, key=lambda frame: self.frames[frame], default=""))
+
+    def times(self) -> Ints:
+        """(N,) ns: the header's stamps; the times of recording where there are none, or all are zero."""
+        return choose_times(self.stamps, self.logged)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """All topics of a recording by name, its transforms, and how the reading of each file went."""
+
+    recording: Recording
+    topics: dict[str, Topic]
+    tf: TfRows
+    reports: tuple[FileReport, ...]
+
+
+def take_survey(recording: Recording, *, label: str = "") -> Survey:
+    """Read a recording once. label: for boxes that come without a class.
+
+    LogError where no file of it can be read. What else cannot be read or used is counted in the reports and topics.
+    """
+    topics: dict[str, Topic] = {}
+    tf = TfRows()
+    handlers: dict[int, tuple[Connection, Topic, _Handler]] = {}
+    reports: list[FileReport] = []
+    for connection, logged, data in read_messages(recording, lambda connection: True, reports):
+        entry = handlers.get(id(connection))
+        if entry is None:
+            if len(topics) >= _MAX_TOPICS and connection.topic not in topics:
+                reports[-1].damage(f"messages of topics beyond the first {_MAX_TOPICS}", 1)
+                continue
+            topic = topics.setdefault(connection.topic, Topic(connection))
+            entry = handlers[id(connection)] = connection, topic, _make_handler(connection, topic, tf, label)
+        _, topic, handle = entry
+        topic.logged.append(logged)
+        try:
+            handle(data, logged)
+        except DecodeError as error:
+            topic.refused[str(error)] += 1
+    return Survey(recording, topics, tf, tuple(reports))
+
+
+def _make_handler(connection: Connection, topic: Topic, tf: TfRows, label: str) -> _Handler:
+    """What is done with each message of a connection."""
+    kind = connection.type
+    makers = {ODOMETRY: _add_pose, CAMERA_INFO: _add_info, IMAGE: _add_image, COMPRESSED: _add_image}
+    makers |= dict.fromkeys(POSES, _add_pose)
+    if not (kind in makers or kind in TRANSFORMS or is_boxes(kind)):
+        return lambda data, logged: None
+    if kind != topic.type:
+        return partial(_refuse, f"of type {kind}, the topic's first was {topic.type}")
+    try:
+        decode = make_decoder(connection)
+    except DecodeError as error:
+        return partial(_refuse, str(error))
+    if kind in TRANSFORMS:
+        return partial(_add_transforms, connection, decode, tf)
+    if is_boxes(kind):
+        return partial(_add_boxes, connection, topic, decode, label)
+    return partial(makers[kind], connection, topic, decode)
+
+
+def _refuse(reason: str, data: bytes, logged: int) -> None:
+    raise DecodeError(reason)
+
+
+def _note_header(connection: Connection, topic: Topic, data: bytes) -> None:
+    stamp, frame, _ = read_head(data, connection.encoding)
+    topic.stamps.append(stamp)
+    topic.frames[frame[:MAX_NAME]] += 1
+
+
+def _add_pose(connection: Connection, topic: Topic, decode: _Decoder, data: bytes, logged: int) -> None:
+    _note_header(connection, topic, data)
+    message = decode(data)
+    child = message.child_frame_id if connection.type == ODOMETRY else ""
+    names = frame_name(message.header.frame_id[:MAX_NAME]), frame_name(child[:MAX_NAME])
+    rows = topic.poses.get(names)
+    if rows is None:
+        rows = topic.poses[names] = PoseRows()
+    pose = message.pose if connection.type == POSES[0] else message.pose.pose
+    rows.add(topic.stamps[-1], logged, pose.position, pose.orientation)
+
+
+def _add_transforms(connection: Connection, decode: _Decoder, tf: TfRows, data: bytes, logged: int) -> None:
+    if read_length(data, connection.encoding) > MAX_TRANSFORMS:
+        raise DecodeError(f"more than {MAX_TRANSFORMS} transforms in one message")
+    for transform in decode(data).transforms:
+        tf.add(transform, logged, connection.topic.endswith("tf_static"))
+
+
+def _add_info(connection: Connection, topic: Topic, decode: _Decoder, data: bytes, logged: int) -> None:
+    _note_header(connection, topic, data)
+    body = data[12:]  # all but the stamp: the calibration, and the frame it is for
+    if body not in topic.infos:
+        info = decode(data)
+        if len(topic.infos) < 2:
+            topic.infos[body] = info
+
+
+def _add_image(connection: Connection, topic: Topic, decode: _Decoder, data: bytes, logged: int) -> None:
+    _note_header(connection, topic, data)
+    if topic.image is None:
+        topic.image = decode(data)
+
+
+def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: str, data: bytes, logged: int) -> None:
+    number = read_head(data, connection.encoding)[2]
+    if number > MAX_BOXES:
+        raise DecodeError(f"more than {MAX_BOXES} detections in one message")
+    if len(data) > _MAX_SMALL:
+        raise DecodeError(f"a message of more than {_MAX_SMALL >> 20} MiB")
+    try:
+        found = list(find_boxes(connection.type, decode(data)))
+    except WRONG_LAYOUT as error:
+        raise DecodeError(f"not laid out as detections are ({error})") from error
+    _note_header(connection, topic, data)
+    place = f"{topic.name} at {logged / 1e9:.3f} s"
+    topic.boxes.add_frame(logged / 1e9, place)
+    for box, name, score, track, points in found:
+        if points is not None:
+            topic.points[len(topic.boxes.boxes)] = points
+        topic.boxes.add_box(box, name or label, score, place, track_id=track_number(track, topic.tracks))

@@ -1,0 +1,80 @@
+"""Which topic of a recording plays which role, by type and content."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from objslam.core.diagnostics import Ledger
+from objslam.errors import ConfigError
+from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, is_boxes
+from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, Choices, warn_of_choice
+from objslam.sources.ros_bag.survey import Survey, Topic
+
+_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings that only depth images have; mono16 is one of grey images too.
+
+
+def check_choices(choices: Choices, survey: Survey) -> None:
+    """ConfigError where a topic that was chosen is not in a recording, or cannot play its role."""
+    for (camera, role), names in choices.names.items():
+        for name in names:
+            if name == NONE or (name == TF and role in FROM_TF):
+                continue
+            fitting = candidates(survey, role)
+            if name not in survey.topics or survey.topics[name] not in fitting:
+                text = f"{camera}.{role}={name}" if camera else f"{role}={name}"
+                what = "is not in the bag" if name not in survey.topics else f"has the type {survey.topics[name].type}"
+                listed = ", ".join(topic.name for topic in fitting[:LISTED]) or "none"
+                raise ConfigError(f"--topic {text}: {name} {what}", hint=f"topics that fit {role}: {listed}")
+
+
+@dataclass(frozen=True)
+class TopicPool:
+    """The topics of a recording, and what a user chose of them."""
+
+    survey: Survey
+    choices: Choices
+    ledger: Ledger
+
+    def fitting(self, role: str) -> list[Topic]:
+        """The topics that may play a role, those that a user chose for any camera, else all."""
+        names = self.choices.of(role)
+        return [topic for topic in candidates(self.survey, role) if not names or topic.name in names]
+
+    def choose(self, role: str, fitting: Sequence[Topic], camera: str = "") -> Topic | None:
+        """The topic of a role: the one chosen for the camera, else the first that fits, with a warning if several do."""
+        names = self.choices.names.get((camera, role))
+        if names:
+            return None if names[0] in (NONE, TF) else self.survey.topics[names[0]]
+        if len(fitting) > 1:
+            full = f"{camera}.{role}" if camera else role
+            warn_of_choice(self.ledger, full, fitting[0].name, (topic.name for topic in fitting[1:]))
+        return fitting[0] if fitting else None
+
+
+def candidates(survey: Survey, role: str) -> list[Topic]:
+    """The topics that may play a role, those with short names first: they have messages of a fitting type to show."""
+    topics = sorted(survey.topics.values(), key=lambda topic: (len(topic.name), topic.name))
+    return [topic for topic in topics if _fits(topic, role)]
+
+
+def is_depth(topic: Topic) -> bool:
+    """Whether an image topic carries depth."""
+    if topic.image is None:
+        return "depth" in topic.name.lower()
+    if topic.type == COMPRESSED:
+        return "compresseddepth" in topic.image.format.replace(" ", "").lower()
+    encoding = topic.image.encoding.lower()
+    return encoding in _DEPTH_ENCODINGS or (encoding == "mono16" and "depth" in topic.name.lower())
+
+
+def _fits(topic: Topic, role: str) -> bool:
+    if role == "odometry":
+        return topic.type == ODOMETRY and bool(topic.poses)
+    if role == "localization":
+        return (topic.type == ODOMETRY or topic.type in POSES) and bool(topic.poses)
+    if role == "detections":
+        return is_boxes(topic.type) and bool(topic.boxes.stamps)
+    if role == "camera_info":
+        return topic.type == CAMERA_INFO and bool(topic.infos)
+    return topic.type in IMAGES and topic.image is not None and is_depth(topic) == (role == "depth")

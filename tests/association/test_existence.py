@@ -1,0 +1,269 @@
+"""What was seen and what should have been, how large things are, and what the counts say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from association_scenes import drive, rays_of_boxes, watch
+from scipy.special import comb
+from scipy.stats import betabinom
+
+from objslam.association.existence import (
+    Rates,
+    _beta_binomial,
+    chance_odds,
+    detection_rates,
+    existence,
+    prior_odds,
+    rest_odds,
+    size_odds,
+)
+from objslam.association.landmarks import Landmarks, State
+from objslam.association.merging import overlap
+from objslam.association.nearest_neighbour import associate_by_label
+from objslam.association.observations import extents, observe
+from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Association
+from objslam.simulation import DriveSettings, make_camera
+from objslam.simulation.scene import EXTENTS
+
+
+def straight(count=80):
+    """Sideways past the origin, looking along x."""
+    return lift_se2(np.column_stack([np.zeros(count), np.linspace(-1.2, 1.2, count), np.zeros(count)]))
+
+
+def state_of(scene, rays=None, whose=None):
+    """The true state of a scene."""
+    rays = scene.rays if rays is None else rays
+    whose = scene.whose if whose is None else whose
+    poses = scene.keyframes.map_T_camera
+    obs, ray, _ = observe(rays, scene.keyframes, scene.cameras, poses, rays.sigma, 0.0)
+    landmarks = Landmarks.new(scene.points, np.ones(len(scene.points)), scene.label, len(rays.label_names))
+    view = CameraFrames(scene.keyframes.stamps, scene.cameras, scene.keyframes.camera, poses, 0.0, 0.0)
+    return State(obs, view, landmarks, whose[ray])
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        make_camera(distortion=(-0.2, 0.05, 0.0, 0.0, 0.0)),
+        make_camera(distortion_model="equidistant", distortion=(0.0, 0.0, 0.0, 0.0), focal=300.0, pitch=-0.1),
+    ],
+    ids=["plumb_bob", "fisheye"],
+)
+def test_what_is_always_detected_is_expected_where_it_is_seen(camera):
+    settings = DriveSettings(objects=8, classes=8, frames=200, cameras=(camera,), max_range=4.0)
+    scene = drive(settings, 1)
+    seen = state_of(scene).history
+    assert (seen.seen == np.bincount(scene.whose, minlength=8)).all()
+    assert (seen.seen >= 0.9 * seen.expected).all()  # but for the edge of the image and of the range
+
+
+def test_what_the_cameras_see_on_average():
+    pinhole, around = make_camera(), make_camera("up", distortion_model="equidistant", distortion=(0.0,) * 4, focal=200.0)
+    around = replace(around, width=1000, height=1000, matrix=np.array([[200.0, 0, 499.5], [0, 200, 499.5], [0, 0, 1]]))
+    half = np.array([640, 480]) / 2 / 460
+    flat = 4 * np.arctan(half.prod() / np.sqrt(1 + (half**2).sum()))
+
+    def seen(camera):
+        frames = np.array(camera)
+        return CameraFrames(np.arange(4.0), (pinhole, around), frames, np.tile(np.eye(4), (4, 1, 1)), 0.0, 0.0).solid_angle
+
+    assert seen([0, 0, 0, 0]) == pytest.approx(flat, rel=1e-12)
+    assert seen([1, 1, 1, 1]) == pytest.approx(2 * np.pi, rel=1e-12)  # a fisheye of 180 degrees: the half sphere
+    assert seen([0, 1, 0, 0]) == pytest.approx((3 * flat + 2 * np.pi) / 4, rel=1e-12)
+
+
+def test_misses_are_counted():
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.4, 0.3]]), straight(), missed=0.4, seed=2)
+    seen = state_of(scene).history
+    inside = [int((np.abs(camera_pixels(scene, j) - 319.5) < 300).sum()) for j in range(2)]
+    assert np.abs(seen.expected - inside).max() <= 6
+    assert abs((seen.seen / seen.expected).mean() - 0.6) < 0.1
+
+
+def camera_pixels(scene, j):
+    local = inverse(scene.keyframes.map_T_camera)
+    point = local[:, :3, :3] @ scene.points[j] + local[:, :3, 3]
+    return 460 * point[:, 0] / point[:, 2] + 319.5
+
+
+def test_what_a_closer_box_hides_is_not_missed():
+    points = np.array([[3.0, 0.0, 0.3], [1.2, 0.0, 0.3], [2.9, 0.5, 0.3]])
+    scene = watch(points, straight(), label=np.array([0, 1, 0]), names=("cup", "screen"))
+    wide = scene.rays.box.copy()
+    wide[scene.whose == 1] += [-60, -60, 60, 60]
+    state = state_of(scene, replace(scene.rays, box=wide))
+    obs, label, position = state.obs, scene.label, state.landmarks.position
+    # the cup is detected where the screen is not in the way
+    free = np.abs(camera_pixels(scene, 0) - camera_pixels(scene, 1)) > 80
+    visible = free[obs.frame] | (state.matched != 0)
+    matched = np.where(visible, state.matched, -1)
+    hidden = detection_history(obs, matched, position, label, state.view)
+    screenless = np.where(obs.label == 1, -1, matched)
+    missed = detection_history(obs, screenless, position, label, state.view)
+    assert missed.expected[0] - hidden.expected[0] > 0.5 * (~free).sum()
+    assert hidden.seen[0] == missed.seen[0]
+
+
+def test_boxes_hide_alike_in_frames_of_few_and_of_many():
+    scene, rng = watch(np.array([[2.0, 0.0, 0.3]]), straight()), np.random.default_rng(0)
+    frame = np.sort(rng.integers(0, 80, 900) ** 2 // 80)  # 1 to 100 in a frame
+    corner = rng.uniform(0, 330, (900, 2))
+    boxes = rays_of_boxes(
+        frame, np.hstack([corner, corner + 100]), np.zeros(900, dtype=np.int64), scene.cameras[0], ("cup",)
+    )
+    s, _, _ = observe(boxes, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, boxes.sigma, 0.0)
+    reach = np.where(rng.random(900) < 0.1, np.nan, rng.uniform(0.5, 4.0, 900))
+    place, pixel, away = np.repeat(np.arange(80), 3), rng.uniform(50, 380, (240, 2)), rng.uniform(0.5, 4.0, 240)
+    middle, half = (s.box[:, :2] + s.box[:, 2:]) / 2, 0.3 * (s.box[:, 2:] - s.box[:, :2])
+    closer = reach < (away - np.maximum(0.3, 0.1 * away))[:, None]
+    over = closer & (np.abs(pixel[:, None] - middle) <= half).all(axis=2) & (s.frame == place[:, None])
+    np.testing.assert_array_equal(_hidden(place, away, pixel, s, reach), over.any(axis=1))
+    assert 20 < over.any(axis=1).sum() < 220
+
+
+def test_misses_from_behind_say_nothing_of_what_has_a_front():
+    angle = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    poses = lift_se2(np.column_stack([2 * np.cos(angle), 2 * np.sin(angle), angle + np.pi]))
+    scene = watch(np.array([[0.0, 0.0, 0.4]]), poses)
+    state = state_of(scene)
+    frame = state.obs.frame
+    front = np.cos(angle[frame]) > 0.3
+    one_side = replace(state, matched=np.where(front, 0, -1)).history
+    assert one_side.expected[0] <= 62
+    everywhere = replace(state, matched=np.where(front | (frame % 10 == 0), 0, -1)).history
+    assert everywhere.expected[0] >= 110
+
+
+def test_beta_binomial_by_scipy():
+    seen, expected = np.array([0, 3, 7, 20]), np.array([5, 9, 7, 30])
+    rate, concentration = 0.3, 8.0
+    whole = betabinom.logpmf(seen, expected, rate * concentration, (1 - rate) * concentration)
+    one = whole - np.log(comb(expected, seen))
+    np.testing.assert_allclose(_beta_binomial(seen, expected, np.full(4, rate), concentration), one)
+
+
+def counted(seen, expected):
+    """A history with that many detections in that many frames."""
+    obj = np.repeat(np.arange(len(seen)), expected)
+    frame = np.concatenate([np.arange(n) for n in expected])
+    return DetectionHistory(obj, frame, frame < np.repeat(seen, expected), np.array(expected))
+
+
+def test_rates_are_those_of_most_boxes_and_phantoms_fall_out():
+    rng = np.random.default_rng(0)
+    expected = np.full(24, 60)
+    seen = np.append(rng.binomial(60, 0.6, 20), [5, 6, 3, 4])
+    label = np.zeros(24, dtype=np.int64)
+    rates = detection_rates(counted(seen, expected), label, 1)
+    assert abs(rates.mean[0] - 0.6) < 0.05
+    odds = rates.log_odds(counted(seen, expected), label)
+    assert (odds[:20] > 2).all()
+    assert (odds[20:] < -1).all()
+
+
+def test_where_rates_differ_a_low_one_is_no_proof():
+    seen, expected = np.array([54, 42, 30, 24, 18, 57]), np.full(6, 60)
+    label = np.zeros(6, dtype=np.int64)
+    rates = detection_rates(counted(seen, expected), label, 1)
+    assert (rates.log_odds(counted(seen, expected), label) > 0).all()
+    assert isinstance(rates, Rates)
+    assert rates.concentration <= 5
+
+
+def test_more_rays_and_fewer_strays_are_less_like_chance():
+    points = np.array([[2.0, 0.2, 0.4]])
+    scene = watch(points, straight())
+    state = state_of(scene)
+    odds = []
+    for keep in (3, 5, 40):
+        few = (np.cumsum(state.matched == 0) <= keep) & (state.matched == 0)
+        odds.append(chance_odds(replace(state, obs=state.obs.take(few), matched=state.matched[few]), 13.8)[0])
+    assert odds[0] < odds[1] <= odds[2]
+    rng = np.random.default_rng(0)
+    frame, centre = np.sort(rng.integers(0, 80, 4000)), rng.uniform(30, 450, (4000, 2))
+    box, label = np.column_stack([centre - 9, centre + 9]), np.zeros(4000, dtype=np.int64)
+    strays = rays_of_boxes(frame, box, label, scene.cameras[0], ("cup",), 4.0)
+    many, ray, _ = observe(strays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, strays.sigma, 0.0)
+    to = points[0] - many.origin
+    near = np.linalg.norm(np.cross(to, many.direction), axis=1) < 3.7 * many.sigma * np.linalg.norm(to, axis=1)
+    chance = replace(state, obs=many, matched=np.where(near, 0, -1))
+    assert near.sum() >= 3
+    assert chance_odds(chance, 13.8)[0] < 0
+    assert len(ray) == 4000
+
+
+def test_priors_and_sizes():
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.4, 0.3]]), straight())
+    state = state_of(scene)
+    obs = state.obs
+    np.testing.assert_allclose(prior_odds(state), np.log(3.0))
+    most_free = replace(state, matched=np.where(obs.frame % 10 == 0, state.matched, -1))
+    assert (prior_odds(most_free) < -1).all()
+    np.testing.assert_allclose(size_odds(state), 0.0)
+    large = np.where((state.matched == 1)[:, None], obs.size * 8, obs.size)
+    thrice = np.concatenate([large, obs.size[state.matched == 0]])  # the first one has most boxes
+    assert len(thrice) > len(large)
+    half = np.where((obs.frame % 2 > 0) | (state.matched == 0), state.matched, -1)
+    odds = size_odds(replace(state, obs=replace(obs, size=large), matched=half))
+    assert odds[0] == 0
+    assert odds[1] < -2
+
+
+def test_what_moves_is_told_from_what_rests():
+    count = 60
+    poses = straight(count)
+    resting = watch(np.array([[2.0, 0.1, 0.4]]), poses, pixel_sigma=3.0, seed=3)
+    state = state_of(resting)
+    obs = state.obs
+    assert rest_odds(state)[0] > -1
+    way = np.linspace(-0.3, 0.3, count)[obs.frame, None] * np.array([0.0, 0.0, 1.0])  # it is lifted
+    turned = obs.direction + way / np.linalg.norm(scene_to(resting, obs), axis=1, keepdims=True)
+    moving = replace(obs, direction=turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    assert rest_odds(replace(state, obs=moving))[0] < -5
+
+
+def scene_to(scene, obs):
+    return scene.points[0] - obs.origin
+
+
+def test_extents_are_those_of_the_things():
+    scene = drive(DriveSettings(objects=6, frames=150), 0)
+    association = associate_by_label(scene.rays)
+    positions = scene.points[[int(np.flatnonzero(scene.label == label)[0]) for label in association.label]]
+    poses = scene.keyframes.map_T_camera
+    found = extents(scene.rays, association, positions, poses, scene.keyframes, scene.cameras)
+    true = np.array([EXTENTS[scene.rays.label_names[label]] for label in association.label])
+    np.testing.assert_allclose(found, true, rtol=0.02)
+    rng = np.random.default_rng(0)
+    torn = scene.rays.box.copy()
+    some = rng.random(len(torn)) < 0.3
+    torn[some, 2:] += rng.uniform(50, 300, (int(some.sum()), 2))
+    again = extents(replace(scene.rays, box=torn), association, positions, poses, scene.keyframes, scene.cameras)
+    np.testing.assert_allclose(again, true, rtol=0.02)
+    blind = tuple(replace(camera, sees_size=False) for camera in scene.cameras)
+    assert np.isnan(extents(scene.rays, association, positions, poses, scene.keyframes, blind)).all()
+    nobody = Association(np.full(len(scene.rays), -1), np.zeros(1, dtype=np.int64))
+    assert np.isnan(extents(scene.rays, nobody, np.zeros((1, 3)), poses, scene.keyframes, scene.cameras)).all()
+
+
+def test_what_follows_from_a_state_is_computed_once(monkeypatch):
+    state = state_of(watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.4, 0.3]]), straight()))
+    asked = []
+    monkeypatch.setattr(
+        "objslam.association.landmarks.detection_history", lambda *given: asked.append(given) or detection_history(*given)
+    )
+    assert (existence(state, 13.8) == existence(state, 13.8)).all()
+    assert len(asked) == 1
+    assert state.keep(np.ones(2, dtype=bool)) is state
+    assert existence(state.keep(np.array([True, False])), 13.8).shape == (1,)
+    assert len(asked) == 2
+
+
+def test_overlap_of_boxes():
+    a = np.array([[0, 0, 10, 10], [0, 0, 10, 10], [0, 0, 10, 10], [5, 5, 5, 5]], dtype=float)
+    b = np.array([[0, 0, 10, 10], [5, 0, 15, 10], [20, 20, 30, 30], [5, 5, 5, 5]], dtype=float)
+    np.testing.assert_allclose(overlap(a, b), [1, 1 / 3, 0, 0])

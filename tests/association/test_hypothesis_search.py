@@ -1,0 +1,94 @@
+"""The search for points that rays agree on, and their refinement, against direct formulas."""
+
+import numpy as np
+import torch
+from association_scenes import rays_of_boxes, watch
+from scipy.optimize import least_squares
+
+from objslam.association.hypothesis_search import Search, _Scorer, discover
+from objslam.association.observations import observe
+from objslam.association.refinement import refine
+from objslam.core.geometry import lift_se2
+
+SEARCH = Search(hypotheses=256, support=3.0, gate=13.8, parallax=np.radians(2), device="cpu")
+
+
+def circle(count, radius=2.0):
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return lift_se2(np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + np.pi]))
+
+
+def observed(scene, rays=None, position_sigma=0.0):
+    rays = scene.rays if rays is None else rays
+    return observe(rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, rays.sigma, position_sigma)[0]
+
+
+THREE = np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.1, -0.5, 0.5]])
+
+
+def test_supports_and_their_sums_over_frames_by_the_plain_formula():
+    obs = observed(watch(THREE, circle(40), pixel_sigma=3.0), position_sigma=0.01)
+    rng = np.random.default_rng(0)
+    points = np.concatenate([THREE, rng.uniform(-1, 1, (20, 3))])
+    scorer = _Scorer(obs, SEARCH)
+    support = scorer.supports(scorer.load(points))
+    to = points[:, None] - obs.origin
+    depth = np.einsum("hrj,rj->hr", to, obs.direction)
+    offset2 = (to**2).sum(axis=2) - depth**2
+    plain = np.clip(1 - offset2 / (SEARCH.gate * ((obs.sigma * depth) ** 2 + obs.position_sigma**2)), 0, 1) * (depth > 0)
+    best = np.zeros((len(points), 40))
+    np.maximum.at(best, (slice(None), obs.frame), plain)
+    np.testing.assert_allclose(scorer.per_frame(support).numpy(), best.sum(axis=1), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(support.sum(dim=1).numpy(), plain.sum(axis=1), rtol=1e-3, atol=1e-3)
+
+
+def test_points_are_found_among_three_times_as_many_strays():
+    scene = watch(THREE, circle(60), pixel_sigma=2.0)
+    rng = np.random.default_rng(1)
+    frame = np.sort(rng.integers(0, 60, 540))
+    centre = rng.uniform([20, 20], [620, 460], (540, 2))
+    box = np.column_stack([centre - 10, centre + 10])
+    strays = rays_of_boxes(frame, box, np.zeros(540, dtype=np.int64), scene.cameras[0], ("cup",), 2.0)
+    both = {k: np.concatenate([v, vars(strays)[k]]) for k, v in vars(scene.rays).items() if k != "label_names"}
+    rays = type(strays)(**both, label_names=("cup",))
+    found = discover(observed(scene, rays), SEARCH, np.random.default_rng(0))
+    gaps = np.linalg.norm(found[:3, None] - THREE, axis=2)
+    assert sorted(gaps.argmin(axis=1)) == [0, 1, 2]
+    assert gaps.min(axis=1).max() < 0.02
+
+
+def test_threads_are_given_back():
+    before = torch.get_num_threads()
+    discover(observed(watch(THREE, circle(20))), SEARCH, np.random.default_rng(0))
+    assert torch.get_num_threads() == before
+
+
+def test_refinement_is_the_least_of_the_robust_angles():
+    scene = watch(THREE, circle(50), pixel_sigma=3.0)
+    obs = observed(scene)
+    index = np.argmin([np.linalg.norm(np.cross(p - obs.origin, obs.direction), axis=1) for p in THREE], axis=0)
+    fitted = refine(obs, np.arange(len(obs)), index, THREE + 0.05, np.ones(3))
+    for j, point in enumerate(fitted):
+        mine = index == j
+
+        def residuals(p, mine=mine):
+            to = p - obs.origin[mine]
+            depth = np.einsum("rj,rj->r", to, obs.direction[mine])
+            offset = to - depth[:, None] * obs.direction[mine]
+            size = np.linalg.norm(offset, axis=1) / (obs.sigma[mine] * np.linalg.norm(to, axis=1))
+            return np.sqrt(6 * np.log1p(size**2 / 6))  # Cauchy's loss of the whole deviation, not of each axis
+
+        best = least_squares(residuals, THREE[j], xtol=1e-14, ftol=1e-14)
+        assert np.linalg.norm(point - best.x) < 2e-3
+        assert np.linalg.norm(point - THREE[j]) < 0.01
+
+
+def test_a_point_stays_along_a_direction_that_its_rays_do_not_fix():
+    scene = watch(np.array([[2.0, 0.1, 0.4]]), np.broadcast_to(np.eye(4), (30, 4, 4)).copy())
+    obs = observed(scene)
+    start = np.array([[3.0, 0.2, 0.5]])
+    fitted = refine(obs, np.arange(len(obs)), np.zeros(len(obs), dtype=np.int64), start, np.ones(1))
+    eye = obs.origin[0]
+    assert abs(np.linalg.norm(fitted[0] - eye) - np.linalg.norm(start[0] - eye)) < 0.05
+    mean = obs.direction.mean(axis=0)
+    assert np.degrees(np.arccos((fitted[0] - eye) @ mean / np.linalg.norm(fitted[0] - eye) / np.linalg.norm(mean))) < 0.05

@@ -1,0 +1,774 @@
+"""The command line as a user meets it: what it prints, what it leaves, and how it fails."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from small_log import THINGS, small_log
+from waiting import LIMIT, pause, wait_for
+
+from objslam import __version__
+from objslam.cli import main
+from objslam.config import Settings
+from objslam.results.read import load_map, load_trajectory
+from objslam.simulation.trajectory import START
+from objslam.sources.log_folder import write_log_folder
+
+LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
+MODES = ("fixed", "joint")
+SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
+
+
+@dataclass(frozen=True)
+class Call:
+    code: int
+    out: str
+    err: str
+
+    def says(self, *words: str) -> None:
+        """One line on stderr with all the words, no traceback."""
+        assert len(self.err.strip().splitlines()) == 1, self.err
+        self.says_somewhere(*words)
+
+    def says_somewhere(self, *words: str) -> None:
+        assert "Traceback" not in self.err
+        assert "internal error" not in self.err
+        assert "Warning" not in self.err
+        for word in words:
+            assert word in self.err, self.err
+
+
+@pytest.fixture
+def objslam(capsys, monkeypatch):
+    """The entry point of the console script, in this process."""
+
+    def call(*arguments) -> Call:
+        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        captured = capsys.readouterr()
+        return Call(exit_.value.code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def log_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs") / "small"
+    write_log_folder(small_log(), folder)
+    return folder
+
+
+@pytest.fixture
+def variant(log_folder, tmp_path):
+    """A copy of the log to be spoilt."""
+    return Path(shutil.copytree(log_folder, tmp_path / "log"))
+
+
+def in_process_of_its_own(*arguments) -> Call:
+    done = subprocess.run([SCRIPT, *map(str, arguments)], capture_output=True, text=True, timeout=LIMIT, check=False)
+    return Call(done.returncode, done.stdout, done.stderr)
+
+
+def rewrite(file: Path, change) -> None:
+    """Every line but comments through change(number, line), None leaves a line out."""
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+    changed = [change(i, line) for i, line in enumerate(lines)]
+    file.write_text("".join(f"{line}\n" for line in changed if line is not None))
+
+
+def rewrite_frames(folder: Path, change) -> None:
+    def on_line(i, line):
+        frame = change(i, json.loads(line))
+        return None if frame is None else json.dumps(frame)
+
+    rewrite(folder / "detections.jsonl", on_line)
+
+
+def both_paths(folder: Path):
+    return folder / "odometry.txt", folder / "localization.txt"
+
+
+def summary(out: Path) -> dict:
+    return json.loads((out / "summary.json").read_text())
+
+
+# What it is for
+
+
+def test_the_console_script_runs_evaluates_and_leaves_a_whole_result(log_folder, tmp_path):
+    out = tmp_path / "deep" / "out"
+    run = in_process_of_its_own("run", log_folder, "-o", out)
+    assert run.code == 0, run.err
+    assert "tall chair" in run.out
+    assert "4 objects (0 unresolved)" in run.out
+    names = {"objects.json", "trajectory.txt", "rays.parquet", "summary.json", "config.yaml", "map.png", "recording.rrd"}
+    assert names | {"groundtruth_objects.json", "groundtruth_trajectory.txt"} == {f.name for f in out.iterdir()}
+    assert all(f.stat().st_size > 0 for f in out.iterdir())
+    evaluated = in_process_of_its_own("eval", out)
+    assert evaluated.code == 0, evaluated.err
+    assert "position RMSE" in evaluated.out
+    found = json.loads((out / "evaluation.json").read_text())
+    assert (found["matched"], found["missed"], found["false"]) == (4, 0, 0)
+    assert found["position_max"] < 0.03
+    assert found["ate"] < 0.04
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_run_finds_the_things(mode, objslam, log_folder, tmp_path):
+    run = objslam("run", log_folder, "-o", tmp_path, "--mode", mode, *LEAN)
+    assert run.code == 0
+    place = {o.label: o.position for o in load_map(tmp_path).objects}
+    assert place.keys() == {label for label, _ in THINGS}
+    for label, position in THINGS:
+        assert np.linalg.norm(place[label] - position) < 0.05
+    counts = summary(tmp_path)["counts"]
+    assert counts["objects"] == 4
+    assert counts["keyframes"] == len(load_trajectory(tmp_path)) == 80
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["mode"] == mode
+    assert f"{mode} mode" in run.out
+
+
+def test_settings_come_from_file_then_set_then_mode(objslam, log_folder, tmp_path):
+    config = tmp_path / "mine.yaml"
+    config.write_text(
+        "mode: joint\nrays: {pixel_sigma: 2.5}\njoint: {loss: cauchy}\noutput: {recording: false, picture: false}\n"
+    )
+    assert objslam("run", log_folder, "-o", tmp_path / "out", "--config", config, "--set", "joint.loss=gnc").code == 0
+    told = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())
+    assert (told["mode"], told["rays"]["pixel_sigma"], told["joint"]["loss"]) == ("joint", 2.5, "gnc")
+    # what a run wrote is what another can be run with
+    again = objslam("run", log_folder, "-o", tmp_path / "again", "--config", tmp_path / "out" / "config.yaml")
+    assert again.code == 0
+    assert (tmp_path / "again" / "objects.json").read_bytes() == (tmp_path / "out" / "objects.json").read_bytes()
+
+
+def test_a_converted_log_gives_the_same_map(objslam, log_folder, tmp_path):
+    converted = objslam("convert", log_folder, tmp_path / "copy")
+    assert converted.code == 0
+    assert "wrote" in converted.out
+    for log, out in ((log_folder, "a"), (tmp_path / "copy", "b")):
+        assert objslam("run", log, "-o", tmp_path / out, *LEAN).code == 0
+    a, b = (load_map(tmp_path / out).objects for out in "ab")
+    assert [(o.label, o.rays, o.status) for o in a] == [(o.label, o.rays, o.status) for o in b]
+    for mine, its in zip(a, b, strict=True):  # rotations are quaternions on disk, which round differently once more
+        np.testing.assert_allclose(mine.position, its.position, atol=1e-9)
+        np.testing.assert_allclose(mine.covariance, its.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_convert_never_writes_over_anything_unasked(objslam, log_folder, variant, tmp_path):
+    objslam("convert", log_folder, variant).says("log", "already")
+    assert objslam("convert", log_folder, variant, "--overwrite").code == 0
+    (tmp_path / "file").write_text("x")
+    failed = objslam("convert", log_folder, tmp_path / "file", "--overwrite")
+    failed.says("in the way")
+    assert failed.code == 1
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("x")
+    objslam("convert", log_folder, tmp_path / "photos", "--overwrite").says("no log")
+
+
+def test_info_of_a_log_folder(objslam, log_folder, variant):
+    info = objslam("info", log_folder)
+    assert (info.code, info.err) == (0, "")
+    for words in ("small: log", "odometry", "detections", "640x480", "nothing is missing for a run"):
+        assert words in info.out
+    (variant / "detections.jsonl").unlink()
+    assert "no detections; and no images either" in objslam("info", variant).out
+
+
+def test_config_dump_is_what_config_reads(objslam, tmp_path):
+    dumped = objslam("config", "dump", "--set", "joint.loss=l1", "--set", "poses.max_gap=3")
+    assert dumped.code == 0
+    file = tmp_path / "all.yaml"
+    file.write_text(dumped.out)
+    assert objslam("config", "dump", "--config", file).out == dumped.out
+    told = yaml.safe_load(dumped.out)
+    assert (told["joint"]["loss"], told["poses"]["max_gap"]) == ("l1", 3.0)
+    assert Settings.model_validate(yaml.safe_load(objslam("config", "dump").out)) == Settings()
+
+
+def test_demo(objslam, tmp_path):
+    demo = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
+    assert demo.code == 0, demo.err
+    assert demo.out.count("position RMSE") == 2
+    for mode in MODES:
+        out = tmp_path / "demo" / mode
+        assert (out / "map.png").is_file()
+        found = json.loads((out / "evaluation.json").read_text())
+        assert found["recall"] > 0.8
+        assert found["position_median"] < 0.1
+    assert objslam("run", tmp_path / "demo" / "log", "-o", tmp_path / "again", *LEAN).code == 0
+    assert objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1).code == 0  # over the demo before
+
+
+def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
+    shutil.copytree(log_folder, tmp_path / "log")
+    demo = objslam("demo", "-o", tmp_path, "--boxes")
+    assert demo.code == 1
+    demo.says("no demo made", "-o")
+    assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
+
+
+def test_demo_from_images(objslam, tmp_path):
+    """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
+    demo = objslam("demo", "-o", tmp_path / "demo")
+    assert demo.code == 0, demo.err
+    for mode, bar in (("fixed", 0.05), ("joint", 0.10)):
+        found = json.loads((tmp_path / "demo" / mode / "evaluation.json").read_text())
+        assert (found["matched"], found["missed"], found["false"]) == (7, 0, 0)
+        assert found["position_rmse"] <= bar
+        assert (tmp_path / "demo" / mode / "detections.jsonl").is_file()
+
+
+def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_path):
+    assert objslam("run", log_folder, "-o", tmp_path, *LEAN).code == 0
+    values = []
+    for truth in (log_folder, log_folder / "groundtruth", log_folder / "groundtruth" / "objects.json"):
+        assert objslam("eval", tmp_path, "--truth", truth, "--align", "se2", "--radius", "0.3").code == 0
+        found = json.loads((tmp_path / "evaluation.json").read_text())
+        assert (found["align"], found["radius"], found["matched"]) == ("se2", 0.3, 4)
+        values.append(found["position_rmse"])
+    assert values[0] == pytest.approx(values[1])
+    assert (json.loads((tmp_path / "evaluation.json").read_text())["ate"]) is None  # objects.json has no path
+
+
+# How it answers at once
+
+
+@pytest.mark.parametrize(
+    "command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("info",), ("export",), ("config",), ("config", "dump")]
+)
+def test_help(objslam, command):
+    help_ = objslam(*command, "--help")
+    assert help_.code == 0
+    assert "Usage" in help_.out
+    assert not help_.err
+
+
+def test_no_arguments_show_help_and_the_version_is_told(objslam):
+    bare = objslam()
+    assert "Commands" in bare.out
+    assert bare.code == 2
+    version = objslam("--version")
+    assert (version.code, version.out) == (0, f"objslam {__version__}\n")
+    assert in_process_of_its_own("--version").out == version.out
+    module = subprocess.run([sys.executable, "-m", "objslam", "--version"], capture_output=True, text=True, check=True)
+    assert module.stdout == version.out
+
+
+def imported_by(*arguments: str) -> set[str]:
+    """The packages that a command imports, in a process of its own."""
+    code = (
+        "import sys\n"
+        "from objslam.cli import main\n"
+        f"sys.argv = ['objslam', *{arguments!r}]\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0, end.code\n"
+        "print('modules:', *sorted({name.partition('.')[0] for name in sys.modules}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.splitlines()[-1].split()[1:])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--help",),
+        *((name, "--help") for name in ("run", "convert", "info", "live", "export")),
+        ("config", "dump"),
+        ("--version",),
+    ],
+)
+def test_answers_import_nothing_heavy(arguments):
+    """Sources declare their options where nothing heavy is imported: see the head of `objslam/sources/options.py`."""
+    heavy = {"torch", "gtsam", "open3d", "onnxruntime", "rerun", "cv2", "matplotlib", "scipy", "pyarrow", "numpy"}
+    heavy |= {"rosbags", "mcap", "cyclonedds"}
+    light_answer = heavy if arguments != ("config", "dump") else heavy - {"numpy"}
+    assert not imported_by(*arguments) & light_answer
+
+
+def test_a_run_imports_what_it_uses(log_folder, tmp_path):
+    lean = imported_by("run", str(log_folder), "-o", str(tmp_path / "lean"), *LEAN)
+    assert {"torch", "gtsam", "cv2"} <= lean
+    assert not lean & {"open3d", "onnxruntime", "rerun", "matplotlib"}
+
+
+# How it fails: 2 for wrong use
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "nosuch.thing=1"), ("nosuch.thing=1", "no setting", "config dump")),
+        (("--set", "joint.nosuch=1"), ("joint.nosuch",)),
+        (("--set", "joint.loss"), ("not key=value",)),
+        (("--set", "joint.loss=quadratic"), ("joint.loss", "quadratic")),
+        (("--set", "seed=abc"), ("seed", "integer")),
+        (("--set", "poses.max_gap=-1"), ("poses.max_gap", "greater than 0")),
+        (("--set", "rays=[1"), ("not YAML",)),
+        (("--config", "no_such.yaml"), ("no_such.yaml", "No such file")),
+        (("--format", "vhs"), ("vhs", "mrclam")),
+    ],
+)
+def test_wrong_settings_are_wrong_use(objslam, log_folder, tmp_path, arguments, words):
+    failed = objslam("run", log_folder, "-o", tmp_path, *arguments)
+    assert failed.code == 2
+    failed.says(*words)
+    assert not failed.out
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (("run",), "Missing argument"),
+        (("run", "x", "--mode", "both"), "--mode"),
+        (("run", "x", "--nosuch"), "--nosuch"),
+        (("run", "x", "--robot", "two"), "--robot"),
+        (("eval", "x", "--align", "so3"), "--align"),
+        (("eval", "x", "--radius", "-1"), "--radius"),
+        (("convert", "x"), "Missing argument"),
+        (("demo", "--seed", "-1"), "--seed"),
+        (("config", "nosuch"), "nosuch"),
+        (("nosuch",), "nosuch"),
+    ],
+)
+def test_wrong_arguments_are_wrong_use(objslam, tmp_path, monkeypatch, arguments, word):
+    monkeypatch.chdir(tmp_path)
+    failed = objslam(*arguments)
+    assert failed.code == 2
+    failed.says_somewhere(word, "Usage")
+    assert not list(tmp_path.iterdir())
+
+
+# and 1 for work that cannot be done
+
+
+@pytest.mark.parametrize("command", ["run", "convert"])
+@pytest.mark.parametrize(("name", "word"), [("nowhere", "No such file"), ("empty", "nothing here that objslam reads")])
+def test_no_log_there(objslam, tmp_path, command, name, word):
+    (tmp_path / "empty").mkdir()
+    failed = objslam(*((command, tmp_path / name) + (("-o",) if command == "run" else ()) + (tmp_path / "new" / "out",)))
+    assert failed.code == 1
+    failed.says(name, word)
+    assert not (tmp_path / "new").exists()
+
+
+def without_path(folder):
+    for file in both_paths(folder):
+        file.unlink()
+
+
+def without_detections(folder):
+    (folder / "detections.jsonl").unlink()
+
+
+def with_empty_detections(folder):
+    (folder / "detections.jsonl").write_text("\n")
+
+
+def without_boxes(folder):
+    rewrite_frames(folder, lambda i, frame: {"stamp": frame["stamp"], "boxes": [], "labels": [], "scores": []})
+
+
+def all_before_the_path(folder):
+    rewrite_frames(folder, lambda i, frame: {**frame, "stamp": frame["stamp"] - 1000})
+
+
+def all_after_the_path(folder):
+    rewrite_frames(folder, lambda i, frame: {**frame, "stamp": frame["stamp"] + 1000})
+
+
+def with_nothing_but_nan_poses(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: line.split()[0] + " nan nan 0 0 0 0 1")
+
+
+def with_half_a_camera(folder):
+    (folder / "camera.yaml").write_text("image_width: 640\n")
+
+
+def with_a_camera_that_is_no_yaml(folder):
+    (folder / "camera.yaml").write_text("image_width: {640\n")
+
+
+def with_an_unknown_lens(folder):
+    file = folder / "camera.yaml"
+    file.write_text(file.read_text().replace("plumb_bob", "tilted"))
+
+
+def with_every_label_a_number(folder):
+    rewrite_frames(folder, lambda i, frame: {**frame, "labels": [7] * len(frame["labels"])})
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (without_path, ("odometry.txt", "localization.txt")),
+        (without_detections, ("no detection", "detections.jsonl")),
+        (with_empty_detections, ("detections.jsonl", "no detection frame")),
+        (without_boxes, ("no box gives a usable ray",)),
+        (all_before_the_path, ("none of the 80 detection frames lies on the robot's path", "same clock")),
+        (all_after_the_path, ("none of the 80 detection frames lies on the robot's path", "same clock")),
+        (with_nothing_but_nan_poses, (".txt", "none of its", "usable")),
+        (with_half_a_camera, ("camera.yaml", "image_height is missing")),
+        (with_a_camera_that_is_no_yaml, ("camera.yaml:", "not YAML")),
+        (with_an_unknown_lens, ("camera.yaml:", "tilted", "plumb_bob")),
+        (with_every_label_a_number, ("detections.jsonl", "none of its 80 lines")),
+    ],
+)
+def test_a_log_that_cannot_be_mapped(objslam, variant, tmp_path, mode, spoil, words):
+    spoil(variant)
+    failed = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *LEAN)
+    assert failed.code == 1
+    failed.says(*words)
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def with_a_few_nan_poses(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: line.split()[0] + " nan 0 0 0 0 0 1" if i in (20, 30) else line)
+
+
+def with_stamps_going_back(folder):
+    for file in both_paths(folder):
+        lines = file.read_text().splitlines()
+        lines[60:64] = lines[40:44]
+        file.write_text("\n".join(lines))
+    frames = (folder / "detections.jsonl").read_text().splitlines()
+    frames[30] = frames[3]
+    (folder / "detections.jsonl").write_text("\n".join(frames))
+
+
+def with_labels_of_unknown_type(folder):
+    odd = {3: 5, 6: None, 7: ["cup"], 9: {"name": "cup"}}
+    rewrite_frames(folder, lambda i, frame: {**frame, "labels": [odd[i]] * len(frame["labels"])} if i in odd else frame)
+
+
+def with_the_camera_of_another_size(folder):
+    file = folder / "camera.yaml"
+    file.write_text(file.read_text().replace("image_width: 640", "image_width: 400"))
+
+
+def with_a_path_that_begins_late(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: line if float(line.split()[0]) > START + 4.1 else None)
+
+
+def with_boxes_that_are_none(folder):
+    inside_out, infinite = [300, 300, 200, 200], [1e400, 0, 10, 10]
+    rewrite_frames(
+        folder,
+        lambda i, frame: (
+            {**frame, "boxes": [inside_out if i == 4 else infinite] * len(frame["boxes"])} if i in (4, 5) else frame
+        ),
+    )
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (with_a_few_nan_poses, ("pose line with a value that is not finite", "odometry.txt:21")),
+        (with_stamps_going_back, ("stamp that repeats or goes back", "odometry.txt:61", "detections.jsonl:31")),
+        (with_labels_of_unknown_type, ("a label is not a string", "detections.jsonl:4")),
+        (with_the_camera_of_another_size, ("outside the image", "camera left")),
+        (with_a_path_that_begins_late, ("before or after the localisation", f"stamp {START:.3f}")),
+        (with_boxes_that_are_none, ("detections.jsonl:5", "detections.jsonl:6")),
+    ],
+)
+def test_what_is_spoilt_is_counted_and_the_rest_is_mapped(objslam, variant, tmp_path, mode, spoil, words):
+    spoil(variant)
+    run = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *LEAN)
+    assert run.code == 0, run.err
+    run.says_somewhere("warning: dropped", *words)
+    told = summary(tmp_path / "out")
+    assert told["dropped"]
+    assert all(f"dropped {count}: {reason}" in run.err for reason, count in told["dropped"].items())
+    resolved = load_map(tmp_path / "out").resolved()
+    assert len(resolved) >= 3
+    for o in resolved:
+        assert np.linalg.norm(o.position - dict(THINGS)[o.label]) < 0.3
+
+
+def only_first_cup(folder, count):
+    kept = []
+
+    def change(i, frame):
+        if "cup" not in frame["labels"] or len(kept) == count:
+            return None
+        kept.append(i)
+        at = frame["labels"].index("cup")
+        return {"stamp": frame["stamp"], **{name: [frame[name][at]] for name in ("boxes", "labels", "scores")}}
+
+    rewrite_frames(folder, change)
+
+
+def exactly_one_ray(folder):
+    only_first_cup(folder, 1)
+
+
+def parallel_rays(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: f"{line.split()[0]} {0.002 * i} 0 0 0 0 0 1")
+    box = {"boxes": [[300, 200, 340, 240]], "labels": ["cup"], "scores": [0.9]}
+    rewrite_frames(folder, lambda i, frame: {"stamp": frame["stamp"], **box})
+
+
+def a_robot_that_stands(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: f"{line.split()[0]} 1 2 0 0 0 0 1")
+
+
+def a_path_of_one_pose(folder):
+    for file in both_paths(folder):
+        rewrite(file, lambda i, line: line if i == 0 else None)
+
+
+def a_single_frame(folder):
+    rewrite_frames(folder, lambda i, frame: frame if i == 0 else None)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("paths", ["both", "odometry.txt", "localization.txt"])
+@pytest.mark.parametrize("spoil", [exactly_one_ray, parallel_rays, a_robot_that_stands, a_path_of_one_pose, a_single_frame])
+def test_rays_that_place_nothing_place_nothing(objslam, variant, tmp_path, mode, paths, spoil):
+    spoil(variant)
+    for file in both_paths(variant):
+        if paths not in ("both", file.name):
+            file.unlink()
+    run = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *LEAN)
+    assert run.code == 0, run.err
+    run.says_somewhere()
+    found = load_map(tmp_path / "out")
+    assert not found.resolved()
+    told = summary(tmp_path / "out")
+    unexplained = told["counts"]["rays_unexplained"]
+    assert found.objects or unexplained == told["counts"]["rays"]  # with its ray, or counted
+    assert not unexplained or "explained by no object" in run.err
+    for o in found.objects:
+        assert o.ray is not None
+        assert o.covariance is None
+    evaluated = objslam("eval", tmp_path / "out")
+    assert evaluated.code == 0, evaluated.err
+
+
+def test_options_of_another_source_are_named(objslam, log_folder, tmp_path):
+    run = objslam("run", log_folder, "-o", tmp_path, "--robot", 3, "--anonymous", *LEAN)
+    assert run.code == 0
+    run.says_somewhere("--robot has no meaning", "--anonymous has no meaning")
+
+
+# Results that cannot be written or read
+
+
+def test_a_file_in_the_way_of_the_output(objslam, log_folder, tmp_path):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    for out in (file, file / "below"):
+        failed = objslam("run", log_folder, "-o", out, *LEAN)
+        assert failed.code == 1
+        failed.says("file")
+    assert file.read_text() == "mine"
+    (tmp_path / "out" / "objects.json").mkdir(parents=True)
+    failed = objslam("run", log_folder, "-o", tmp_path / "out", *LEAN)
+    assert failed.code == 1
+    failed.says("objects.json")
+
+
+def test_an_output_on_a_drive_that_is_not_there(objslam, log_folder):
+    failed = objslam("run", log_folder, "-o", "/proc/no_such_drive/out", *LEAN)
+    assert failed.code == 1
+    failed.says("/proc/no_such_drive", "cannot write")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")
+def test_a_folder_that_may_not_be_written(objslam, log_folder, tmp_path):
+    tmp_path.chmod(0o500)
+    try:
+        failed = objslam("run", log_folder, "-o", tmp_path / "out", *LEAN)
+        assert failed.code == 1
+        failed.says("Permission denied")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_a_log_is_never_taken_for_the_place_of_its_result(objslam, variant, monkeypatch):
+    before = {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()}
+    for out in (str(variant), "."):
+        monkeypatch.chdir(variant)
+        failed = objslam("run", variant, "-o", out, *LEAN)
+        assert failed.code == 1
+        failed.says("this is a log", "-o")
+        assert {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()} == before
+
+
+def test_what_went_with_the_older_result_is_told(objslam, variant, tmp_path):
+    out = tmp_path / "out"
+    assert "removed" not in objslam("run", variant, "-o", out, *LEAN).out
+    assert objslam("export", out, "--to", "csv").code == 0
+    assert objslam("eval", out).code == 0
+    told = objslam("run", variant, "-o", out, *LEAN).out
+    assert f"removed from {out}, for it was of the older result: evaluation.json, objects.csv" in told
+
+
+def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
+    shutil.rmtree(variant / "groundtruth")
+    assert objslam("run", variant, "-o", tmp_path / "out", *LEAN).code == 0
+    failed = objslam("eval", tmp_path / "out")
+    assert failed.code == 1
+    failed.says(str(tmp_path / "out"), "no ground truth", "--truth")
+    for truth in (tmp_path / "nowhere.json", variant):
+        failed = objslam("eval", tmp_path / "out", "--truth", truth)
+        assert failed.code == 1
+        failed.says("ground truth")
+    assert objslam("eval", tmp_path / "nowhere").code == 1
+    failed = objslam("eval", tmp_path / "out", "--radius", "0")
+    assert failed.code == 2
+    failed.says("radius")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("objects.json", b"{", "not JSON"),
+        ("objects.json", b"[]", "not an objects file"),
+        ("objects.json", b"\xff\xfe", "not text"),
+        ("objects.json", None, "missing"),
+        ("trajectory.txt", b"hello\n", "8 numbers"),
+        ("trajectory.txt", None, "missing"),
+        ("groundtruth_objects.json", b'{"objects": [{"id": 1}]}', "objects[0]"),
+        ("groundtruth_trajectory.txt", b"", "nothing in it"),
+    ],
+)
+def test_a_corrupted_result_in_eval(objslam, log_folder, tmp_path, name, content, word):
+    assert objslam("run", log_folder, "-o", tmp_path, *LEAN).code == 0
+    if content is None:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_bytes(content)
+    failed = objslam("eval", tmp_path)
+    assert failed.code == 1
+    failed.says(name, word)
+    assert not (tmp_path / "evaluation.json").exists()
+
+
+# The last resorts
+
+
+def test_debug_shows_the_traceback_of_an_error(log_folder, tmp_path):
+    failed = in_process_of_its_own("--debug", "run", tmp_path / "nowhere", "-o", tmp_path / "out")
+    assert failed.code == 1
+    assert "Traceback" in failed.err
+    assert "LogError" in failed.err
+    quiet = in_process_of_its_own("run", tmp_path / "nowhere", "-o", tmp_path / "out")
+    assert quiet.code == 1
+    quiet.says("nowhere")
+
+
+def test_an_unforeseen_error_asks_for_a_report(objslam, log_folder, tmp_path, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError("a fault of ours")
+
+    monkeypatch.setattr("objslam.mapping.pipeline.run", broken)
+    failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
+    assert failed.code == 1
+    assert failed.err == (
+        "objslam: internal error, ZeroDivisionError: a fault of ours (please report it; objslam --debug shows where)\n"
+    )
+    monkeypatch.setattr("objslam.mapping.pipeline.run", lambda *_: exhausted())
+    failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
+    assert failed.code == 1
+    failed.says("out of memory")
+
+
+def exhausted():
+    raise MemoryError
+
+
+ENDLESS = """
+from objslam.mapping import pipeline
+from objslam.cli import main
+
+run = pipeline.run
+
+def again_and_again(*work):
+    print("begun", flush=True)
+    while True:
+        run(*work)
+
+pipeline.run = again_and_again
+main()
+"""
+
+
+def test_an_interrupt_ends_a_run_without_a_traceback(log_folder, tmp_path):
+    """In the middle of the work, however fast that is."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", ENDLESS, "run", str(log_folder), "-o", str(out), *LEAN]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert run.stdout.readline() == "begun\n"
+    run.send_signal(signal.SIGINT)
+    _, err = run.communicate(timeout=LIMIT)
+    assert run.returncode == 130
+    assert "Traceback" not in err
+    assert not (out / "summary.json").exists()
+
+
+def test_a_closed_pipe_is_no_traceback():
+    run = subprocess.run(f"'{SCRIPT}' config dump | head -n 1", shell=True, capture_output=True, text=True, check=False)
+    assert run.stdout.startswith("mode:")
+    assert "Traceback" not in run.stderr
+
+
+def test_a_killed_run_leaves_no_half_result(log_folder, tmp_path, objslam):
+    """Killed at random moments, most of them while it writes: no summary.json, or a whole result, the old or the new one."""
+    out, rng = tmp_path / "out", random.Random(0)
+    assert objslam("run", log_folder, "-o", out, "--set", "output.recording=false").code == 0
+    before = (out / "objects.json").read_bytes()
+    killed = attempt = 0
+    while killed < 5:  # a run may be done before
+        command = [SCRIPT, "run", str(log_folder), "-o", str(out), "--set", f"seed={attempt + 1}", "--mode", "joint"]
+        run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        staged = out / ".objslam-staging"
+        if attempt:
+            writing = [staged / "objects.json", staged / "map.png"]
+            wait_for(lambda run=run, writing=writing: run.poll() is not None or any(f.exists() for f in writing), 0.001)
+        pause(rng.uniform(0, 0.6 if attempt % 2 else 0.1))
+        attempt += 1
+        assert attempt < 100
+        killed += run.poll() is None
+        run.kill()
+        run.wait()
+        if (out / "summary.json").exists():
+            found = load_map(out)
+            assert summary(out)["counts"]["objects"] == len(found) == 4
+            assert len(load_trajectory(out)) == 80
+            told = yaml.safe_load((out / "config.yaml").read_text())
+            assert summary(out)["mode"] == told["mode"]
+            assert (told["mode"] == "fixed") == ((out / "objects.json").read_bytes() == before)
+    assert objslam("run", log_folder, "-o", out, "--set", "output.recording=false").code == 0  # and the next run is whole
+    assert (out / "objects.json").read_bytes() == before
+    assert not (out / ".objslam-staging").exists()
+
+
+def test_a_camera_without_a_picture_of_its_own_is_left_to_others(objslam, tmp_path):
+    """Two cameras of which one saw nothing at all."""
+    log = small_log()
+    (camera_log,) = log.cameras
+    blind = replace(camera_log, camera=replace(camera_log.camera, name="right"), detections=None)
+    write_log_folder(replace(log, cameras=(camera_log, blind)), tmp_path / "log")
+    assert objslam("run", tmp_path / "log", "-o", tmp_path / "out", *LEAN).code == 0
+    assert len(load_map(tmp_path / "out").resolved()) == 4

@@ -1,0 +1,77 @@
+"""The numbers of statistics: each is what its sentence says, and has no second home."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2, norm, rayleigh
+
+import objslam
+from objslam.core import statistics
+from objslam.core.statistics import grouped_median, grouped_quantile, noise_factors
+
+
+def test_they_are_the_quantiles_that_they_say():
+    assert pytest.approx(chi2.ppf(0.99, 3), rel=1e-4) == statistics.SAME_POINT
+    assert pytest.approx(chi2.ppf(0.999, 3), rel=1e-4) == statistics.SAME_POINT_WIDE
+    assert pytest.approx(chi2.ppf(norm.cdf(3) - norm.cdf(-3), 3), rel=1e-4) == statistics.POSSIBLE_MOTION
+    assert pytest.approx(chi2.ppf(0.999, 2), rel=1e-4) == statistics.STRAY_RAY
+    assert pytest.approx(rayleigh.sf(statistics.OUTLIER_RAY), rel=0.15) == 3e-4
+    assert pytest.approx(rayleigh.median()) == statistics.RAYLEIGH_MEDIAN
+    assert pytest.approx(rayleigh.mean()) == statistics.RAYLEIGH_MEAN
+    assert pytest.approx(norm.ppf(0.75), rel=1e-4) == statistics.NORMAL_MEDIAN
+
+
+def test_a_robust_loss_is_95_percent_efficient_on_gaussian_noise():
+    """The asymptotic efficiency of an M-estimator of a place: E[psi']^2 / E[psi^2]."""
+    x = np.linspace(-12, 12, 200_001)
+    density = norm.pdf(x) * (x[1] - x[0])
+    k, c = statistics.HUBER_K, statistics.CAUCHY_K
+    for psi in (np.clip(x, -k, k), x / (1 + (x / c) ** 2)):
+        slope = (np.gradient(psi, x) * density).sum()
+        assert slope**2 / (psi**2 * density).sum() == pytest.approx(0.95, abs=1e-3)
+
+
+def floats(module: Path) -> Iterator[float]:
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, float) and node.value:
+            yield node.value
+
+
+def test_they_stand_nowhere_else():
+    """Round numbers may mean many things; the others are these, to half a percent."""
+    numbers = {name: x for name, x in vars(statistics).items() if isinstance(x, float) and x % 1}
+    ours = [x for name, x in numbers.items() if name != "RAYLEIGH_MEAN"]  # which is close to 1.25
+    package = Path(objslam.__file__).parent
+    others = [module for module in sorted(package.rglob("*.py")) if module.stem != "statistics"]
+    assert len(ours) == 8
+    assert [(module.stem, x) for module in others for x in floats(module) if np.isclose(x, ours, rtol=5e-3).any()] == []
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.floats(-1e6, 1e6)), max_size=60), st.floats(0, 1))
+def test_quantiles_of_groups(pairs, share):
+    index = np.array([i for i, _ in pairs], dtype=np.int64)
+    values = np.array([x for _, x in pairs])
+    quantile, median = grouped_quantile(values, index, 5, share), grouped_median(values, index, 5)
+    for group in range(5):
+        mine = np.sort(values[index == group])
+        if not len(mine):
+            assert np.isnan(quantile[group])
+            assert np.isnan(median[group])
+            continue
+        assert quantile[group] == mine[min(int(share * len(mine)), len(mine) - 1)]
+        assert median[group] == mine[len(mine) // 2]
+
+
+def test_the_noise_of_each_group_is_that_of_its_median_ray():
+    rng = np.random.default_rng(0)
+    factor = np.repeat([0.5, 1.0, 3.0, 3.0], [500, 500, 500, 3])
+    index = np.repeat([0, 1, 2, 3], [500, 500, 500, 3])
+    deviations = factor * np.hypot(*rng.normal(size=(2, len(index))))
+    deviations[500:600] = 100.0  # a fifth of one group fits nothing
+    found = noise_factors(deviations, index, 5, fewest=6)
+    np.testing.assert_allclose(found, [1.0, 1.1, 3.0, 1.0, 1.0], atol=0.2)

@@ -1,0 +1,67 @@
+"""From odometry that drifts, without identities: loops are closed and the map is whole."""
+
+import numpy as np
+import pytest
+
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.evaluation.evaluate import evaluate
+from objslam.graph.init_unknown_correspondences import _planar_sigmas
+from objslam.graph.loop_closure import distribute_correction
+from objslam.mapping import pipeline
+from objslam.mapping.alternation import rays_moved
+from objslam.simulation import preset, simulate
+
+STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}
+STEP |= {"floor_xy": 0.01, "floor_yaw": float(np.radians(0.3))}
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_two_laps_from_odometry_alone(seed):
+    log = simulate(preset("drift"), seed)
+    settings = Settings.model_validate({"mode": "joint", "rays": {"pixel_sigma": 3.0}, "odometry": STEP})
+    result = pipeline.run(log, settings, Ledger())
+    found = evaluate(result.map, log.truth, result.path_after, align="se2", radius=0.5)
+    dead = evaluate(result.map, log.truth, log.odometry, align="se2", radius=0.5)
+    objects = found.objects
+    assert 2 * len(objects.matches) >= 0.95 * (2 * len(objects.matches) + len(objects.false) + len(objects.missed))
+    assert np.mean(found.path.errors**2) <= np.mean(dead.path.errors**2) / 9
+    assert result.summary["rounds"][-1]["rays_changed"] <= 0.02 * len(result.rays)
+
+
+def test_a_bent_path_begins_where_it_was_and_ends_where_it_should():
+    way = lift_se2(np.column_stack([np.linspace(0, 5, 20), np.zeros(20), np.linspace(0, 1, 20)]))
+    correction = lift_se2(np.array([0.3, -0.5, 0.2]))
+    drift = np.linspace(0, 1, 20) ** 2
+    bent = distribute_correction(way, correction, 5, 15, drift)
+    np.testing.assert_array_equal(bent[:5], way[:5])
+    np.testing.assert_allclose(bent[5], way[5], atol=1e-12)
+    np.testing.assert_allclose(bent[15:], correction @ way[15:], atol=1e-12)
+    # no step on the way takes more than its share of the whole
+    steps = np.linalg.norm(np.diff((bent - way)[5:16, :3, 3], axis=0), axis=1)
+    whole = np.linalg.norm((bent - way)[15, :3, 3])
+    share = np.diff(drift[5:16]) / (drift[15] - drift[5])
+    assert (steps <= 3 * share * max(whole, 1.0)).all()
+
+
+def test_rays_moved_counts_rays_and_not_numbers():
+    rng = np.random.default_rng(0)
+    before = rng.integers(-1, 6, 200)
+    number = np.append(rng.permutation(6), -1)
+    assert rays_moved(before, number[before]) == 0
+    after = before.copy()
+    moved = rng.permutation(200)[:17]
+    after[moved] = np.where(before[moved] < 0, 0, -1)
+    assert rays_moved(before, number[after]) == 17
+    assert rays_moved(np.full(5, -1), np.zeros(5, dtype=np.int64)) == 5
+
+
+def test_the_drift_of_any_camera_is_told_in_the_map():
+    """The same robot's drift, as a camera that looks ahead and one that looks left have it."""
+    ahead = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
+    left = lift_se2(np.array([0.0, 0.0, np.pi / 2])) @ ahead
+    of_map = np.diag([0.0, 0.0, 0.05, 0.3, 0.1, 0.0]) ** 2
+    for camera in (ahead, left):
+        turn = np.kron(np.eye(2), camera[:3, :3])
+        np.testing.assert_allclose(_planar_sigmas(turn.T @ of_map @ turn, camera), [0.3, 0.1, 0.05], atol=1e-12)

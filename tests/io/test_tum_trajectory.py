@@ -1,0 +1,86 @@
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Trajectory
+from objslam.errors import LogError
+from objslam.io.tum_trajectory import read_trajectory, write_trajectory
+
+_STAMPS = st.lists(st.floats(0, 2e9), min_size=1, max_size=20, unique=True).map(sorted)
+
+
+@given(_STAMPS, st.data())
+def test_written_trajectories_read_back(stamps, data):
+    count = len(stamps)
+    translation = data.draw(arrays(float, (count, 3), elements=st.floats(-1e6, 1e6)))
+    turns = data.draw(arrays(float, (count, 3), elements=st.floats(-3, 3)))
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = Rotation.from_rotvec(turns).as_matrix(), translation
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "path.txt")
+        write_trajectory(Trajectory(np.array(stamps), poses), file)
+        ledger = Ledger()
+        read = read_trajectory(file, ledger)
+    assert not ledger.lines()
+    assert read.stamps.tolist() == stamps
+    assert np.array_equal(read.poses[:, :3, 3], translation)
+    np.testing.assert_allclose(read.poses, poses, atol=1e-14, rtol=1e-15)
+
+
+def test_a_pose_is_read_as_tum_writes_it(tmp_path):
+    file = tmp_path / "path.txt"
+    file.write_text("# comment\n1341847980.7900 1 2 3 0 0 2 2\n")  # a quarter turn about z, of any length
+    ledger = Ledger()
+    path = read_trajectory(file, ledger)
+    assert path.stamps.tolist() == [1341847980.79]
+    np.testing.assert_allclose(path.poses[0], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
+    assert f"{file}:2: 1 quaternions are not of length 1" in ledger.warnings[0]
+
+
+def test_every_bad_line_is_dropped_and_named(tmp_path):
+    file = tmp_path / "odometry.txt"
+    lines = [
+        "1 0 0 0 0 0 0 1",
+        "2 0 0 0 0 0 0",  # too few
+        "3 0 0 0 0 0 0 1 0",  # too many
+        "4 0 0 zero 0 0 0 1",
+        "5 nan 0 0 0 0 0 1",
+        "inf 0 0 0 0 0 0 1",
+        "7 0 0 0 0 0 0 0",  # no rotation
+        "7 0 0 0 0 0 0 1e-9",
+        "7 0 0 0 1e300 1e300 0 1",  # its length is not finite
+        "8 5 0 0 0 0 0 1",
+        "8 6 0 0 0 0 0 1",  # again
+        "3 7 0 0 0 0 0 1",  # back
+        "9 8 0 0 0 0 0 1",
+        "10 8 0",  # cut off
+    ]
+    file.write_text("\n".join(lines))
+    ledger = Ledger()
+    path = read_trajectory(file, ledger)
+    assert path.stamps.tolist() == [1, 8, 9]
+    assert path.poses[:, 0, 3].tolist() == [0, 5, 8]
+    places = {reason: [int(place.rpartition(":")[2]) for place in places] for reason, places in ledger.examples.items()}
+    assert places == {
+        "pose line that is not 8 numbers": [2, 3, 4],
+        "pose line with a value that is not finite": [5, 6],
+        "pose line with a zero quaternion": [7, 8, 9],
+        "pose line with a stamp that repeats or goes back": [11, 12],
+    }
+    assert ledger.dropped["pose line that is not 8 numbers"] == 4
+    assert all(place.startswith(f"{file}:") for found in ledger.examples.values() for place in found)
+
+
+def test_no_pose_left(tmp_path):
+    file = tmp_path / "odometry.txt"
+    file.write_text("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 0\n")
+    with pytest.raises(LogError, match="quaternion") as caught:
+        read_trajectory(file, Ledger())
+    assert caught.value.where == str(file)

@@ -1,0 +1,264 @@
+"""What a session does when something in it breaks: nobody waits for ever, and the map so far is not lost."""
+
+import importlib
+import json
+import sys
+import threading
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from objslam.cli import main
+from objslam.config import Odometry, load_settings
+from objslam.errors import LogError, SolveError
+from objslam.live.adapters.replay import ReplayAdapter
+from objslam.live.mapper.mapper import Mapper
+from objslam.live.session import session as sessions
+from objslam.live.session.session import Session
+from objslam.live.session.snapshots import Describer
+from objslam.results.read import load_map
+from objslam.simulation import preset, simulate
+from objslam.sources.journal import file as journals
+from objslam.sources.log_folder import write_log_folder
+
+SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
+QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
+live_command = importlib.import_module("objslam.cli.live")  # the name in objslam.cli is the function
+PATIENCE = 60  # s until a wait counts as one for ever
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(preset("demo", frames=150, classes=12, false=0.0, localization=None, odometry=Odometry()), 0)
+
+
+@pytest.fixture(scope="module")
+def folder(log, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("failures") / "log"
+    write_log_folder(log, folder)
+    return folder
+
+
+@pytest.fixture
+def breaks(monkeypatch):
+    """Makes a method fail from its nth call on."""
+
+    def at(owner, name, number, error):
+        whole, calls = getattr(owner, name), [0]
+
+        def broken(self, *args, **more):
+            calls[0] += 1
+            if calls[0] >= number:
+                raise error
+            return whole(self, *args, **more)
+
+        monkeypatch.setattr(owner, name, broken)
+
+    return at
+
+
+def ends(work):
+    """Whether work comes to an end."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(PATIENCE)
+    return not thread.is_alive()
+
+
+def replayed(log, session):
+    adapter = ReplayAdapter(session, log, None, session.wait)
+    return ends(lambda: adapter.run(threading.Event()))
+
+
+def test_a_session_that_breaks_keeps_nobody_waiting_and_keeps_its_map(log, breaks):
+    error = RuntimeError("it broke\nin two lines")
+    breaks(Mapper, "take", 120, error)
+    session = Session(SETTINGS, patient=True).start()
+    assert replayed(log, session)
+    assert session.failure is error
+    assert not session.wait()
+    assert not session.push_odometry(1e6, np.eye(4))
+    last = session.snapshot()
+    assert len(last.map.resolved()) >= 8
+    result = session.stop()
+    assert len(result.map.resolved()) >= 8
+    (warning,) = session.counters.ledger.warnings
+    assert "ended early" in warning
+    assert "it broke in two lines" in warning
+    assert result.summary["warnings"] == [warning]
+
+
+def test_what_waited_when_a_session_broke_is_counted(log, monkeypatch):
+    begun, go = threading.Event(), threading.Event()
+
+    def feed(self, message):
+        begun.set()
+        assert go.wait(PATIENCE)
+        raise RuntimeError("it broke")
+
+    monkeypatch.setattr(Mapper, "feed", feed)
+    session = Session(SETTINGS).start()
+    assert session.push_camera(log.cameras[0].camera)
+    assert begun.wait(PATIENCE)
+    for i in range(5):
+        assert session.push_odometry(float(i), np.eye(4))
+    go.set()
+    assert ends(session.wait)
+    session.abort()
+    assert session.counters.dropped() == {"messages that waited when the session ended early": 5}
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_snapshot_that_fails_keeps_nobody_waiting_and_the_map(log, breaks, number):
+    """The first is asked for, the second is made at the end."""
+    session = Session(SETTINGS, patient=True).start()
+    assert replayed(log, session)
+    breaks(Describer, "map", number, ValueError("no words"))
+    assert ends(session.snapshot)
+    assert ends(session.wait)
+    assert (session.failure is not None) == (number == 1)
+    assert len(session.stop().map.resolved()) >= 8
+    assert str(session.failure) == "no words"
+
+
+def test_nobody_waits_for_a_session_that_was_not_started(log):
+    session = Session(SETTINGS)
+    assert session.wait()
+    assert session.push_camera(log.cameras[0].camera)
+    assert not session.wait()
+
+
+def test_the_first_failure_is_told_where_no_result_can_be_made(log, breaks, monkeypatch):
+    breaks(Mapper, "take", 50, RuntimeError("the cause"))
+
+    def no_finish(*what):
+        raise KeyError("what came of it")
+
+    monkeypatch.setattr(sessions, "finish", no_finish)
+    session = Session(SETTINGS, patient=True).start()
+    assert replayed(log, session)
+    with pytest.raises(RuntimeError, match="the cause"):
+        session.stop()
+
+
+def test_a_session_that_breaks_while_it_resumes(log, breaks, tmp_path):
+    first = Session(SETTINGS, tmp_path / "journal.objslam", patient=True).start()
+    assert replayed(log, first)
+    first.abort()
+    breaks(Mapper, "take", 100, RuntimeError("it broke"))
+    session = Session(SETTINGS, tmp_path / "journal.objslam", resume=True).start()
+    assert str(session.failure) == "it broke"
+    assert not session.wait()
+    assert len(session.snapshot().map.resolved()) >= 5
+    assert len(session.stop().map.resolved()) >= 5
+
+
+def test_a_journal_that_cannot_be_closed_costs_no_map(log, tmp_path, monkeypatch):
+    session = Session(SETTINGS, tmp_path / "journal.objslam", patient=True).start()
+    assert replayed(log, session)
+
+    def fsync(stream):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(journals.os, "fsync", fsync)
+    assert len(session.stop().map.resolved()) >= 8
+    (line,) = session.counters.ledger.warnings
+    assert line == f"{tmp_path / 'journal.objslam'}: cannot write the end of the journal: No space left on device"
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """`objslam live` in this process: exit code, and the lines on stderr."""
+
+    def call(source, out, *more):
+        monkeypatch.setattr(sys, "argv", ["objslam", "live", str(source), "-o", str(out), *QUIET, *more])
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        return exit_.value.code, capsys.readouterr().err.strip().splitlines()
+
+    return call
+
+
+@pytest.mark.parametrize(("speed", "frames", "least"), [("0", 120, 8), ("20", 5, 0)])
+def test_the_command_writes_what_was_mapped_and_ends_with_one_line(folder, breaks, command, tmp_path, speed, frames, least):
+    breaks(Mapper, "take", frames, RuntimeError("it broke\nin two lines"))
+    out = tmp_path / "out"
+    code, lines = command(folder, out, "--speed", speed)
+    assert code == 1
+    (line,) = [line for line in lines if not line.startswith("warning: ")]
+    said = "the session ended early: internal error, RuntimeError: it broke in two lines"
+    assert line == f"objslam: {said} (the map is of what came until then; `objslam run {out}` maps all that came)"
+    assert len(load_map(out).resolved()) >= least
+    assert "ended early" in json.loads((out / "summary.json").read_text())["warnings"][-1]
+
+
+def test_the_command_tells_an_error_of_ours_as_it_is(folder, breaks, command, tmp_path):
+    breaks(Mapper, "take", 120, SolveError("no\nway", hint="go\nround"))
+    code, lines = command(folder, tmp_path / "out", "--speed", "0", "--no-journal")
+    assert code == 1
+    assert lines[-1] == "objslam: the session ended early: no way (go round) (the map is of what came until then)"
+
+
+def test_the_command_leaves_the_last_snapshot_where_no_result_can_be_made(folder, breaks, command, tmp_path, monkeypatch):
+    def no_finish(*what):
+        raise KeyError("what came of it")
+
+    breaks(Mapper, "take", 120, RuntimeError("it broke"))
+    monkeypatch.setattr(sessions, "finish", no_finish)
+    code, lines = command(folder, tmp_path / "out", "--speed", "0")
+    assert code == 1
+    assert "RuntimeError: it broke" in lines[-1]
+    assert len(load_map(tmp_path / "out").resolved()) >= 5
+
+
+@pytest.mark.parametrize("when", [1, 2])
+def test_a_view_that_breaks_costs_no_map(folder, command, tmp_path, monkeypatch, when):
+    """The first snapshot after the drive is shown while the source goes on, the last one at the end."""
+    shown, make = [], live_command._replay
+    driven, seen = threading.Event(), threading.Event()
+
+    def view(snapshot):
+        if driven.is_set():
+            shown.append(snapshot)
+            seen.set()
+            if len(shown) >= when:
+                raise RuntimeError("the window\nwent")
+
+    def feed(*what):
+        found, truth = make(*what)
+
+        def run(stop):
+            found.adapter.run(stop)
+            driven.set()
+            seen.wait(PATIENCE)
+
+        return replace(found, adapter=SimpleNamespace(ledger=found.adapter.ledger, run=run), views=(view,)), truth
+
+    monkeypatch.setattr(live_command, "_replay", feed)
+    code, lines = command(folder, tmp_path / "out", "--speed", "0", "--interval", "0.1")
+    assert code == 1
+    assert "internal error, RuntimeError: the window went (" in lines[-1]
+    assert len(shown) >= when
+    assert len(load_map(tmp_path / "out").resolved()) >= 8
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+def test_what_is_said_of_a_source_that_breaks_is_one_line(folder, command, tmp_path, monkeypatch):
+    make = live_command._replay
+
+    def feed(*what):
+        found, truth = make(*what)
+        run = found.adapter.run
+
+        def runs_then_breaks(stop):
+            run(stop)
+            raise LogError("the plug\nwas pulled")
+
+        return replace(found, adapter=SimpleNamespace(ledger=found.adapter.ledger, run=runs_then_breaks)), truth
+
+    monkeypatch.setattr(live_command, "_replay", feed)
+    code, lines = command(folder, tmp_path / "out", "--speed", "0")
+    assert code == 0
+    assert "warning: the source ended: the plug was pulled" in lines

@@ -1,0 +1,174 @@
+"""Who a box may be of: near what was seen just now, and after a long way only where no other could be meant."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from objslam.association.observations import Observations
+from objslam.config import load_settings
+from objslam.core.geometry import adjoint, inverse
+from objslam.live.counters import Counters
+from objslam.live.mapper.frame_association import FrameRays, match
+from objslam.live.mapper.landmark_table import LandmarkTable, predict_landmarks
+from objslam.live.mapper.maintenance import _one, _two_of_a_label
+from objslam.live.mapper.pose_uncertainty import PoseUncertainty
+from objslam.live.mapper.track_promotion import prune_tracks, try_promote
+from objslam.live.mapper.tracks import Track
+
+AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+SIGMA = 0.004
+
+
+def landmarks(positions, labels):
+    known = LandmarkTable()
+    for i, (position, label) in enumerate(zip(positions, labels, strict=True)):
+        known.add(
+            id=[i], position=[position], information=[np.eye(3) * 1e4], label=[label], drift=np.zeros((1, 6, 6)),
+            first=[0.0], last=[0.0], seen=[30], expected=[30], far=[6.0], squared=[60.0], rejected=[0],
+        )  # fmt: skip
+    return known
+
+
+def rays(targets, label=0):
+    local = np.asarray(targets) @ AHEAD[:3, :3]
+    count = len(local)
+    nothing, one = np.full(count, np.nan), np.ones(count)
+    direction = local / np.linalg.norm(local, axis=1, keepdims=True)
+    return FrameRays(
+        direction, one * SIGMA, nothing, nothing, np.full(count, label), one, np.zeros((count, 4)), np.full(count, -1)
+    )
+
+
+def uncertainty(heading, place=np.nan):
+    """Drift of so much in heading (rad) since what is known was seen; `place`: m and rad, of the place in the map."""
+    drift = np.diag([1e-8, 1e-8, heading**2, 1e-6, 1e-6, 1e-8])
+    return PoseUncertainty(drift, adjoint(inverse(AHEAD)), np.eye(6) * place**2)
+
+
+def found(known, target, heading, place=np.nan, tracks=()):
+    targets = [target] if np.ndim(target) == 1 else target
+    return match(rays(targets), AHEAD, predict_landmarks(known, tracks), uncertainty(heading, place), 2, 0.99, {}).tolist()
+
+
+HALL = [(5.0, 0.0, 0.5), *((x, y, 0.5) for x in (-8.0, 0.0, 8.0, 14.0) for y in (-8.0, -5.0, 5.0, 8.0))]
+
+
+def test_a_landmark_seen_just_now_is_matched_among_many():
+    assert found(landmarks(HALL, [0] * len(HALL)), (5.0, 0.05, 0.5), 0.02) == [0]
+
+
+def turned(points, angle):
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(points) @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_after_a_long_way_only_where_nothing_unknown_could_be_meant():
+    many, few = landmarks(HALL, [0] * len(HALL)), landmarks(HALL, [0] + [1] * (len(HALL) - 1))
+    off = turned(HALL[0], 0.05)
+    assert found(many, off, 0.15) == [-1]
+    assert found(many, off, 0.15, place=0.01) == [-1]  # it is known better where the camera is, and this is too far off
+    assert found(many, HALL[0], 0.15, place=0.01) == [0]
+    assert found(few, off, 0.15) == [0]
+    assert found(few, off, 1.5) == [-1]  # a drift that large leaves room for the few that may be unknown, too
+
+
+def test_several_that_one_drift_explains_are_trusted_together():
+    near = [(5.0, 0.0, 0.5), (4.0, 1.5, 0.9), (4.5, -1.5, 0.2)]
+    known = landmarks([*near, *HALL[1:]], [0] * (len(HALL) + 2))
+    off = turned(near, 0.05)
+    assert found(known, off, 0.15) == [0, 1, 2]
+    off[1] = turned(near[1], -0.2)
+    assert found(known, off, 0.15) == [0, -1, 2]  # the odd one is something else
+
+
+def track(drift):
+    one = Track(0, 0, False, 0.0, 0.0, drift)
+    one.position, one.covariance = np.array([5.0, 0.0, 0.5]), np.eye(3) * 1e-4
+    one.rays = [(0, 0, np.zeros(3), SIGMA, np.nan, np.nan)]
+    return one
+
+
+def test_a_track_is_given_up_after_a_long_way_unless_the_camera_knows_where_it_is():
+    known, one = landmarks([], []), track(np.zeros((6, 6)))
+    assert found(known, (5.0, 0.01, 0.5), 0.01, tracks=[one]) == [0]
+    assert found(known, (5.0, 0.01, 0.5), 0.07, tracks=[one]) == [-1]
+    assert found(known, (5.0, 0.01, 0.5), 0.07, place=0.01, tracks=[one]) == [0]
+
+
+class Still:
+    """Keyframes on a line across the view, 1 cm apart."""
+
+    def pose(self, k):
+        return np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.01 * k], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(("width", "count", "born"), [(45, 45, True), (15, 15, False), (45, 4, False), (100, 20, True)])
+def test_a_track_becomes_a_landmark_as_soon_as_it_is_sure(width, count, born):
+    """5 m away, 1 cm are 0.11 degrees: 45 of them are 5, less than half of joint.min_parallax_deg."""
+    graph, rng = Still(), np.random.default_rng(0)
+    one = Track(0, 0, False, 0.0, 0.0, np.zeros((6, 6)))
+    for number, k in enumerate(np.linspace(0, width, count).astype(int).tolist()):
+        pose = graph.pose(k)
+        local = pose[:3, :3].T @ (np.array([5.0, 0.2, 0.3]) - pose[:3, 3]) / 5.0 + rng.normal(0, SIGMA, 3)
+        one.extend((number, k, local / np.linalg.norm(local), SIGMA, np.nan, np.nan), pose, 0.0, one.drift)
+    met = try_promote(one, graph, load_settings(None, ()), rng)
+    assert (met is not None) == born
+    if met is not None:
+        off = met.position - [5.0, 0.2, 0.3]
+        assert off @ np.linalg.solve(met.covariance, off) < 25
+
+
+def test_landmarks_are_one_where_they_are_near_and_few():
+    spread = np.eye(3) * 0.1**2
+    assert _one(np.array([0.1, 0.0, 0.0]), spread, 0.03)
+    assert not _one(np.array([0.1, 0.0, 0.0]), spread, 3.0)
+    assert not _one(np.array([0.5, 0.0, 0.0]), spread, 0.03)
+    assert not _one(np.array([0.5, 0.0, 0.0]), spread * 100, 0.5)
+
+
+def lines(targets, sigma=0.004, reach=6.0):
+    """One ray to each of the targets (n, 3), from a place on the way from -reach to reach along y, with noise."""
+    rng = np.random.default_rng(0)
+    origin = np.column_stack([np.zeros(len(targets)), np.linspace(-reach, reach, len(targets)), np.zeros(len(targets))])
+    to = np.asarray(targets) - origin
+    direction = to / np.linalg.norm(to, axis=1, keepdims=True) + rng.normal(scale=sigma, size=to.shape)
+    nothing = np.full(len(to), np.nan)
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return Observations.of_lines(origin, unit, np.full(len(to), sigma), nothing, nothing)
+
+
+def two(s, support):
+    session = SimpleNamespace(landmarks=[0], settings=load_settings(None, ()), rng=np.random.default_rng(0))
+    return _two_of_a_label(session, s, np.zeros(len(support), dtype=np.int64), np.array(support))
+
+
+def test_a_label_has_two_objects_where_what_disagrees_makes_another_one():
+    one, other = (3.0, 0.0, 0.5), (5.0, 2.0, 0.5)
+    in_turns = np.arange(40) // 5 % 2 == 0
+    turns = [one if here else other for here in in_turns]
+    assert two(lines(turns), in_turns)
+    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20)  # at one stretch: the path may have drifted
+    assert not two(lines(turns, reach=0.1), in_turns)  # from one place it has no distance: the one of the label may be wrong
+    strays = np.random.default_rng(1).uniform([1, -8, -8], [17, 8, 8], (40, 3))
+    assert not two(lines(np.where(in_turns[:, None], one, strays)), in_turns)
+
+
+def test_a_crowd_of_candidates_leaves_room_for_those_of_other_labels():
+    def candidate(i, label, last, count):
+        one = Track(i, label, False, 0.0, last, np.zeros((6, 6)))
+        one.rays = [None] * count
+        return one
+
+    few = [candidate(i, 0, 1.0, 1) for i in range(20)]
+    grown = [candidate(i, 1, 1.0, 9) for i in range(20, 25)]
+    crowd = [candidate(i, 1, 2.0, 1) for i in range(25, 425)]
+    counters = Counters()
+    m = SimpleNamespace(tracks=[*few, *grown, *crowd], settings=load_settings(None, ()), counters=counters)
+    prune_tracks(m)
+    assert m.tracks[:25] == [*few, *grown]
+    assert len(m.tracks) == 150
+    assert counters.accepted() == {"tracks given up": 275}
+    prune_tracks(m)
+    assert len(m.tracks) == 150
+    assert counters.accepted() == {"tracks given up": 275}

@@ -1,0 +1,367 @@
+"""The report, read back as a browser would: what it holds, that nothing in it acts, and that it asks for nothing outside."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from synthetic_result import clusters, synthetic_result
+
+from objslam import config
+from objslam.cli import main
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import ObjectMap
+from objslam.errors import OutputError
+from objslam.evaluation.evaluate import evaluate, evaluate_folder, write_evaluation
+from objslam.mapping import pipeline
+from objslam.output.report import write_report
+from objslam.output.report.charts import HEIGHT, axis_end, histogram
+from objslam.output.report.crops import best_rays
+from objslam.output.result_folder import write_result
+from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
+from objslam.simulation import make_camera
+from objslam.sources import SourceOptions, read
+
+EVIL = [
+    "<script>alert(1)</script>",
+    "\"><img src=x onerror='alert(2)'>",
+    "{{ 7 * 7 }}</style></title>&amp;",
+    "Bücher & Töpfe",
+]
+QUICK = Settings(mode="joint", output=config.Output(recording=False, picture=False))
+VOID = {"meta", "img", "line", "rect", "br"}
+
+
+class Page(HTMLParser):
+    """Checks that every tag closes, and keeps elements, the text of each kind and the table of the objects."""
+
+    def __init__(self, file: Path) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text: dict[str, list[str]] = {}
+        self.rows: list[list[str]] = []
+        self._sortable = False
+        self.feed(file.read_text(encoding="utf-8"))
+        assert not self.stack
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self._sortable |= tag == "table" and dict(attrs).get("class") == "sortable"
+        if tag not in VOID:
+            self.stack.append(tag)
+        if self._sortable and tag == "tr":
+            self.rows.append([])
+        if self._sortable and tag == "td":
+            self.rows[-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.stack.pop() == tag
+        self._sortable &= tag != "table"
+
+    def handle_data(self, data: str) -> None:
+        self.text.setdefault(self.stack[-1] if self.stack else "", []).append(data)
+        if self._sortable and "td" in self.stack:
+            self.rows[-1][-1] += data
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    @property
+    def all_text(self) -> str:
+        return " ".join(part for tag, parts in self.text.items() if tag not in ("script", "style") for part in parts)
+
+
+def evil_result(tmp_path: Path) -> Path:
+    positions = np.array([[2.0, 3.0, 0.5], [8.0, 4.0, 1.0], [5.0, 12.0, 0.2], [1.0, 9.0, 0.4]])
+    result, truth = synthetic_result(positions, EVIL, keyframes=30, unresolved=(2,), settings=QUICK)
+    evil = "<b onmouseover=alert(3)>late</b>"
+    summary = {**result.summary, "warnings": [evil], "dropped": {evil: 3}, "dropped_examples": {evil: [evil]}, "log": evil}
+    write_result(dataclasses.replace(result, summary=summary), tmp_path / "out", truth)
+    return write_report(tmp_path / "out")
+
+
+def test_text_of_others_is_text(tmp_path: Path) -> None:
+    page = Page(evil_result(tmp_path))
+    assert len(page.of("script")) == 1
+    assert "alert" not in page.text["script"][0]
+    assert {row[1] for row in page.rows if row} == set(EVIL)
+    assert page.all_text.count("<b onmouseover=alert(3)>late</b>") == 4
+    for _, attributes in page.elements:
+        assert not [name for name in attributes if name.startswith("on")]
+
+
+def test_it_asks_for_nothing_outside(tmp_path: Path) -> None:
+    page = Page(evil_result(tmp_path))
+    for tag, attributes in page.elements:
+        for name in ("src", "href", "action", "data", "srcset", "xlink:href"):
+            if name in attributes:
+                assert re.match(r"data:image/(png|jpeg);base64,|#object-\d+$", attributes[name] or ""), (tag, name)
+    (policy,) = [m["content"] for m in page.of("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert (policy or "").startswith("default-src 'none'; img-src data:;")
+    assert not re.search(r"url\(|@import", page.text["style"][0])
+
+
+def test_the_table_is_the_map(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=40, unresolved=(4,))
+    write_result(result, tmp_path, truth)
+    page = Page(write_report(tmp_path))
+    rows = [row for row in page.rows if row]
+    assert len(rows) == 15
+    for row, o in zip(rows, result.map.objects, strict=True):
+        assert row[:2] == [str(o.id), o.label]
+        assert row[2:5] == [f"{x:.3f}" for x in o.position]
+        sigma = "" if o.covariance is None else f"{np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.3f}"
+        assert row[5:7] == [sigma, str(o.rays)]
+        assert row[-1] == o.status
+    links = {a["href"] for a in page.of("a")}
+    cards = {f"#{c['id']}" for c in page.of("article")}
+    assert links == cards == {f"#object-{o.id}" for o in result.map.objects}
+    png = next(image["src"] for image in page.of("img"))
+    assert base64.b64decode((png or "").partition(",")[2]) == (tmp_path / "map.png").read_bytes()
+    assert "the clock of the camera runs 0.04 s late" in page.all_text
+    assert '"joint"' in page.text["td"]  # a setting that was changed
+    assert any(text.startswith("mode: joint") for text in page.text["pre"])
+
+
+@pytest.mark.parametrize("evaluated", [True, False])
+def test_errors_come_from_the_evaluation_or_the_truth(tmp_path: Path, evaluated: bool) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=40, settings=QUICK)
+    write_result(result, tmp_path, truth)
+    evaluation = evaluate(load_map(tmp_path), load_truth(tmp_path), load_trajectory(tmp_path))
+    if evaluated:
+        write_evaluation(evaluation, tmp_path)
+    page = Page(write_report(tmp_path))
+    assert evaluation.objects is not None
+    errors = {str(m.object.id): f"{m.error:.3f}" for m in evaluation.objects.matches}
+    assert {row[0]: row[9] for row in page.rows if row} == errors
+    assert f"{evaluation.to_dict()['position_rmse']:.3f} m" in page.text["td"]
+
+
+def test_a_comparison_of_two_maps_is_not_called_the_truth(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=10, settings=QUICK)
+    write_result(result, tmp_path / "mine", truth)
+    write_result(result, tmp_path / EVIL[0].replace("/", "") / "other")
+    other = tmp_path / EVIL[0].replace("/", "") / "other" / "objects.json"
+    told = {}
+    for given in (None, other):
+        write_evaluation(evaluate_folder(tmp_path / "mine", given), tmp_path / "mine")
+        told[given] = Page(write_report(tmp_path / "mine"))
+    assert "Against the ground truth, as the two stand" in told[None].all_text
+    assert "ground truth" not in told[other].all_text
+    assert "truth id" not in told[other].all_text
+    assert f"Against {other}, as the two stand" in told[other].all_text
+    assert "objects' RMSE, against other/objects.json" in told[other].text["span"]
+    assert len(told[other].of("script")) == 1
+
+
+def test_an_error_names_the_id_of_its_truth(tmp_path: Path) -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=40, settings=QUICK)
+    write_result(result, tmp_path, truth)
+    page = Page(write_report(tmp_path))
+    assert "(truth id 3)" in page.all_text
+
+
+def test_labels_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    positions, labels = clusters()
+    result, _ = synthetic_result(positions, labels[::-1], keyframes=20, settings=QUICK)
+    write_result(result, tmp_path)
+    page = Page(write_report(tmp_path))
+    assert [row[1] for row in page.rows if row] == [f"landmark_{i}" for i in range(6, 21)]
+
+
+def test_existence_has_a_column_where_it_was_judged(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    objects = tuple(dataclasses.replace(o, existence=0.75 if o.id == 1 else None) for o in result.map.objects)
+    write_result(dataclasses.replace(result, map=ObjectMap(objects)), tmp_path)
+    page = Page(write_report(tmp_path))
+    rows = [row for row in page.rows if row]
+    assert [row[9] for row in rows] == ["0.750"] + [""] * 14
+
+
+def test_without_a_truth_there_is_no_error(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    write_result(result, tmp_path)
+    page = Page(write_report(tmp_path))
+    assert len(next(row for row in page.rows if row)) == 10
+    assert "Evaluation" not in page.text["h2"]
+
+
+def test_an_empty_map(tmp_path: Path) -> None:
+    result, _ = synthetic_result(np.zeros((0, 3)), [], keyframes=10, settings=QUICK)
+    write_result(dataclasses.replace(result, map=ObjectMap(())), tmp_path)
+    page = Page(write_report(tmp_path))
+    assert "No object was found." in page.text["p"]
+
+
+def test_the_histograms_of_the_page_are_in_degrees(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=40, settings=QUICK)
+    write_result(result, tmp_path)
+    page = Page(write_report(tmp_path))
+    bars = [text for text in page.text["title"] if " deg: " in text]
+    chart = histogram(np.degrees(result.residual), result.weight, 32)
+    assert chart is not None
+    expected = [bar.text for bar in chart.bars if bar.used or bar.rejected]
+    assert bars[: len(expected)] == expected
+
+
+def test_the_histogram_counts_every_ray() -> None:
+    rng = np.random.default_rng(0)
+    residual = np.concatenate([rng.rayleigh(0.4, 500), np.full(7, 30.0), np.full(20, np.nan)])
+    weight = np.where(np.arange(527) % 5 == 0, 0.0, 1.0)
+    chart = histogram(residual, weight, 20)
+    assert chart is not None
+    used, rejected = (sum(getattr(bar, kind) for bar in chart.bars) for kind in ("used", "rejected"))
+    known = np.isfinite(residual)
+    unit = HEIGHT / chart.highest
+    assert round(used / unit) == (known & (weight > 0)).sum()
+    assert round(rejected / unit) == (known & (weight == 0)).sum()
+    assert max(bar.used + bar.rejected for bar in chart.bars) == pytest.approx(HEIGHT)
+    assert chart.counts[0] == (0.0, "0")
+    for height, text in chart.counts:
+        assert height == pytest.approx(int(text) * unit)
+    assert 2 <= int(chart.highest / int(chart.counts[1][1])) <= 5
+    few = histogram(np.array([0.1]), np.ones(1), 5)
+    assert few is not None
+    assert [text for _, text in few.counts] == ["0", "1"]
+    assert chart.beyond == (residual[known] > 2.0).sum()
+    assert histogram(np.array([np.nan]), np.ones(1), 5) is None
+    assert [axis_end(np.full(9, x)) for x in (0.013, 0.1, 0.3, 2.0, 7.0)] == pytest.approx([0.02, 0.1, 0.5, 2.0, 10.0])
+
+
+@pytest.fixture
+def mapped(tmp_path: Path) -> Path:
+    """A log with images in which each thing is a patch of a colour of its own, and the folder of its result."""
+    from small_log import small_log
+
+    from objslam.core.types import Images
+    from objslam.sources.log_folder import write_log_folder
+
+    log = small_log(
+        cameras=(make_camera("left", width=320, height=240, focal=190.0, position=(0.0, 0.0, 0.3), yaw=np.pi / 2),)
+    )
+    camera_log = log.cameras[0]
+    boxes = camera_log.detections
+    assert boxes is not None
+    files = []
+    (tmp_path / "images").mkdir()
+    for i in range(len(boxes.frame_stamps)):
+        image = np.full((240, 320, 3), 90, np.uint8)
+        for j in np.flatnonzero(boxes.frame == i):
+            x1, y1, x2, y2 = np.rint(boxes.boxes[j]).astype(int).tolist()
+            cv2.rectangle(image, (x1, y1), (x2, y2), COLOURS[boxes.label_names[boxes.label[j]]], -1)
+        files.append(tmp_path / "images" / f"{i:03d}.png")
+        cv2.imwrite(str(files[-1]), image)
+    with_images = dataclasses.replace(camera_log, rgb=Images(boxes.frame_stamps, tuple(files)))
+    write_log_folder(dataclasses.replace(log, cameras=(with_images,)), tmp_path / "log")
+    result = pipeline.run(read(tmp_path / "log", Ledger(), SourceOptions()), Settings(output=QUICK.output), Ledger())
+    write_result(result, tmp_path / "out")
+    return tmp_path
+
+
+COLOURS = {"cup": (220, 30, 30), "tall chair": (30, 200, 30), "Bücherregal": (20, 20, 210), "plant": (200, 30, 200)}
+
+
+def pictures(page: Page) -> list[tuple[str, Any]]:
+    """What each picture of a box is of, and its pixels."""
+    found = []
+    for image in page.of("img"):
+        kind, _, data = (image["src"] or "").partition(",")
+        if kind == "data:image/jpeg;base64":
+            pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+            found.append(((image["alt"] or "").removeprefix("box of "), pixels))
+    return found
+
+
+def test_the_pictures_show_the_objects(mapped: Path) -> None:
+    page = Page(write_report(mapped / "out", crops=3))
+    found = pictures(page)
+    assert sorted(label for label, _ in found) == sorted(3 * list(COLOURS))
+    for label, pixels in found:
+        middle = pixels[pixels.shape[0] // 2 - 3 :, pixels.shape[1] // 2 - 3 :][:6, :6].reshape(-1, 3)
+        assert np.abs(np.median(middle, axis=0) - COLOURS[label]).max() < 30
+        assert max(pixels.shape) <= 160
+    assert not pictures(Page(write_report(mapped / "out", crops=0)))
+
+
+def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
+    (mapped / "log").rename(mapped / "moved")
+    page = Page(write_report(mapped / "out"))
+    assert not pictures(page)
+    assert f"No pictures. The log is not at {mapped / 'log'} any more" in page.all_text
+    assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) == 16
+
+
+def test_no_file_outside_the_log_is_shown(mapped: Path) -> None:
+    listed = (mapped / "log" / "rgb.txt").read_text()
+    (mapped / "log" / "rgb.txt").write_text(re.sub(r"rgb/", "../images/", listed))
+    page = Page(write_report(mapped / "out"))
+    assert not pictures(page)
+    for link in (mapped / "log" / "rgb").iterdir():
+        link.unlink()
+        link.symlink_to(mapped / "images" / link.name)
+    (mapped / "log" / "rgb.txt").write_text(listed)
+    assert not pictures(Page(write_report(mapped / "out")))
+
+
+def test_the_best_boxes_are_spread_over_time(mapped: Path) -> None:
+    rays = load_rays(mapped / "out")
+    mine = np.flatnonzero(rays.object == 0)
+    score, weight = np.full(len(rays), 0.5), np.ones(len(rays))
+    score[mine[[3, 20]]] = 0.9
+    weight[mine[1]], score[mine[1]] = 0.0, 1.0  # rejected
+    rays = dataclasses.replace(rays, score=score, weight=weight)
+    chosen = best_rays(rays, mine, 4)
+    assert len(chosen) == 4
+    assert {mine[3], mine[20]} <= set(chosen)
+    assert mine[1] not in chosen
+    assert (np.diff(rays.stamp[chosen]) > 0).all()
+    assert best_rays(rays, mine[:2], 4).tolist() == mine[:1].tolist()
+
+
+@pytest.mark.parametrize("name", ["rays.parquet", "summary.json", "config.yaml", "objects.json"])
+def test_what_is_damaged_is_named(tmp_path: Path, name: str) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    write_result(result, tmp_path)
+    (tmp_path / name).write_bytes(b"\x00 not this {")
+    with pytest.raises(OutputError, match=re.escape(name)) as caught:
+        write_report(tmp_path)
+    assert "\n" not in str(caught.value)
+    (tmp_path / name).unlink()
+    with pytest.raises(OutputError):
+        write_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    write_result(result, tmp_path / "out")
+    for folder, code in (("out", 0), ("nowhere", 1)):
+        monkeypatch.setattr("sys.argv", ["objslam", "report", str(tmp_path / folder)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == code
+    told = capsys.readouterr()
+    assert told.out == f"wrote {tmp_path / 'out' / 'report.html'}\n"
+    assert told.err == f"objslam: {tmp_path / 'nowhere'}: there is no such result folder\n"
+
+
+def test_a_new_result_takes_the_old_report_away(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
+    write_result(result, tmp_path)
+    write_report(tmp_path)
+    write_result(result, tmp_path)
+    assert not (tmp_path / "report.html").exists()
+    assert json.loads((tmp_path / "summary.json").read_text())
