@@ -6,13 +6,14 @@ import socket
 import struct
 import sys
 import threading
-import time
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robot import BASE_T_CAMERA, LOOPBACK, MAP_T_ODOM, Drive, Recorder, messages, pose_at, sent, start
+from robot import BASE_T_CAMERA, LOOPBACK, MAP_T_ODOM, Drive, Recorder, messages, pose_at, sent, start, time_of_day
+from waiting import LIMIT, wait_for
 
 pytest.importorskip("cyclonedds")
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
@@ -20,10 +21,11 @@ from bag_writer import Maker, serialize
 
 from objslam.errors import ConfigError, ObjslamError
 from objslam.live.adapters.dds import DdsAdapter, _Publication
-from objslam.live.dds_network import open_network
-from objslam.live.dds_types import dds_topic, dds_type, layouts_of, ros_topic, ros_type
-from objslam.live.ros_messages import RosMessages, RosOptions, parse_topics
-from objslam.live.topic_choice import TopicChoice
+from objslam.live.dds.network import open_network
+from objslam.live.dds.types import dds_topic, dds_type, layouts_of, ros_topic, ros_type
+from objslam.live.ros.message_handler import RosMessages
+from objslam.live.ros.topic_discovery import TopicChoice
+from objslam.sources.ros_bag.options import RosOptions
 
 _DOMAINS = itertools.count(20 + os.getpid() % 60)
 
@@ -39,8 +41,8 @@ def domain(monkeypatch):
 def listening(domain, **choices):
     """A recorder that hears a domain, and its adapter."""
     sink = Recorder()
-    topics = parse_topics([f"{role}={name}" for role, name in choices.items()])
-    adapter = DdsAdapter(open_network(domain), RosMessages(sink, RosOptions(topics=topics)), TopicChoice(topics))
+    messages = RosMessages(sink, RosOptions(topics=tuple(f"{role}={name}" for role, name in choices.items())))
+    adapter = DdsAdapter(open_network(domain), messages, TopicChoice(messages.chosen))
     stop = threading.Event()
     thread = threading.Thread(target=adapter.run, args=(stop,))
     thread.start()
@@ -48,27 +50,19 @@ def listening(domain, **choices):
         yield sink, adapter
     finally:
         stop.set()
-        thread.join(10)
+        thread.join(LIMIT)
     assert not thread.is_alive()
-
-
-def wait_for(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.02)
-    return condition()
 
 
 def stamps(rows):
     return [round(row[0], 6) for row in rows]
 
 
-@pytest.mark.parametrize("reliable", [True, False])
-def test_all_of_a_robot_arrives(domain, reliable):
+def test_all_of_a_robot_arrives(domain):
     with listening(domain) as (sink, adapter):
-        robot = start(Drive(domain, seconds=2.0, reliable=reliable, bad=2))
+        robot = start(Drive(domain, seconds=2.0, bad=2))
         said = sent(robot)
-        assert wait_for(lambda: len(sink.odometry) == len(said["odometry"]) and adapter.ledger.dropped)
+        wait_for(lambda: [len(sink.odometry), len(sink.detections)] == [len(said[kind]) for kind in said])
     assert stamps(sink.odometry) == [round(stamp, 6) for stamp in said["odometry"]]
     assert stamps(sink.detections) == [round(stamp, 6) for stamp in said["detections"]]
     np.testing.assert_allclose(
@@ -88,17 +82,34 @@ def test_all_of_a_robot_arrives(domain, reliable):
     assert adapter.ledger.dropped == {"message that cannot be decoded": 2}
 
 
-def test_a_robot_that_is_killed_and_starts_again_is_heard_again(domain):
+def test_what_arrives_of_a_robot_that_sends_once_is_what_it_sent(domain):
+    """Best effort: a busy machine may lose some of it."""
     with listening(domain) as (sink, _):
-        robot = start(Drive(domain, seconds=60.0))
-        assert wait_for(lambda: len(sink.detections) > 5)
+        robot = start(Drive(domain, seconds=3600.0, reliable=False))
+        wait_for(lambda: len(sink.odometry) > 100 and len(sink.detections) > 10)
         robot.kill()
         robot.communicate()
-        before = len(sink.odometry)
-        said = sent(start(Drive(domain, seconds=1.0, first=before)))
-        assert wait_for(lambda: len(sink.odometry) >= before + len(said["odometry"]))
-    assert stamps(sink.odometry)[before:] == [round(stamp, 6) for stamp in said["odometry"]]
-    assert stamps(sink.detections)[-len(said["detections"]) :] == [round(stamp, 6) for stamp in said["detections"]]
+    found = stamps(sink.odometry), stamps(sink.detections)
+    assert all((np.diff(rows) > 0).all() for rows in found)
+    turns = np.array([np.arctan2(row[1][1, 0], row[1][0, 0]) for row in sink.odometry])
+    steps = np.diff(np.unwrap(turns)) / (0.5 / 200)  # its odometry turns by so much from one message to the next
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    assert (np.round(steps) >= 1).all()
+    assert all(row[3] == [f"cup{i}" for i in range(5)] for row in sink.detections)
+
+
+def test_a_robot_that_is_killed_and_starts_again_is_heard_again(domain):
+    with listening(domain) as (sink, _):
+        robot = start(Drive(domain, seconds=3600.0))
+        wait_for(lambda: len(sink.detections) > 5)
+        robot.kill()
+        robot.communicate()
+        killed = time_of_day()
+        said = sent(start(Drive(domain, seconds=1.0)))
+        wait_for(lambda: stamps(sink.odometry)[-1] == round(said["odometry"][-1], 6))
+        wait_for(lambda: stamps(sink.detections)[-1] == round(said["detections"][-1], 6))
+    for kind, rows in (("odometry", sink.odometry), ("detections", sink.detections)):
+        assert [stamp for stamp in stamps(rows) if stamp > killed] == [round(stamp, 6) for stamp in said[kind]]
 
 
 def test_reliable_and_best_effort_publishers_of_one_topic_are_each_heard_once(domain):
@@ -106,9 +117,11 @@ def test_reliable_and_best_effort_publishers_of_one_topic_are_each_heard_once(do
         drives = [Drive(domain, seconds=1.0, reliable=reliable, heard=("odom",)) for reliable in (True, False)]
         robots = [start(drive) for drive in drives]
         said = [sent(robot)["odometry"] for robot in robots]
-        assert wait_for(lambda: len(sink.odometry) >= sum(map(len, said)))
-        time.sleep(0.2)
-    assert sorted(stamps(sink.odometry)) == sorted(round(stamp, 6) for stamp in said[0] + said[1])
+        # Two messages of two robots may bear the same microsecond, so messages are counted, not only looked for.
+        surely, perhaps = (Counter(round(stamp, 6) for stamp in stamps) for stamps in said)
+        # Best effort may lose some on a busy machine.
+        wait_for(lambda: (heard := Counter(stamps(sink.odometry))) >= surely and heard & perhaps)
+    assert surely <= Counter(stamps(sink.odometry)) <= surely + perhaps
 
 
 def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
@@ -117,8 +130,8 @@ def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
     network = open_network(domain)
     found = BuiltinDataReader(network.participant, BuiltinTopicDcpsPublication)
     with listening(domain) as (sink, adapter):
-        robot = start(Drive(domain, seconds=3.0, reliable=False))
-        assert wait_for(lambda: len(sink.odometry) > 20)
+        robot = start(Drive(domain, seconds=3600.0, reliable=False))
+        wait_for(lambda: len(sink.odometry) > 20)
         (writer,) = [sample.key.bytes for sample in found.take(100) if sample.topic_name == "rt/odom"]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
             for number, payload in ((100_000, b"\0\1\0\0garbage!"), (100_001, b"\0\1\0\0" + b"\xff" * 64)):
@@ -126,10 +139,11 @@ def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
                     port = 7400 + 250 * domain + 11 + 2 * index
                     wire.sendto(rtps_data(writer, number, payload), ("127.0.0.1", port))
         reason = "malformed payload (DDS)"
-        assert wait_for(lambda: adapter.ledger.dropped.get(reason, 0) >= 2)
+        wait_for(lambda: adapter.ledger.dropped.get(reason, 0) >= 2)
         count = len(sink.detections)
-        assert wait_for(lambda: len(sink.detections) > count)
-        sent(robot)
+        wait_for(lambda: len(sink.detections) > count)
+        robot.kill()
+        robot.communicate()
     assert adapter.ledger.examples[reason][0] == "/odom"
 
 
@@ -147,15 +161,15 @@ def test_an_older_layout_of_vision_msgs_is_read(domain):
     newer, older = layouts_of("vision_msgs/msg/Detection2DArray")
     assert newer.__idl__.get_type_id() == messages()["Detection2DArray"].__idl__.get_type_id()
     maker = Maker("2")
-    with listening(domain, odometry="/odom", detections="/old") as (sink, adapter):
+    with listening(domain, odometry="/odom", detections="/old") as (sink, _):
         robot = start(Drive(domain, seconds=1.0, heard=("odom", "tf", "info")))
         participant = DomainParticipant(domain)
         writer = DataWriter(participant, Topic(participant, "rt/old", older))
-        assert wait_for(lambda: len(sink.odometry) > 10 and writer.get_matched_subscriptions())
+        wait_for(lambda: len(sink.odometry) > 10 and writer.get_matched_subscriptions())
         box = [(1, 2, 30, 40, "mug", 0.5, "4")]
-        message = maker.detections(round(time.time() * 1e9), box, "front_optical_frame")
+        message = maker.detections(round(time_of_day() * 1e9), box, "front_optical_frame")
         writer.write(older(serialize(maker, message)))
-        assert wait_for(lambda: sink.detections), adapter.ledger.lines()
+        wait_for(lambda: sink.detections)
         sent(robot)
     ((_, _, boxes, labels, scores, tracks, _),) = sink.detections
     np.testing.assert_allclose(boxes, [box[0][:4]])
