@@ -3,6 +3,7 @@
 What describes objects, rooms or robots is a setting; what a method needs for itself is a constant beside the method.
 """
 
+from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Activation, BoxForm, BoxUnits, Colour, Detector, Layout, Resize, Role
 from objslam.config.estimation import AssociationSettings, Fixed, Joint, Loss, Triangulation
 from objslam.config.live import Live
@@ -17,6 +18,7 @@ __all__ = [
     "BoxForm",
     "BoxUnits",
     "Colour",
+    "CalibrationSettings",
     "Depth",
     "Detector",
     "Device",

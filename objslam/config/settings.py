@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
+from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector
 from objslam.config.estimation import AssociationSettings, Fixed, Joint, Triangulation
 from objslam.config.live import Live
@@ -30,6 +31,7 @@ class Settings(Section):
     odometry: Odometry = Odometry()
     planar: Planar = Planar()
     localization: Localization = Localization()
+    calibration: CalibrationSettings = CalibrationSettings()
     association: AssociationSettings = AssociationSettings()
     triangulation: Triangulation = Triangulation()
     fixed: Fixed = Fixed()

@@ -9,6 +9,7 @@ import numpy as np
 
 from objslam.config import Loss, Settings
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, inverse
@@ -22,6 +23,7 @@ from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_co
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
+from objslam.graph.self_calibration import calibrate
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
@@ -87,16 +89,29 @@ def solve_joint(
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Floats | None = None,
     trace: Trace | None = None,
+    errors: CalibratedMeasurements | None = None,
+    theta: Floats | None = None,
 ) -> Estimate:
     """Poses and objects together, from the localisation's poses, or from a graph that has grown along the odometry.
 
-    start: camera poses (K, 4, 4) to begin from instead.
+    start: camera poses (K, 4, 4) to begin from instead. errors: the errors that all measurements share, as a function of which
+    the same measurements are made anew; they are estimated, beginning at theta (P,), and widen the covariances.
     After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
     that the poses now carry, or place better, enter or move, until nothing changes. Where a stretch of the drive was
     rejected as a whole, its poses may be wrong, not its rays: these are taken back once, and the better solution counts.
     """
-    rays = _share_bias(rays, association, settings)
-    measured = Measurements.of(keyframes, rays, settings)
+
+    def remeasure(values: Floats) -> Measurements:
+        assert errors is not None
+        other, other_rays, scaled = errors.at(values)
+        return Measurements.of(other, _share_bias(other_rays, association, settings), scaled)
+
+    if errors is None:
+        measured = Measurements.of(keyframes, _share_bias(rays, association, settings), settings)
+    else:
+        theta = np.zeros(len(errors.names)) if theta is None else theta
+        measured = remeasure(theta)
+    keyframes, rays = measured.keyframes, measured.rays
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
     if start is not None:
@@ -117,6 +132,12 @@ def solve_joint(
             found = replace(other, cost_before=found.cost_before, iterations=iterations)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
+    calibration, sensitivity = None, None
+    if errors is not None and theta is not None:
+        calibrated = calibrate(errors, remeasure, association, found, theta)
+        calibration, sensitivity = calibrated.calibration, calibrated.sensitivity
+        measured, found = calibrated.measured, calibrated.found
+        keyframes, rays = measured.keyframes, measured.rays
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
 
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
@@ -136,6 +157,8 @@ def solve_joint(
     wider = widening(residual, association.object[used], association.count)
     covariance *= wider[:, None, None]
     seen_sigma *= np.sqrt(wider)
+    if calibration is not None and sensitivity is not None:
+        covariance += sensitivity @ calibration.covariance @ np.swapaxes(sensitivity, 1, 2)
     return Estimate(
         map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
         positions=positions,
@@ -146,6 +169,7 @@ def solve_joint(
         cost_before=found.cost_before,
         cost_after=optimum.cost_after,
         iterations=found.iterations,
+        calibration=calibration,
     )
 
 

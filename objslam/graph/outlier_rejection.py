@@ -62,7 +62,7 @@ def reject_outliers(
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
     for _ in range(_ROUNDS):
-        positions, supported = _second_opinion(measured, map_T_camera, association, positions, used)
+        positions, supported = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
             supported = supported | back
         elif (supported == used).all():
@@ -104,7 +104,7 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
     return STRAY_RAY * strays + truncated_cost(measured.rays, owner, positions, map_T_camera, *measured.odometry())
 
 
-def _second_opinion(
+def second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
 ) -> tuple[Floats, Bools]:
     """Positions (N, 3), NaN where there is none, and the rays (R,) that agree with them.

@@ -20,6 +20,7 @@ from objslam.core.trace import Round, Trace, Why
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
+from objslam.frontend.shared_errors import SharedErrors
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -63,10 +64,12 @@ def solve(
     ledger: Ledger,
     progress: Progress,
     start: InitialEstimate | None = None,
+    errors: SharedErrors | None = None,
 ) -> Solution:
     """Find and solve the objects of a log; frames are all that have a pose, those without a ray too.
 
     start: what is known already of the keyframes with a ray, where the joint mode need not explore nor trust labels.
+    errors: the errors that all measurements share, for the keyframes with a ray. Joint mode estimates them.
 
     Where the settings say so, every label is one object; in joint mode also where no frame has two boxes of one label, and
     the rays bear it out: the graph grows with that knowledge. Else the association is global: in fixed mode once, at the
@@ -97,7 +100,7 @@ def solve(
         return Solution(keyframes, rays_of_keyframes, association, estimate, (), tuple(trace.rounds if trace else ()))
     if not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation")
-    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start)
+    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start, errors)
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
@@ -118,6 +121,7 @@ def _joint(
     progress: Progress,
     trace: Trace | None,
     start: InitialEstimate | None,
+    errors: SharedErrors | None,
 ) -> Solution:
     from objslam.graph import batch_solver
     from objslam.graph.init_unknown_correspondences import initialize_unknown
@@ -125,8 +129,12 @@ def _joint(
     def tell(done: int, total: int) -> None:
         progress("solve", done, total)
 
+    theta: Floats | None = None
+
     def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
-        solved = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, tell, start, trace)
+        nonlocal theta
+        solved = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, tell, start, trace, errors, theta)
+        theta = None if solved.calibration is None else solved.calibration.values
         if trace is not None:
             trace.end_round(why, association, solved)
         return solved
@@ -136,6 +144,7 @@ def _joint(
         solved = solve_round("labels", by_label)
         if _labels_tell(settings, by_label, solved.weight):
             _count_unexplained(rays, by_label, ledger)
+            keyframes, rays = _corrected(errors, theta, keyframes, rays)
             return Solution(keyframes, rays, by_label, solved, (), tuple(trace.rounds if trace else ()))
 
     map_T_camera = keyframes.map_T_camera
@@ -145,11 +154,15 @@ def _joint(
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
+    seen, seen_rays, everything = keyframes, rays, (frames, all_rays)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
     estimate: Estimate | None = None
     for number in range(settings.joint.max_rounds):
         progress(f"association, round {number + 1}", 0, 0)
+        if errors is not None and theta is not None:
+            frames, all_rays = _corrected(errors, theta, *everything)
+            keyframes, rays = _corrected(errors, theta, seen, seen_rays)
         at = correct_poses(frames.stamps, frames.map_T_base, keyframes.stamps, keyframes.map_T_base, map_T_base)
         scale = 1.0 if rounds else _FIRST
         noise = np.hypot(all_rays.sigma, scale * _SOLVED_YAW), scale * _SOLVED_XY
@@ -173,7 +186,17 @@ def _joint(
     assert association is not None
     assert estimate is not None
     _count_unexplained(rays, association, ledger)
+    keyframes, rays = _corrected(errors, theta, seen, seen_rays)
     return Solution(keyframes, rays, association, estimate, tuple(rounds), tuple(trace.rounds if trace else ()))
+
+
+def _corrected(
+    errors: SharedErrors | None, theta: Floats | None, keyframes: Keyframes, rays: Rays
+) -> tuple[Keyframes, Rays]:
+    """Some of the log's keyframes and rays with the shared errors theta (P,) taken out."""
+    if errors is None or theta is None:
+        return keyframes, rays
+    return errors.take(keyframes, rays).at(theta)[:2]
 
 
 def _associate(

@@ -113,6 +113,7 @@ def summarise(
             label: round(float(n / of), 4) for label, n, of in zip(rays.label_names, left, total, strict=True) if n
         },
         "rounds": list(solution.rounds),
+        "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "dropped": dict(ledger.dropped),
         "dropped_examples": {k: v for k, v in ledger.examples.items() if v},
         "cost_before": estimate.cost_before,

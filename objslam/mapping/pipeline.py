@@ -21,7 +21,8 @@ from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping.alternation import Progress, Solution, solve
+from objslam.frontend.shared_errors import shared_errors
+from objslam.mapping.alternation import Progress, Solution, seen_something, solve
 from objslam.mapping.describe import describe, summarise
 from objslam.mapping.reconstruction import has_depth, reconstruct
 
@@ -43,8 +44,12 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         )
     cameras = tuple(c.camera for c in log.cameras)
     with _stage("solve", seconds, progress):
-        solution = solve(frames, rays, cameras, settings, ledger, progress)
+        errors = shared_errors(log, *seen_something(frames, rays), settings)
+        solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
+    if errors is not None and estimate.calibration is not None:
+        log = errors.corrected_log(estimate.calibration.values)
+        cameras = tuple(c.camera for c in log.cameras)
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     path = log.localization or log.odometry

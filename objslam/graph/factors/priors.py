@@ -9,7 +9,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.graph.variables import L0, X0
 
-_ANCHOR = 1e-4
+ANCHOR = 1e-4
 """The standard deviation (rad, m) with which the first keyframe is held. Chosen far below any measurement's; larger lets the
 map drift as a whole, smaller makes the linear system worse conditioned."""
 
@@ -21,7 +21,7 @@ def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> l
 
 def anchor(keyframe: int, map_T_camera: Floats) -> gtsam.NonlinearFactor:
     """Hold X(keyframe) where it is (4, 4): bearings and odometry alone do not say where the map lies."""
-    return pose_prior(keyframe, map_T_camera, _ANCHOR, _ANCHOR)
+    return pose_prior(keyframe, map_T_camera, ANCHOR, ANCHOR)
 
 
 def point_prior(landmark: int, position: Floats, sigma: float) -> gtsam.NonlinearFactor:

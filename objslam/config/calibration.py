@@ -1,0 +1,36 @@
+"""The settings of the calibration: which errors that all measurements share are estimated, and how large they may be."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from objslam.config.section import NotNegative, Positive, Section
+
+
+class CalibrationSettings(Section):
+    """Errors that all measurements of a robot share; each number is a prior standard deviation, and 0 holds its error at 0."""
+
+    use: Literal["auto"] | bool = "auto"
+    """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off."""
+    scale: NotNegative = 0.03
+    """share by which all ways of the odometry are too long or too short."""
+    turn_scale: NotNegative = 0.05
+    """share by which all turns of the odometry are too large or too small."""
+    turn_bias: NotNegative = 0.001
+    """rad/s; the turn rate that the odometry adds at all times, for example because the wheels differ."""
+    clock: NotNegative = 0.1
+    """s; the offset of each camera's clock against the clock of the poses."""
+    max_clock: Positive = 0.5
+    """s; the largest offset of a clock that is looked for."""
+    yaw: NotNegative = 0.03
+    """rad; the rotation of each camera on the base about the vertical axis."""
+    tilt: NotNegative = 0.02
+    """rad; the rotation of each camera on the base about the sideways axis."""
+    roll: NotNegative = 0.02
+    """rad; the rotation of each camera on the base about the forward axis."""
+    translation: NotNegative = 0.0
+    """m; the offset of each camera's place on the base, along each axis."""
+    range_scale: NotNegative = 0.01
+    """share by which all ranges are too long or too short."""
+    focal: NotNegative = 0.0
+    """share by which the focal length of each camera is too long or too short."""
