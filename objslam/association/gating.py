@@ -151,8 +151,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tuple[Ints, Ints]:
     """Return the pairs (P,) of a row and a column with the greatest total gain (Hungarian method).
 
-    Each row and each column is in at most one pair. row, column, gain: (E,) of the possible pairs, with gains above 0. shape:
-    the numbers of rows and columns.
+    Each row and each column is in at most one pair. row, column, gain: (E,) of the possible pairs, with gains above 0.
+    shape: the numbers of rows and columns.
     """
     from scipy.optimize import linear_sum_assignment
     from scipy.sparse import csr_array
