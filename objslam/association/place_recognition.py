@@ -212,7 +212,7 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the log likelihood ratio (..., C) of pairs over new landmarks for corrections (..., 3), -inf outside the gate."""
+    """Return the log likelihood ratio (..., C) of pairs over new landmarks for corrections (..., 3), -inf beyond a gate."""
     miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
