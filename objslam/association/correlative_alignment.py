@@ -21,12 +21,9 @@ _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared devia
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
     """Return the planar correction (4, 4) in map that aligns the rays of these cameras with the landmarks.
 
-    Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray.
-
-    Args:
-        positions, labels: (N, 3) m and (N,), of the landmarks.
-        centre: (3,) m, the point about which the correction turns.
-        spread: (3,) standard deviations of x, y (m) and yaw (rad) in map. They define the prior and bound the grid.
+    Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray. positions,
+    labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
+    standard deviations of x, y (m) and yaw (rad) in map, which define the prior and bound the grid.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -60,8 +57,8 @@ def _misfit(
     deviation = angle**2 / (sigma**2 + (_LANDMARK_SIGMA / distance) ** 2)
     miss = (distance - (rays.range * level)[:, None]) ** 2 / (rays.range_sigma**2 + _LANDMARK_SIGMA**2)[:, None]
     deviation += np.where(np.isfinite(rays.range)[:, None], np.minimum(miss, _MOST_RANGE_COST), 0.0)
-    same = rays.label[:, None] == labels
-    return np.asarray(np.where(same, deviation, STRAY_RAY).min(axis=2, initial=STRAY_RAY).sum(axis=1))
+    cost = np.where(rays.label[:, None] == labels, deviation, STRAY_RAY)
+    return np.asarray(cost.min(axis=2, initial=STRAY_RAY).sum(axis=1))
 
 
 def _steps(sigma: float, finest: float, most: int) -> Floats:

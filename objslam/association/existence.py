@@ -131,13 +131,11 @@ def size_odds(state: State) -> Floats:
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
     """Return the number of rays (N,) of all landmarks of the same class with no more rays than each landmark."""
-    order = np.lexsort((number, label))
+    rank = label * (int(number.max(initial=0)) + 1) + number
+    order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))
-    rank = label[order] * (int(number.max(initial=0)) + 1) + number[order]
-    first, last = np.searchsorted(label[order], label[order]), np.searchsorted(rank, rank, side="right")
-    result = np.empty(len(number), dtype=np.int64)
-    result[order] = total[last] - total[first]
-    return result
+    first, last = np.searchsorted(label[order], label), np.searchsorted(rank[order], rank, side="right")
+    return np.asarray(total[last] - total[first])
 
 
 def rest_odds(state: State) -> Floats:

@@ -85,8 +85,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
     turn, move = np.zeros((2, len(obs.label)))
     if pose is not None:  # Twice its diagonal blocks bound a covariance with any correlation between them.
         turn, move = (2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
-    rays: list[Ints] = []
-    found: list[Ints] = []
+    rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
     for label in np.unique(obs.label):
         mine, which = np.flatnonzero(obs.label == label), np.flatnonzero(landmarks.accepts[:, label])
@@ -104,12 +103,6 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
             rays.append(r[a])
             found.append(which[b])
     return np.concatenate(rays), np.concatenate(found)
-
-
-def reassign(obs: Observations, landmarks: Landmarks, matched: Ints, gate: float) -> Ints:
-    """Return the best landmark (R,) of each ray, -1 for none. The previous landmarks, matched (R,), keep tracks together."""
-    edges = gated_edges(obs, landmarks, gate)
-    return best_assignment(edges, edges.cost - track_bonus(edges, obs.track, matched), obs.frame, gate)
 
 
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:

@@ -1,8 +1,7 @@
 """Global association at known poses: assign rays to an unknown number of objects.
 
-For each label a search finds points where rays of different frames meet. The best points become landmarks, and the search
-continues with the remaining rays. Then landmarks are merged, fused across labels and dropped, each time in favour of the
-cheaper explanation of the boxes and the misses.
+A search finds points where rays of one label meet, and the best points become landmarks. Then landmarks are merged, fused
+across labels and dropped, each time in favour of the cheaper explanation of the boxes and the misses.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.existence import chance_odds, existence
-from objslam.association.gating import gate_limit, reassign
+from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
@@ -74,19 +73,13 @@ def associate_globally(
         guess: an initial association of these rays, and the positions (N, 3) m of its objects. NaN drops an object.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = CameraFrames(
-        stamps=keyframes.stamps[keyframe],
-        cameras=cameras,
-        camera=keyframes.camera[keyframe],
-        map_T_camera=map_T_camera[keyframe],
-        margin=settings.rays.border,
-        margin_share=settings.rays.border_share,
-    )
+    margins = settings.rays.border, settings.rays.border_share
+    camera = keyframes.camera[keyframe]
+    view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
-    task = _Task(
-        gate_limit(settings.association.gate), settings.association, torch_device(settings.triangulation.device), seed
-    )
+    device = torch_device(settings.triangulation.device)
+    task = _Task(gate_limit(settings.association.gate), settings.association, device, seed)
     if guess is not None:
         association, position = guess
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
@@ -95,7 +88,7 @@ def associate_globally(
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX), 2)
-        state = _merge_round(task, _drop_chance(task, state))
+        state = _merge_round(task, state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS))
         state = _drop(task, state, existence(state, task.gate))
         if state.count <= before:
             break
@@ -132,8 +125,7 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / state.view.solid_angle
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
-        search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
-        points = discover(pool, search, rng)
+        points = discover(pool, Search(task.settings.hypotheses, support, task.gate, parallax, task.device), rng)
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
         landmarks = landmarks.and_also(new)
     return replace(state, landmarks=landmarks)
@@ -148,19 +140,21 @@ def _add_distant(task: _Task, state: State) -> State:
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
-    return _drop_chance(task, state.keep(narrow | (np.arange(len(narrow)) < known)))
+    state = state.keep(narrow | (np.arange(len(narrow)) < known))
+    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
 
 
 def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
     """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times."""
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched
-        matched = reassign(obs, old, before, task.gate)
+        edges = gated_edges(obs, old, task.gate)
+        matched = best_assignment(edges, edges.cost - track_bonus(edges, obs.track, before), obs.frame, task.gate)
         held = np.flatnonzero(matched >= 0)
         position = refine(obs, held, matched[held], old.position, old.noise)
         state = State(obs, state.view, replace(old, position=position), matched)
-        keep = _plausible(task, state)
-        state = replace(state, landmarks=replace(state.landmarks, noise=state.noise)).keep(keep)
+        plausible = _plausible(task, state)
+        state = replace(state, landmarks=replace(state.landmarks, noise=state.noise)).keep(plausible)
         if np.array_equal(matched, before):
             break
     return state
@@ -172,18 +166,11 @@ def _plausible(task: _Task, state: State) -> Bools:
     return np.asarray((state.ray_count >= task.settings.min_rays) & near)
 
 
-def _drop_chance(task: _Task, state: State) -> State:
-    """Drop landmarks whose rays may be strays that meet by chance."""
-    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
-
-
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:
     if state.count < 2:
         return state
     target = merge_targets(state, task.gate, across_labels)
-    if (target == np.arange(len(target))).all():
-        return state
-    return _alternate(task, state.merge(target))
+    return state if (target == np.arange(len(target))).all() else _alternate(task, state.merge(target))
 
 
 def _merge_all(task: _Task, state: State) -> State:
@@ -228,9 +215,6 @@ def _result(state: State, existence: Floats, ray: Ints) -> Association:
     first = np.full(len(label), len(ray))
     np.minimum.at(first, state.owner, state.assigned)
     order = np.lexsort((first, label))
-    number = np.append(np.empty(len(label), dtype=np.int64), -1)
-    number[order] = np.arange(len(label))
-    matched = np.empty(len(ray), dtype=np.int64)
-    matched[ray] = number[state.matched]
+    matched = np.append(np.argsort(order), -1)[state.matched][np.argsort(ray)]
     weights = counts[order] / np.maximum(counts[order].sum(axis=1, keepdims=True), 1)
     return Association(matched, label[order], weights, existence[order])

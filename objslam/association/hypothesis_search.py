@@ -59,7 +59,7 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
         taken = support[best] > scorer.doubt
         left -= support[:, taken].sum(dim=1)
         support[:, taken] = 0.0
-    return scorer.unload(moved[found])
+    return np.asarray(moved[found].double().cpu().numpy() + scorer.centre)
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
@@ -134,10 +134,6 @@ class _Scorer:
     def load(self, points: Floats) -> Tensor:
         """Convert points (H, 3) in map to a tensor relative to the mean camera position."""
         return self._tensor(points - self.centre)
-
-    def unload(self, points: Tensor) -> Floats:
-        """Convert a tensor of `load` back to points (H, 3) in map."""
-        return np.asarray(points.double().cpu().numpy() + self.centre)
 
     def supports(self, points: Tensor) -> Tensor:
         """Return supports (H, R) of points by rays: 1 for a perfect fit, less with the squared deviation, 0 at the gate."""

@@ -1,7 +1,6 @@
 """Joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-Their gates are then so wide that an unknown object may lie in them. Several landmarks together tell more, because one pose
-error must explain all their offsets. This leaves little freedom for each of them.
+Unknown objects may lie in their wide gates. So one pose error must explain the offsets of all landmarks together.
 """
 
 from __future__ import annotations
@@ -25,11 +24,9 @@ def jointly_compatible(
 ) -> Bools:
     """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
-    A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay.
-
-    Args:
-        doubt: (6, 6) covariance of the camera's pose relative to the landmarks, in the camera frame.
-        unknown: (n,) expected number of unknown objects of the label per steradian along each ray.
+    A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay. doubt: (6, 6)
+    covariance of the camera's pose relative to the landmarks, in the camera frame. unknown: (n,) expected number of unknown
+    objects of the label per steradian along each ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)

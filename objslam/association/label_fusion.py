@@ -36,7 +36,6 @@ def fused_labels(state: State, gate: float) -> Bools:
     ray, landmark = edges.ray[missed], edges.landmark[missed]
     pair = landmark * labels + free.label[ray]
     number = np.bincount(pair, minlength=count * labels).reshape(count, labels)
-
     away = np.linalg.norm(state.landmarks.position[landmark] - free.origin[ray], axis=1)
     size = grouped_median(np.sqrt(free.size[ray].prod(axis=1)) * away, pair, count * labels).reshape(count, labels)
     ratio = size / np.maximum(state.size, 1e-9)[:, None]

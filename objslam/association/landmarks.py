@@ -25,9 +25,6 @@ class Landmarks:
     noise: Floats
     accepts: Bools
 
-    def __len__(self) -> int:
-        return len(self.position)
-
     @classmethod
     def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
         """Create landmarks at exact positions that accept one label (N,) each, of `labels` labels."""

@@ -34,9 +34,6 @@ class _Pairs:
     ray: Ints
     pair: Ints
 
-    def __len__(self) -> int:
-        return len(self.a)
-
 
 def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
     """Return the landmark (N,) that each landmark merges into: itself, or the one with more rays if a pair is one object.
@@ -67,8 +64,7 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
     for p in np.lexsort((b, a, -gain)):  # The pair with the largest gain comes first. Each landmark merges at most once.
         if one[p] and not taken[a[p]] and not taken[b[p]]:
             taken[[a[p], b[p]]] = True
-            keep, gone = (a[p], b[p]) if number[a[p]] >= number[b[p]] else (b[p], a[p])
-            target[gone] = keep
+            target[[a[p], b[p]]] = a[p] if number[a[p]] >= number[b[p]] else b[p]
     return target
 
 
@@ -109,7 +105,7 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
     """Return the -2 ln likelihood (P,) that one object saves over two, in fit, boxes, misses and number of objects."""
-    count, a, b, number = len(pairs), pairs.a, pairs.b, state.ray_count.astype(float)
+    count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]
     two = _ray_costs(r, position[own], noise[own], gate)
@@ -160,7 +156,7 @@ def _seen_apart(obs: Observations, pairs: _Pairs, matched: Ints) -> Ints:
     ray, pair = pairs.ray[order], pairs.pair[order]
     both = np.flatnonzero((np.diff(pair) == 0) & (np.diff(obs.frame[ray]) == 0))
     different = overlap(obs.box[ray[both]], obs.box[ray[both + 1]]) < _DUPLICATE_OVERLAP
-    return np.bincount(pair[both[different]], minlength=len(pairs))
+    return np.bincount(pair[both[different]], minlength=len(pairs.a))
 
 
 def overlap(one: Floats, two: Floats) -> Floats:

@@ -28,11 +28,9 @@ def assign(
     A known range adds to the cost of a match, but a wrong range adds little.
 
     Args:
-        positions: (N, 3) m, NaN to leave a landmark out.
-        covariances: (N, 3, 3) m^2.
+        positions, covariances: (N, 3) m, NaN to leave a landmark out, and (N, 3, 3) m^2.
         accepts: (N, L) whether a box of a label may belong to the landmark.
-        map_T_camera: (K, 4, 4) of the rays' keyframes.
-        sigma: (R,) rad, of the rays.
+        map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, of the rays.
         pose_covariance: (K, 6, 6) in the camera frames, rotation first, as in GTSAM's marginals.
         gate: the share of correct matches that the bearing gate accepts.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
@@ -65,11 +65,10 @@ def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats]:
 
 
 def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Find the closest approach of P pairs of rays.
+    """Return the closest approach of P pairs of rays.
 
-    Returns:
-        The distances along the first and the second ray (P,) m, the midpoint (P, 3) m, the squared gap (P,) m^2, and the
-        squared sine of the angle between the rays (P,).
+    The values are the distances along the first and the second ray (P,) m, the midpoint (P, 3) m, the squared gap (P,) m^2,
+    and the squared sine of the angle between the rays (P,).
     """
     m, n, o, p = obs.origin[first], obs.direction[first], obs.origin[second], obs.direction[second]
     between, cos, normal = o - m, np.einsum("pi,pi->p", n, p), np.cross(n, p)
@@ -88,27 +87,16 @@ def observe(
     Frames are sorted by time and camera, and boxes within a frame by label and box. So nothing depends on the input order.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
-    number = np.empty(len(keyframe), dtype=np.int64)
-    number[keyframe] = np.arange(len(keyframe))
-    frame = number[rays.keyframe]
+    frame = np.argsort(keyframe)[rays.keyframe]
     ray = np.lexsort((*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame))
     rays, frame = rays.take(ray), frame[ray]
     origin, direction = rays.in_map(map_T_camera)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
-    observations = Observations(
-        frame=frame,
-        label=rays.label,
-        origin=origin,
-        direction=direction,
-        sigma=sigma[ray],
-        position_sigma=position_sigma,
-        range=np.where(known, rays.range, np.nan),
-        range_sigma=np.where(known, rays.range_sigma, np.nan),
-        size=size_per_metre(rays, keyframes, cameras),
-        box=rays.box,
-        track=rays.track_id,
-    )
-    return observations, ray, keyframe
+    ranges = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
+    lines = Observations.of_lines(origin, direction, sigma[ray], *ranges, rays.label)
+    size = size_per_metre(rays, keyframes, cameras)
+    obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
+    return obs, ray, keyframe
 
 
 def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
@@ -130,8 +118,8 @@ def extents(
 ) -> Floats:
     """Return the median width and height (N, 2) m of objects at positions (N, 3) m over their rays.
 
-    They are NaN without rays or position, and if half of the rays come from a camera that observes no sizes. map_T_camera:
-    (K, 4, 4) of the keyframes.
+    They are NaN without rays or position, and if half of the rays come from a camera that observes no sizes.
+    map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)
     index = association.object[held]

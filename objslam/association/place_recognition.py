@@ -1,8 +1,7 @@
 """Place recognition: find one constellation of landmarks in another by their relative positions.
 
-After a drift of metres a robot sees no landmark where it expects one, and a single landmark could be any of its class.
-Several landmarks that fit under one shift and turn within the drift are evidence. It is the Bayes factor of "these landmarks
-are those" over "all of them are new".
+Several landmarks that fit under one shift and turn within the drift are evidence for the place. The evidence is the Bayes
+factor of "these landmarks are those" over "all of them are new".
 """
 
 from __future__ import annotations
@@ -77,11 +76,9 @@ def recognise_place(
 ) -> Recognition | None:
     """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M), None if nothing fits.
 
-    Args:
-        pivot: (2,) m, the point about which the correction turns.
-        prior: (3, 3) covariance of the correction in x, y (m) and yaw (rad), with mean zero.
-        density: (N,) landmarks `there` per m^2 with the label of each landmark `here`.
-        possible: (N, M) which pairs may be the same landmark.
+    pivot: (2,) m, the point about which the correction turns. prior: (3, 3) covariance of the correction in x, y (m) and yaw
+    (rad), with mean zero. density: (N,) landmarks `there` per m^2 with the label of each landmark `here`. possible: (N, M)
+    which pairs may be the same landmark.
     """
     centre = np.append(pivot, 0.0)
     total = here.covariance[:, None] + there.covariance

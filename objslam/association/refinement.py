@@ -43,9 +43,7 @@ def normalised_residuals(obs: Observations, position: Floats, slack: float = 0.0
 
 def information(obs: Observations, point: Floats) -> Floats:
     """Return the information (R, 3, 3) m^-2 of each ray about its point, (R, 3) or (3,)."""
-    to = point - obs.origin
-    distance = np.linalg.norm(to, axis=1)
-    n = obs.direction
+    distance, n = np.linalg.norm(point - obs.origin, axis=1), obs.direction
     along = n[:, :, None] * n[:, None, :]
     across = (np.eye(3) - along) / (obs.sigma * np.maximum(distance, MIN_DEPTH))[:, None, None] ** 2
     weight = np.where(np.isfinite(obs.range), 1 / obs.range_sigma**2, 0.0)
@@ -67,10 +65,8 @@ def range_costs(
 def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats) -> Floats:
     """Refine positions (N, 3) m of points from P pairs of a ray and its point. A ray may be in several pairs.
 
-    Args:
-        ray, index: (P,) the observation and the point of each pair.
-        start: (N, 3) m. A point keeps its start value in directions that its rays do not observe.
-        noise: (N,) factor on the noise of the rays.
+    ray, index: (P,) the observation and the point of each pair. start: (N, 3) m. A point keeps its start value in directions
+    that its rays do not observe. noise: (N,) factor on the noise of the rays.
     """
     count = len(start)
     order = np.argsort(index, kind="stable")
@@ -103,12 +99,9 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
 def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Floats, steps: int) -> tuple[Floats, Floats]:
     """Refine a few points faster than `refine`: return positions (N, 3) m and covariances (N, 3, 3) m^2.
 
-    Args:
-        obs: all rays of the first point, then all rays of the second point, and so on.
-        number: (N,) number of rays of each point, at least 1.
-        start: (N, 3) m.
-        damping: (N, 3, 3) m^-2, information that keeps a point at its place in each step.
-        steps: number of Gauss-Newton steps.
+    obs: all rays of the first point, then all rays of the second point, and so on. number: (N,) number of rays of each
+    point, at least 1. start: (N, 3) m. damping: (N, 3, 3) m^-2, information that keeps a point at its place in each step.
+    steps: number of Gauss-Newton steps.
     """
     index, begin, position = np.repeat(np.arange(len(number)), number), np.cumsum(number) - number, start
     for _ in range(steps):

@@ -38,16 +38,16 @@ def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -
         return None
     inlier = normalised_residuals(obs, start, slack) < OUTLIER_RAY
     for _ in range(2):
-        if inlier.sum() < 2:
-            return None
         held, before = np.flatnonzero(inlier), inlier
+        if len(held) < 2:
+            return None
         start = refine(obs, held, np.zeros(len(held), dtype=np.int64), start[None], np.ones(1))[0]
         inlier = normalised_residuals(obs, start, slack) < OUTLIER_RAY
         if (inlier == before).all():
             break
-    if inlier.sum() < 2:
-        return None
     held = np.flatnonzero(inlier)
+    if len(held) < 2:
+        return None
     some = held[np.linspace(0, len(held) - 1, min(len(held), _MOST_RAYS)).astype(np.int64)]
     inner = obs.take(held)
     covariance = np.linalg.inv(information(inner, start).sum(axis=0) + _FREE_INFORMATION * np.eye(3))

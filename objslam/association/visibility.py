@@ -73,11 +73,8 @@ def detection_history(
     """Return where the objects are or should be detected.
 
     An object should be detected if its box lies in the image, at a usual distance of its class or of itself, is not occluded
-    by a closer box, and shows the object's front if it has one.
-
-    Args:
-        matched: (R,) the object of each observation, -1 for none.
-        position, label: (N, 3) m and (N,), of the objects.
+    by a closer box, and shows the object's front if it has one. matched: (R,) the object of each observation, -1 for none.
+    position, label: (N, 3) m and (N,), of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
@@ -89,7 +86,6 @@ def detection_history(
     own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(distance[held], index, count, (0.5, 1.0)))
     near, far = np.minimum(own, near[label]), np.maximum(own, far[label])
     reach = np.maximum(furthest, far)
-
     pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)))]
     for number, camera in enumerate(view.cameras):
         frames = np.flatnonzero(view.camera == number)
@@ -102,15 +98,12 @@ def detection_history(
     usual &= _from_the_front(obs.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
     clear = ~_hidden(frame, away, pixel, obs, np.where(np.isfinite(obs.range), obs.range, distance))
-    there = np.sort(index * total + obs.frame[held])
-    key = np.sort(np.concatenate([obj[clear] * total + frame[clear], there]))
-    key = key[np.append(True, np.diff(key) > 0)[: len(key)]]
-    at = np.minimum(np.searchsorted(there, key), max(len(there) - 1, 0))
-    detected = there[at] == key if len(there) else np.zeros(len(key), dtype=bool)
-    return DetectionHistory(key // total, key % total, detected, inside)
+    there = index * total + obs.frame[held]
+    key = np.union1d(obj[clear] * total + frame[clear], there)
+    return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
 
 
-def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> tuple[Floats, Floats]:
+def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
     """Return the least and the greatest usual distance (C,) of each class, from the distances (P,) m of its boxes."""
     number = np.bincount(index, minlength=len(label))
     order = np.lexsort((-number, label))
@@ -120,8 +113,7 @@ def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> tuple[Floats, F
     core[order] = before <= _CORE_SHARE * np.bincount(label, number)[label[order]]
     core_box = core[index]
     classes = int(label.max(initial=-1)) + 1
-    near, far = grouped_quantiles(distance[core_box], label[index[core_box]], classes, _USUAL_DISTANCES)
-    return near, far
+    return grouped_quantiles(distance[core_box], label[index[core_box]], classes, _USUAL_DISTANCES)
 
 
 def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
@@ -130,15 +122,12 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
     An object has a front if nearly all its boxes come from one half space. Misses from the other half space then tell
     nothing. origin, index: (P, 3) m and (P,), the camera position and the object of each box.
     """
-    count, toward = len(position), _unit(origin - position[index])
+    count, toward = len(position), origin - position[index]
+    toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     front = grouped_sums(toward, index, count)
     facing = np.einsum("pi,pi->p", toward, front[index])
     one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FRONT_SHARE)) >= 0
     return ~one_sided[obj] | (np.einsum("vi,vi->v", camera - position[obj], front[obj]) >= 0)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
 def _in_image(

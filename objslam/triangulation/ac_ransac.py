@@ -1,9 +1,8 @@
 """A-contrario consensus over ray pairs (AC-RANSAC): which rays of an object agree, for many objects at once, in torch.
 
-The noise of real rays is unknown, because the box of a large object wanders by many times the pixel noise. So there is no
-fixed threshold. The score of a point is the probability that chance makes rays agree so well (Moisan & Stival, IJCV 57,
-2004; Moisan, Moulon & Monasse, IPOL 2, 2012). The consensus is the share of rays whose agreement is the least likely by
-chance. `triangulate` imports this module on its first call.
+No fixed threshold fits, because the box of a large object wanders by many times the pixel noise. So the consensus is the
+share of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon & Monasse, IPOL
+2, 2012).
 """
 
 from __future__ import annotations
@@ -68,14 +67,13 @@ def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
 
     Objects that their rays do not fix keep the point of `least_squares` and get a NaN gradient.
     """
-    count = len(bundle.number)
     origin, direction, index = bundle.origin[use], bundle.direction[use], bundle.index[use]
-    point, determined = least_squares(origin, direction, index, count)
+    point, determined = least_squares(origin, direction, index, len(bundle.number))
     gradient = torch.full_like(point[:, 0], torch.nan)
     rays = determined[index]
     number = (torch.cumsum(determined, 0) - 1)[index[rays]]
-    origin, direction, begin = origin[rays], direction[rays], point[determined]
-    point[determined], iterations, gradient[determined] = minimise_distances(origin, direction, number, len(begin), begin)
+    solved = minimise_distances(origin[rays], direction[rays], number, point[determined])
+    point[determined], iterations, gradient[determined] = solved
     return PointSolution(point, determined, gradient, iterations)
 
 
@@ -144,8 +142,7 @@ def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
     for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
         chance = _chance(bundle, rays, real, points[objects, None])
         log_nfa[objects, None], limit = _least_chance(chance, bundle.number[objects])
-        chosen = (chance[:, 0] <= limit) & (chance[:, 0] < 1) & real
-        inlier[rays[real]] = chosen[real]
+        inlier[rays[real]] = ((chance[:, 0] <= limit) & (chance[:, 0] < 1))[real]
     return inlier, log_nfa
 
 

@@ -1,7 +1,4 @@
-"""Covariance and parallax of triangulated objects, and their fusion with ranges, for many objects at once, in torch.
-
-`triangulate` imports this module on its first call.
-"""
+"""Covariance and parallax of triangulated objects, and their fusion with ranges, for many objects at once, in torch."""
 
 from __future__ import annotations
 
@@ -24,9 +21,8 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
     & Ronchetti, Robust Statistics, ch. 6). Offsets are Gaussian with s_i along both axes across ray i. The unit offset u
     then has E[u u^T] = P / 2, and is independent of the distance with E[1 / distance] = sqrt(pi / 2) / s_i. So a ray adds
-    sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i widen the result. Smaller ones do not narrow it.
-
-    Eq. 1 also has a bias that more rays do not reduce. Angular noise tilts the unit offset forward along ray i of length
+    sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1
+    also has a bias that more rays do not reduce. Angular noise tilts the unit offset forward along ray i of length
     r_i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, because rays miss a nearer object by less. The result includes its square.
     """
     rays = _used(bundle, use)
@@ -59,8 +55,7 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     has = typical.isfinite()
     measured = torch.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
     informed = has[rays.index]
-    zero = torch.zeros_like(rays.origin)
-    lines = Lines.through(torch.where(informed[:, None], rays.origin, zero), rays.direction, rays.index, count)
+    lines = Lines.through(torch.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count)
     weight = torch.where(informed, 1 / s.square(), 0.0)
     across_matrix = lines.spread(weight)
     across_vector = lines.sum(weight[:, None] * lines.foot)
@@ -90,8 +85,7 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     factor = _variance_factor(lines.offset(point).norm(dim=1) / s, rays, 2)
     inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
     regular &= has
-    point = torch.where(regular[:, None], point, torch.nan)
-    return point, torch.where(regular[:, None, None], inverse, torch.nan)
+    return torch.where(regular[:, None], point, torch.nan), torch.where(regular[:, None, None], inverse, torch.nan)
 
 
 def largest_sigma(covariances: Tensor) -> Tensor:

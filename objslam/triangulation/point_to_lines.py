@@ -1,7 +1,4 @@
-"""Solve Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the least sum of distances to lines.
-
-`triangulate` imports this module on its first call, because torch takes long to import.
-"""
+"""Solve Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the least sum of distances to lines."""
 
 from __future__ import annotations
 
@@ -97,15 +94,13 @@ def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) 
     return base + point + torch.where(determined[:, None], 0.0, ahead), determined
 
 
-def minimise_distances(
-    origin: Tensor, direction: Tensor, index: Tensor, count: int, start: Tensor
-) -> tuple[Tensor, int, Tensor]:
+def minimise_distances(origin: Tensor, direction: Tensor, index: Tensor, start: Tensor) -> tuple[Tensor, int, Tensor]:
     """Solve Eq. 1 for N objects from a start (N, 3): the points (N, 3), the iterations, the norms (N,) of the gradient.
 
     If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
     The lines of each object must fix a point. Objects without lines keep their start.
     """
-    lines = Lines.through(origin - start[index], direction, index, count)
+    lines = Lines.through(origin - start[index], direction, index, len(start))
     number = lines.sum(torch.ones_like(origin[:, 0])).clamp(min=1)
     unit = lines.sum(lines.foot.norm(dim=1)) / number
     reach = lines.sum((origin - start[index]).norm(dim=1)) / number

@@ -1,6 +1,6 @@
 """Triangulate objects from rays with known poses: Eq. 1 of Staszak & Belter on the rays that agree, for a whole log at once.
 
-Inputs and outputs are numpy float64 arrays. The first call imports torch, which does the work.
+Inputs and outputs are numpy float64 arrays. The first call imports torch and the modules with it, which takes long.
 """
 
 from __future__ import annotations
@@ -125,15 +125,17 @@ def triangulate(
     weight[where] = use.double().cpu().numpy()
     positions = (base + point).cpu().numpy()
     distance, off = _miss(m, n, index, positions)
+    total = np.bincount(index[weight > 0], off[weight > 0] ** 2, minlength=count)
+    number = counts.cpu().numpy()
     return Triangulation(
         positions=positions,
         covariance=covariance.cpu().numpy(),
         ok=(carried & ~by_chance).cpu().numpy(),
         parallax=angle.cpu().numpy(),
-        rms=_rms(off, weight, index, count),
+        rms=np.sqrt(np.divide(total, number, out=np.full(count, np.nan), where=number > 0)),
         distance=distance,
         weight=weight,
-        counts=counts.cpu().numpy(),
+        counts=number,
         iterations=result.iterations,
         gradient=gradient.cpu().numpy(),
     )
@@ -201,7 +203,7 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray, and refuse values that are not finite and above 0 if `needed` is a number (default: all)."""
+    """Return one value per ray, and refuse a value that is not finite and above 0 where `needed` is a number or None."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
@@ -234,16 +236,9 @@ def _bundle(
 
 
 def _miss(m: Floats, n: Floats, index: Ints, positions: Floats) -> tuple[Floats, Floats]:
-    """Return the distance (R,) m of each ray's line to its object, and the angle (R,) rad off the ray, NaN without object."""
+    """Return the distance (R,) m and the angle (R,) rad between each ray and its object, NaN without object."""
     to_object = np.full_like(m, np.nan)
     has = index >= 0
     to_object[has] = positions[index[has]] - m[has]
     distance = np.linalg.norm(np.cross(to_object, n), axis=1)
     return distance, np.arctan2(distance, (to_object * n).sum(axis=1))
-
-
-def _rms(off: Floats, weight: Floats, index: Ints, count: int) -> Floats:
-    inlier = weight > 0
-    total = np.bincount(index[inlier], off[inlier] ** 2, minlength=count)
-    number = np.bincount(index[inlier], minlength=count)
-    return np.sqrt(np.divide(total, number, out=np.full(count, np.nan), where=number > 0))
