@@ -7,11 +7,11 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""The share of frames with both of two objects that wrong boxes can explain; larger merges objects seen as two."""
+"""The largest share of frames that may show both duplicates because of wrong boxes; larger merges separate objects."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
-    """Return the pairs a < b (P,) of objects (N,) of one label closer than `farthest` m, and the offsets b to a (P, 3) m."""
+    """Return the pairs a < b (P,) of objects (N,) of one label within `farthest` m, and the offsets (P, 3) m from b to a."""
     a, b = np.triu_indices(len(position), 1)
     apart = position[a] - position[b]
     near = (label[a] == label[b]) & (np.linalg.norm(apart, axis=1) < farthest)

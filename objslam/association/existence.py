@@ -15,7 +15,7 @@ _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share o
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations of rates; larger means more alike.
 _CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one; larger drops fewer objects.
 _POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
-_RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single miss or box would be a proof.
+_RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
 _MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets; larger keeps more weak objects.
 _EXPECTED_STRAYS = 5.0  # The number of stray boxes that each class is assumed to have besides the observed ones.
 _LOG_SIZE = 0.7  # The standard deviation of ln size within a class, which is a factor of 2.
@@ -49,7 +49,7 @@ class Rates:
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
     """Estimate the rate of each class as the median over its boxes, drawn to the rate of all classes if they are few.
 
-    The concentration is the lowest one that is not clearly less likely than the best. Each object may be real or a phantom.
+    The concentration is the lowest one that is not clearly less likely than the best. Any object may be a phantom.
     """
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)

@@ -15,7 +15,7 @@ from objslam.core.geometry import skew
 TRACK_GAIN = 2.0
 """The cost reduction of a match if most other boxes of the ray's track have its landmark; larger trusts the tracker more."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together; larger needs more memory.
-_FEW_PAIRS = 1 << 12  # The number of pairs up to which exact costs for all of them take less time than a bound first.
+_FEW_PAIRS = 1 << 12  # The number of pairs up to which computing all exact costs is faster than a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains; larger tables are sparse.
 
 
@@ -84,7 +84,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn, move = np.zeros((2, len(obs.label)))
     if pose is not None:  # Twice its diagonal blocks bound a covariance with any correlation between them.
-        turn, move = (2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
+        turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
     for label in np.unique(obs.label):
@@ -131,7 +131,7 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     end = np.append(first[1:], len(part))
     one_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)
     one_place = np.minimum.reduceat(place, first) == np.maximum.reduceat(place, first)
-    simple = one_ray | one_place  # The best edge solves such a part.
+    simple = one_ray | one_place  # A part with one ray or one place takes its best edge.
     chosen[ray[first[simple]]] = landmark[first[simple]]
     for i, j in zip(first[~simple].tolist(), end[~simple].tolist(), strict=True):
         rows, r = np.unique(ray[i:j], return_inverse=True)
@@ -183,9 +183,8 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     ray, landmark = edges.ray[which], edges.landmark[which]
     at = np.minimum(np.searchsorted(keys, track[ray] * base + landmark), len(keys) - 1)
     same = keys[at] == track[ray] * base + landmark
-    own = (matched[ray] == landmark).astype(np.int64)
     t = np.minimum(np.searchsorted(tracks, track[ray]), len(tracks) - 1)
-    others = np.where(same, counts[at], 0) - own
+    others = np.where(same, counts[at], 0) - (matched[ray] == landmark)
     of = np.where(tracks[t] == track[ray], total[t], 0) - (matched[ray] >= 0)
     bonus[which] = np.where((others >= 2) & (2 * others > of), TRACK_GAIN, 0.0)
     return bonus

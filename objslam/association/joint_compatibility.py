@@ -15,7 +15,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import skew
 
 _MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object; larger trusts fewer landmarks.
-_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length and width, and the least height, of a room with objects (m).
+_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
 
@@ -58,8 +58,7 @@ def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks,
     """Return the expected number of unknown objects (n,) per steradian along each ray, of the label of landmark rows (n,).
 
     novelty: the recent number of boxes of unknown objects per box of a known one. Unknown objects are assumed in the same
-    ratio to known ones, and evenly spread over the room. They are visible up to the end of the room, but
-    no farther than the greatest distance at which a landmark was seen.
+    ratio to known ones, evenly spread over the room, and visible up to its end or the farthest distance of a seen landmark.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

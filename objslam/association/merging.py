@@ -16,9 +16,9 @@ from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
-_OBJECT_COST = 10.0  # The cost of one more object in squared deviations, in addition to BIC's ln of the rays per coordinate.
+_OBJECT_COST = 10.0  # The cost of one more object in squared deviations, on top of BIC's ln of the rays for each coordinate.
 _SHARED_SPACE = (0.35, 0.5)  # The shares of the smaller size and of the larger size within which two objects fill one space.
-_MOST_APART = 0.1  # The largest share of frames in which one object may look like two, of the rarer or the expected frames.
+_MOST_APART = 0.1  # One object looks like two in at most this share of the rarer object's frames, or of the expected frames.
 _MIN_EXPECTED = 5.0  # The fewest expected common frames of two objects for which a missing common frame counts.
 _DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with; larger costs time in dense scenes.
@@ -84,7 +84,7 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 
 def _on_one_line(state: State, gate: float) -> Ints:
-    """Return pairs (P, 2) for which half of the first one's rays pass the second, because of little parallax or a ghost."""
+    """Return pairs (P, 2) for which half of the first one's rays pass the second, from little parallax or a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)

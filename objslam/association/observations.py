@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -52,7 +52,8 @@ class Observations:
 
     def take(self, rays: Bools | Ints) -> Self:
         """Select rays by a mask or by increasing indices."""
-        return type(self)(**{k: v[rays] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()})
+        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        return type(self)(**selected)
 
 
 @lru_cache(maxsize=256)
@@ -92,8 +93,8 @@ def observe(
     rays, frame = rays.take(ray), frame[ray]
     origin, direction = rays.in_map(map_T_camera)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
-    ranges = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
-    lines = Observations.of_lines(origin, direction, sigma[ray], *ranges, rays.label)
+    range_, range_sigma = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
+    lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
     size = size_per_metre(rays, keyframes, cameras)
     obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
     return obs, ray, keyframe

@@ -20,7 +20,7 @@ MIN_LANDMARKS = 2
 """The fewest common landmarks for recognising a place."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
-_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: m, and m per m of distance from the robot.
+_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis, alone and with its assignment, because all start near the end.
 _CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there, any two of which form a hypothesis.

@@ -20,12 +20,12 @@ _ITERATIONS = 6  # The Gauss-Newton steps of a refinement; few are enough, becau
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
-    """Return the variance (E,) m^2 per perpendicular axis of the offset of points from rays `of`, `distance` (E,) m away."""
+    """Return the variance (E,) m^2 per perpendicular axis of the offsets of points at `distance` (E,) m from rays `of`."""
     return np.asarray(noise**2 * ((obs.sigma[of] * distance) ** 2 + obs.position_sigma**2))
 
 
 def squared_offsets(obs: Observations, position: Floats, of: Ints | slice = slice(None)) -> tuple[Floats, Floats]:
-    """Return the squared offset of each point, (E, 3) or (3,), from its ray, inf if behind, and its distance (E,) m."""
+    """Return the squared offset (E,) of each point, (E, 3) or (3,), from its ray, inf if behind, and its distance (E,) m."""
     to = position - obs.origin[of]
     depth = np.einsum("ri,ri->r", to, obs.direction[of])
     distance2 = np.einsum("ri,ri->r", to, to)
@@ -97,7 +97,7 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
 
 
 def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Floats, steps: int) -> tuple[Floats, Floats]:
-    """Refine a few points faster than `refine`: return positions (N, 3) m and covariances (N, 3, 3) m^2.
+    """Refine a few points faster than `refine`, and return positions (N, 3) m and covariances (N, 3, 3) m^2.
 
     obs: all rays of the first point, then all rays of the second point, and so on. number: (N,) number of rays of each
     point, at least 1. start: (N, 3) m. damping: (N, 3, 3) m^-2, information that keeps a point at its place in each step.
@@ -120,7 +120,7 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
 def velocity_gain(
     obs: Observations, ray: Ints, index: Ints, position: Floats, noise: Floats, stamps: Floats
 ) -> tuple[Floats, Floats]:
-    """Fit a velocity to each point: return the explained share (N,) of squared deviations, and the way (N,) in m.
+    """Fit a velocity to each point. Return the share (N,) of squared deviations that it explains, and its motion (N,) in m.
 
     Pairs and points are as in `refine`. stamps: (P,) s of the rays.
     """

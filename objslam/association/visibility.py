@@ -25,8 +25,8 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 class CameraFrames:
     """Observed frames: stamps (F,) s, cameras, the camera (F,) of each frame, map_T_camera (F, 4, 4).
 
-    margin (px) and margin_share (of the box) are the least distance of a usable box from the image edge. A negative margin
-    allows all boxes.
+    A usable box is at least margin (px) and margin_share of its size away from the image edge. A negative margin allows any
+    box.
     """
 
     stamps: Floats

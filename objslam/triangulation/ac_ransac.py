@@ -78,7 +78,7 @@ def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
-    """Solve Eq. 1 on the rays that agree: return the solution, inlier (R,) and log NFA (N,).
+    """Solve Eq. 1 on the rays that agree, and return the solution, inlier (R,) and log NFA (N,).
 
     The candidates are Eq. 1 on all rays, ray pairs, and a point far ahead, on which nearly parallel rays agree. Eq. 1 and
     the selection then alternate from the best candidate while the agreement grows. An object without two agreeing rays keeps
@@ -136,7 +136,7 @@ def _far_ahead(bundle: Bundle) -> Tensor:
 
 
 def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the consensus about one point (N, 3) per object: inlier (R,), and log NFA (N,), below 0 for no chance."""
+    """Return the consensus about one point (N, 3) per object: inlier (R,), and log NFA (N,), below 0 if not by chance."""
     inlier = torch.zeros(len(bundle.origin), dtype=torch.bool, device=points.device)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
     for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
@@ -149,7 +149,7 @@ def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
 def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
     """Return the points (B, 3) of ray pairs with which the other rays agree most, NaN without a pair.
 
-    objects: (B,) indices. hypotheses: number of pairs tried per object: all, or as many spread evenly over all. jitter:
+    objects: (B,) indices. hypotheses: the most pairs tried per object, spread evenly over all its pairs. jitter:
     (hypotheses,) in [0, 1), the place of each pair in its part. An object's result depends on its own rays alone.
     """
     points = bundle.origin.new_full((len(bundle.number), 3), torch.nan)
@@ -206,7 +206,7 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that a wrong box is as close to points (B, H, 3) as each ray, 1 if padded."""
+    """Return the probability (B, H, n) that a wrong box is as close to points (B, H, 3) as each ray, 1 if it points away."""
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
     distance2 = points.square().sum(-1)[..., None] - 2 * points @ origin.mT + origin.square().sum(-1)[:, None]

@@ -16,7 +16,7 @@ _RANGE_ITERATIONS = 30  # The iterations of the range fit from the median range,
 
 
 def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return covariances (N, 3, 3) m^2 of the solutions (N, 3) of Eq. 1 on the rays in use (R,), NaN for free directions.
+    """Return covariances (N, 3, 3) m^2 of Eq. 1's solutions (N, 3) on the rays in use (R,), NaN if these fix no point.
 
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
     & Ronchetti, Robust Statistics, ch. 6). Offsets are Gaussian with s_i along both axes across ray i. The unit offset u
@@ -40,7 +40,7 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 
 def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Fuse rays in use with ranges (R,) m along them, NaN for none: points (N, 3) and covariances (N, 3, 3).
+    """Fuse rays in use with ranges (R,) m along them, NaN for none, to points (N, 3) and covariances (N, 3, 3).
 
     It is for objects whose rays alone are too uncertain, and gives NaN for objects without a range. The loss is squared
     across the rays, whose outliers are already removed. It is Cauchy's along the rays, because a range may belong to the
@@ -150,8 +150,8 @@ def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
 
 def _used(bundle: Bundle, use: Tensor) -> Bundle:
     number = torch.bincount(bundle.index[use], minlength=len(bundle.number))
-    used = (values[use] for values in (bundle.origin, bundle.direction, bundle.sigma))
-    return Bundle(*used, bundle.position_sigma, bundle.index[use], number)
+    position_sigma = bundle.position_sigma
+    return Bundle(bundle.origin[use], bundle.direction[use], bundle.sigma[use], position_sigma, bundle.index[use], number)
 
 
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:

@@ -95,7 +95,7 @@ def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) 
 
 
 def minimise_distances(origin: Tensor, direction: Tensor, index: Tensor, start: Tensor) -> tuple[Tensor, int, Tensor]:
-    """Solve Eq. 1 for N objects from a start (N, 3): the points (N, 3), the iterations, the norms (N,) of the gradient.
+    """Solve Eq. 1 for N objects from a start (N, 3), and return points (N, 3), iterations and norms (N,) of the gradient.
 
     If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
     The lines of each object must fix a point. Objects without lines keep their start.

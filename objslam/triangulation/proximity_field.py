@@ -79,9 +79,7 @@ def main_heading(directions: Floats) -> Floats:
     """Return the mean horizontal unit direction (3,) of rays with directions (R, 3) as lines, or east if they have none."""
     flat = directions[:, :2]
     values, axes = np.linalg.eigh(flat.T @ flat)
-    if values[1] < 1e-12:
-        return np.array([1.0, 0.0, 0.0])
-    return np.array([*axes[:, 1], 0.0])
+    return np.array([1.0, 0.0, 0.0] if values[1] < 1e-12 else [*axes[:, 1], 0.0])
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:

@@ -203,7 +203,7 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray, and refuse a value that is not finite and above 0 where `needed` is a number or None."""
+    """Return one value per ray, which must be finite and above 0 for rays with a `needed` number (default: all rays)."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
