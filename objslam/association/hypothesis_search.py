@@ -24,8 +24,8 @@ _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried a
 
 @dataclass(frozen=True)
 class Search:
-    """Settings of a search. support: least support of a point. gate: squared deviations. parallax: least angle (rad) of a
-    pair. A parallax of 0 also tries distances along single rays. device: of torch."""
+    """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: squared
+    deviation. parallax: least angle (rad) of a pair, or 0 to also try distances along single rays. device: of torch."""
 
     hypotheses: int
     support: float
@@ -63,7 +63,7 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Return points (H, 3) where two rays of different frames meet, and points where measured ranges end."""
+    """Return points (H, 3) where two rays of different frames meet, where ranges end, and along rays without parallax."""
     first, second = _draw(obs, _DRAWS_EACH * search.hypotheses, rng)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2

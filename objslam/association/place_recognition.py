@@ -22,7 +22,7 @@ POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
 _BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
-_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis, alone and with its assignment, because all start near the end.
+_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment; few are enough from a close start.
 _CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there, any two of which form a hypothesis.
 _HYPOTHESES = 2000  # The most hypotheses from two pairs, those with the longest bases first; larger costs time.
 _VERIFIED = 20  # The most hypotheses, by a quick score, that get a best assignment; larger costs time.
@@ -41,7 +41,7 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Return landmarks relative to the pivot (2,) m, with larger covariances for landmarks farther away."""
+    """Return landmarks with larger covariances farther from the pivot (2,) m, because a neighbourhood bends over distance."""
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 

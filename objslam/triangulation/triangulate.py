@@ -31,7 +31,7 @@ class Triangulation:
     """N objects from one batch of R rays, all in the frame of the rays (map).
 
     positions: (N, 3) m, NaN without rays. If the rays do not fix an object, it is a point on their mean ray, 1 m ahead if no
-    range was measured. covariance: (N, 3, 3) m^2, NaN for such an object. ok: (N,) whether the position is reliable.
+    range was measured. covariance: (N, 3, 3) m^2, NaN if not determined. ok: (N,) whether the position is reliable.
     parallax: (N,) rad, the widest angle between inlier rays as lines. rms: (N,) rad, angular residual of the inlier rays.
     distance: (R,) m, Eq. 1's distance of a ray to its object, NaN without object. weight: (R,) 1 for an inlier, else 0.
     counts: (N,) number of inlier rays. iterations: of the solver. gradient: (N,) norm of Eq. 1's gradient at the solution,
