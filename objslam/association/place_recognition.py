@@ -41,7 +41,7 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Return landmarks with larger covariances farther from the pivot (2,) m, because a neighbourhood bends over distance."""
+    """Return landmarks with larger covariances farther from the pivot (2,) m, because neighbourhoods bend over distance."""
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 

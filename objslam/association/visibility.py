@@ -45,7 +45,7 @@ class CameraFrames:
 
 @dataclass(frozen=True)
 class DetectionHistory:
-    """V pairs of an object and a frame with a detection or an expected one, sorted by object, then by frame.
+    """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
     object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, at most as far away
     as the farthest box of the object or of its class.
