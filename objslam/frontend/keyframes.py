@@ -25,9 +25,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     """
     path = log.localization or log.odometry
     if path is None:
-        raise LogError(
-            "the log has neither odometry nor localisation", where=log.name, hint="give the log at least one of them"
-        )
+        raise LogError("the log has neither odometry nor localisation", where=log.name, hint="give at least one of them")
     odometry = log.odometry if settings.mode == "joint" else None
     max_gap = settings.poses.max_gap
 
@@ -60,9 +58,8 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         base_T_camera[mine] = camera_log.camera.base_T_camera
         if camera_log.mount is not None:
             what = f"camera_poses of {camera_log.camera.name}"
-            base_T_camera[mine], on_mount = _on_path(
-                camera_log.mount, stamps[mine], valid[mine], boxes[mine], max_gap, ledger, what
-            )
+            poses, on_mount = _on_path(camera_log.mount, stamps[mine], valid[mine], boxes[mine], max_gap, ledger, what)
+            base_T_camera[mine] = poses
             valid[mine] &= on_mount
     if not valid.any():
         raise LogError(
@@ -72,7 +69,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
             hint="check that both use the same clock, or raise poses.max_gap to bridge longer gaps",
         )
     localized_every = 0.0
-    if log.localization is not None:
+    if log.localization:
         known, used = log.localization.stamps, stamps[valid]
         measured = ((known >= used[0]) & (known <= used[-1])).sum()
         localized_every = max(1.0, len(used) / max(float(measured), 1.0))
