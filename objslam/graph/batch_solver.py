@@ -114,9 +114,7 @@ def solve_joint(
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        other = reject_outliers(
-            measured, association, found.map_T_camera, found.positions, found.used, back, attempt
-        )
+        other = reject_outliers(measured, association, found.map_T_camera, found.positions, found.used, back, attempt)
         before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
         if after < before:
             found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)

@@ -52,11 +52,7 @@ def has_depth(log: Log) -> bool:
 
 
 def reconstruct(
-    log: Log,
-    path: Trajectory,
-    settings: Settings,
-    ledger: Ledger,
-    progress: Progress = lambda stage, done, total: None,
+    log: Log, path: Trajectory, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None
 ) -> Surface | None:
     """The surface that a log's depth images show from the poses of a path (map_T_base); None, with a warning, without one.
 
