@@ -21,15 +21,15 @@ from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _ITERATIONS = 4
-"""The number of iterations of the solve after each step. A larger number is slower. Few are enough, because each solve starts
-close to its optimum and the next one continues from there."""
+"""The number of iterations of the solve after each step. A larger number is slower. Few are enough, because each solve
+starts close to its optimum and the next one continues from there."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
 doubles. Above the second, a shorter step is tried again. Larger limits take longer steps. On MRCLAM, limits from 1 and 3 to
 5 and 15 degrees converge to the same map. iSAM2 in place of full solves does not: in half the time it lost robot 1 or 5."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger ones let more false
-boxes in. They were chosen well above the odometry's drift in one step."""
+"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger ones let more
+false boxes in. They were chosen well above the odometry's drift in one step."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter
 later. With fewer, false boxes agree by chance too often."""

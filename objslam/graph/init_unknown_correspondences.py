@@ -1,8 +1,8 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
 As in `init_known_correspondences`, keyframes enter a few at a time at predicted poses. Their rays are assigned to the known
-landmarks by predicted bearing, with a gate that contains the odometry's drift. The unassigned rays of the last stretch, whose
-poses still agree, give new landmarks. The result is the start of a global association.
+landmarks by predicted bearing, with a gate that contains the odometry's drift. The unassigned rays of the last stretch,
+whose poses still agree, give new landmarks. The result is the start of a global association.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def initialize_unknown(
     owner = np.full(len(rays), -1, dtype=np.int64)
     known = Landmarks.none()
     refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
-    graph = build_graph(measured.factors(owner, known.label, known.label, known.position, end=1))
+    none = np.zeros(0, dtype=np.int64)
+    graph = build_graph(measured.factors(owner, none, none, known.position, end=1))
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
@@ -146,7 +147,7 @@ def _close(
 
 
 def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Return which landmarks (N,) are expected at their positions: the drift in heading since then is below `_HORIZON`."""
+    """Return which landmarks (N,) have a drift in heading below `_HORIZON` since their last observation."""
     return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
 
 

@@ -1,7 +1,7 @@
 """Estimate a growing graph by iSAM2: updates, rebuilds, and access to the estimate.
 
-If an update throws, the graph is rebuilt from the stored factors. Levenberg-Marquardt starts from the last good estimate. Its
-damping covers variables that nothing holds yet.
+If an update throws, Levenberg-Marquardt solves the stored factors from the last good estimate, and iSAM2 is rebuilt there.
+The damping covers variables that nothing holds yet.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def reject_outliers(
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """Return the rejected rays (R,) whose neighbours in time are mostly rejected, which suggests that the poses are wrong."""
+    """Return the rejected rays (R,) whose neighbours in time are mostly rejected, as if the poses were wrong."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)
