@@ -153,11 +153,8 @@ def solve_joint(
 
 
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
-    """Increase the noise of ranges to account for the bias that all ranges of an object share.
-
-    The mean of n ranges with noise s and a shared bias b has the variance b^2 + s^2 / n. So has the mean of n independent
-    ranges with the variance s^2 + n b^2.
-    """
+    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
+    # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()

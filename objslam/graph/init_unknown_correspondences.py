@@ -154,16 +154,13 @@ def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
 def _recognise(
     rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4) that are aligned with the landmarks.
-
-    The alignment of the whole step comes first. The error of the heading may be larger than the angle between two landmarks,
-    so that the nearest landmark of a single ray is often wrong.
-    """
+    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4) that are aligned with the landmarks."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)
     drift = _drifted(keyframes, begin - 1)
     centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
+    # The whole step is aligned first, because the heading may err by more than the angle between two landmarks.
     correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread)
     poses = map_T_camera.copy()
     poses[begin:end] = correction @ poses[begin:end]

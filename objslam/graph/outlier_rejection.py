@@ -104,10 +104,9 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 def _second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
 ) -> tuple[Floats, Bools]:
-    """Return better positions (N, 3), and which rays (R,) agree with them.
+    """Triangulate undetermined objects and objects with outliers again. Move an object if more of its rays agree then.
 
-    An object without a position, or with outliers among its rays, is triangulated from all its rays. It moves to the new
-    position if more rays agree there.
+    Return the positions (N, 3), and which rays (R,) agree with them.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)

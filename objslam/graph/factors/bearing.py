@@ -11,10 +11,8 @@ from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""The distance (m) of a virtual camera behind its ray.
-
-A larger distance leaves less perspective: the relative error is the range divided by it. A larger distance also rounds more
-coarsely. The chosen one rounds to a nanometre (it times 1e-16)."""
+"""The distance (m) of a virtual camera behind its ray. A larger one leaves less perspective and rounds more coarsely. The
+relative error is the range divided by it. It was chosen so that rounding (it times 1e-16) is a nanometre."""
 L1_RADIANS = 1e-4
 """The angle (rad) below which the loss `l1` on bearings is quadratic, which gives it a derivative at 0. A larger angle is
 smoother and less like a norm. It was chosen far below the noise of a box (a twentieth of a pixel)."""
