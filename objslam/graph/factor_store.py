@@ -36,8 +36,7 @@ class FactorStore:
         """Store one group of factors for each number. Factors that have the same number are replaced."""
         stored = self.kinds.setdefault(kind, {})
         for number, group in zip(numbers, groups, strict=True):
-            keys = [key for factor in group for key in factor.keys()]  # noqa: SIM118 (no dict)
-            stored[number] = Stored(frozenset(keys), group)
+            stored[number] = Stored(frozenset(key for factor in group for key in factor.keys()), group)  # noqa: SIM118 (no dict)
 
     def drop(self, kind: str, numbers: Iterable[int]) -> None:
         """Remove measurements of a kind."""

@@ -200,8 +200,7 @@ def _discover(
 ) -> Ints:
     """Find landmarks among the unassigned rays of keyframes begin to end. Add them to `known` and `owner`."""
     free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
-    none = np.zeros(0, dtype=np.int64)
-    fewest = settings.association.min_rays + _MORE_RAYS
+    none, fewest = np.zeros(0, dtype=np.int64), settings.association.min_rays + _MORE_RAYS
     if len(free) < fewest:
         return none
     some = rays.take(free)

@@ -121,9 +121,7 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
     result = []
-    for anchor in anchors:
-        if anchor >= now:
-            continue
+    for anchor in (a for a in anchors if a < now):
         joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
         relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
         jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])

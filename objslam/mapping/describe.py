@@ -93,8 +93,7 @@ def summarise(
     """Return the content of summary.json. counts: what the driver counted before the solution."""
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
-    total = np.bincount(rays.label, minlength=len(rays.label_names))
-    left = np.bincount(unexplained, minlength=len(rays.label_names))
+    total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
     packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,

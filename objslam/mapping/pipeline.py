@@ -21,7 +21,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping.alternation import Progress, solve
 from objslam.mapping.describe import describe, summarise
-from objslam.mapping.reconstruction import has_depth, reconstruct
+from objslam.mapping.reconstruction import reconstruct
 
 
 def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
@@ -50,7 +50,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     assert path is not None  # build_keyframes raises LogError otherwise
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     surface, before = None, None
-    if settings.reconstruction.use and has_depth(log):
+    if settings.reconstruction.use and any(c.depth is not None for c in log.cameras):
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:

@@ -27,8 +27,8 @@ from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 
 _BLOCK = 6
-"""The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger number
-is slower: 16 takes twice the time."""
+"""The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
+number is slower. 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
 """The first capacity of the grid, in blocks. A larger one takes more memory in a small scene. This one is enough for a room,
 and the grid doubles when it is full."""
@@ -53,20 +53,15 @@ class Shot:
     map_T_camera: Floats
 
 
-def has_depth(log: Log) -> bool:
-    """Return whether a camera of the log has depth images."""
-    return any(camera_log.depth is not None for camera_log in log.cameras)
-
-
 def reconstruct(
     log: Log, path: Trajectory, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None
 ) -> Surface | None:
     """Fuse the depth images of a log, at the poses of a path (map_T_base), into a surface.
 
-    Depth images contain z at the pixels of the camera image. The ledger counts images that cannot be used: those without a
-    pose, damaged, of another size than the camera's, without a colour image within 20 ms, or without a depth in reach. Blocks
-    beyond reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be
-    imported, the result is None with a warning.
+    Depth images contain z at the pixels of the camera image. The ledger counts frames without a pose, a colour image within
+    20 ms, or a depth in reach, and images that are damaged or not in the camera's size. Blocks beyond
+    reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be imported,
+    the result is None with a warning.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
