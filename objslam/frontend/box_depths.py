@@ -28,7 +28,7 @@ MAX_IMAGE_LAG = 0.02
 def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledger: Ledger) -> Detections:
     """Return the detections with the depth (m) of each box, from the depth image nearest in time.
 
-    A depth is NaN where it is unknown. The depth images must be registered to the camera's image. The ledger counts images
+    An unknown depth is NaN. The depth images must be registered to the camera's image. The ledger counts images
     that cannot be used, and frames without a depth image within 20 ms.
     """
     depths = np.full(len(detections), np.nan)

@@ -18,10 +18,8 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
 
     The path is the localisation if the log has one, else the odometry. In joint mode a frame must also lie on the odometry,
     because the odometry gives the motion between keyframes. Nothing is extrapolated. The ledger counts frames outside a path
-    or in a gap longer than poses.max_gap, and their boxes.
-
-    Raises:
-        LogError: The log has no path, no detection frame, or no frame on the path.
+    or in a gap longer than poses.max_gap, and their boxes. LogError if the log has no path, no detection frame, or no frame
+    on the path.
     """
     path = log.localization or log.odometry
     if path is None:

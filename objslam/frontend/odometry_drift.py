@@ -48,7 +48,7 @@ def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats
 
 
 def add_step(drift: Floats, before: Floats, after: Floats, settings: Odometry, planar: bool) -> Floats:
-    """Add to a covariance (6, 6) what `step_drift` adds for the step between two poses (4, 4).
+    """Add the noise of the step between two poses (4, 4) to a covariance (6, 6). The noise is that of `step_drift`.
 
     A session calls this function for every pose. It avoids numpy, and takes a tenth of the time of `step_drift`.
     """

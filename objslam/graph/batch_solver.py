@@ -90,15 +90,11 @@ def solve_joint(
 ) -> Estimate:
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
+    Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
+    return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes. If most
+    rays of a stretch of the drive were rejected, the poses may be wrong instead of the rays. These rays return once, and the
+    better solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
     start: (K, 4, 4) camera poses to start from instead.
-
-    Each solve is followed by a test of all rays. Rays that are far outside the noise of their object are rejected, and other
-    rays return. Objects enter or move if the poses now determine them better. This repeats until nothing changes.
-    If most rays of a stretch of the drive were rejected, its poses may be wrong instead of its rays. These rays return once,
-    and the better solution counts.
-
-    Raises:
-        SolveError: The linear system is indeterminate, or the cost is not finite.
     """
     rays = _share_bias(rays, association, settings)
     measured = Measurements.of(keyframes, rays, settings)

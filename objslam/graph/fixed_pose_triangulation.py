@@ -23,7 +23,7 @@ def triangulate_landmarks(
 ) -> tuple[Triangulation, Bools]:
     """Triangulate every object at the camera poses (K, 4, 4), and return which objects (N,) can enter a growing graph.
 
-    At least `fewest` rays must agree on such an object. Its rays must also have parallax, or one of them a range.
+    An object can enter if at least `fewest` rays agree on it. Its rays must also have parallax, or one of them a range.
     """
     found = _triangulate(map_T_camera, rays, association, settings, rays.sigma, 0.0)
     ranged = association.object[np.isfinite(rays.range) & (association.object >= 0)]

@@ -21,7 +21,7 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     """Return the covariances (n, 3, 3), m^2, of the landmarks (n,) at `values`.
 
     If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior of 1 m.
-    Landmarks whose uncertainty comes from this prior get NaN. For the others the prior is taken out again.
+    Landmarks that only this prior determines get NaN. The other covariances are corrected for the prior.
     """
     try:
         return _marginals(graph, values, landmarks)
@@ -46,8 +46,8 @@ def seen_covariances(
 ) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of landmarks (n,), each in the frame of its witness, a keyframe (n,).
 
-    They leave out the uncertainty of the camera pose. Far from the start of a map by odometry, this uncertainty is nearly
-    all of a landmark's own covariance. If the linear system is indeterminate, the ledger gets a warning, and they are NaN.
+    The uncertainty of the camera pose is left out. Far from the start of a map by odometry, it is nearly all of a landmark's
+    own covariance. If the linear system is indeterminate, the ledger gets a warning, and the result is NaN.
     """
     covariance = np.full((len(landmarks), 3, 3), np.nan)
     if len(landmarks) == 0:
@@ -77,7 +77,7 @@ def in_camera(joint: gtsam.JointMarginal, k: int, j: int, map_T_camera: Floats, 
 
 
 def largest_sigma(covariances: Floats) -> Floats:
-    """Return the largest standard deviation (n,), m, of covariances (n, 3, 3). It is NaN where a covariance is NaN."""
+    """Return the largest standard deviation (n,), m, of each covariance (n, 3, 3). A NaN covariance gives NaN."""
     known = np.isfinite(covariances).all(axis=(1, 2))
     sigma = np.full(len(covariances), np.nan)
     sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[known])[:, -1], 0.0))

@@ -20,10 +20,9 @@ OnIteration = Callable[[float, gtsam.Values], None]
 
 @dataclass(frozen=True)
 class Optimum:
-    """The result of an optimisation. weights: (F,) one for each factor of the graph, None unless GNC was used.
+    """The result of an optimisation. SolveError if its cost is not finite.
 
-    Raises:
-        SolveError: The cost is not finite.
+    weights: (F,) one for each factor of the graph, or None unless GNC was used.
     """
 
     values: gtsam.Values
@@ -70,11 +69,7 @@ def levenberg_marquardt(
     relative_tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """Minimise from `start` by Levenberg-Marquardt.
-
-    Raises:
-        SolveError: The linear system is indeterminate, or the cost is not finite.
-    """
+    """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)
@@ -95,10 +90,8 @@ def graduated(
 ) -> Optimum:
     """Minimise by graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020) over LM.
 
-    known_inliers: indices of the factors that are never rejected (odometry, priors).
-
-    Raises:
-        SolveError: The linear system is indeterminate, or the cost is not finite.
+    known_inliers: indices of the factors that are never rejected (odometry, priors). SolveError if the linear system is
+    indeterminate, or if the cost is not finite.
     """
     inner = gtsam.LevenbergMarquardtParams()
     inner.setMaxIterations(max_iterations)

@@ -72,10 +72,7 @@ def solve(
     joint mode also tries this if no frame has two boxes of one label, and keeps it if the rays agree.
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With a start, the
-    joint mode neither explores nor trusts labels.
-
-    Raises:
-        SolveError: The joint mode has neither odometry nor localisation.
+    joint mode neither explores nor trusts labels. SolveError if the joint mode has neither odometry nor localisation.
     """
     from objslam.graph import batch_solver
     from objslam.graph.fixed_pose_triangulation import pose_noise, triangulate_at

@@ -90,7 +90,7 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Return the content of summary.json. counts: what the driver counted before the solution."""
+    """Return the content of summary.json. counts: numbers of images, frames and boxes from the driver."""
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))

@@ -27,9 +27,7 @@ from objslam.mapping.reconstruction import reconstruct
 def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    Raises:
-        LogError: No frame lies on the path.
-        SolveError: No box gives a usable ray.
+    LogError if no frame lies on the path. SolveError if no box gives a usable ray.
     """
     log = _chosen_poses(log, settings)
     seconds: dict[str, float] = {}

@@ -22,10 +22,7 @@ def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = No
     A motion is E_prev^-1 * odo * E_next. Its covariance is Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation
     first. S is the covariance in base that the odometry accumulated between the two keyframes. Rows that are not
     `Keyframes.measured` have no meaning.
-    on_plane: whether the path is planar. If it is None, the poses decide.
-
-    Raises:
-        ValueError: The keyframes have no odometry.
+    on_plane: whether the path is planar. If it is None, the poses decide. ValueError if the keyframes have no odometry.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
