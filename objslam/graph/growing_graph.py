@@ -91,7 +91,7 @@ class GrowingGraph(ABC):
         self._touched.update(dict.fromkeys(rays.landmark.tolist(), self._updates + 1))
 
     def add_variable(self, key: int, value: gtsam.Pose3 | Floats) -> None:
-        """Add a pose or a point (3,) that is neither keyframe nor landmark. It needs factors before the next update."""
+        """Add another variable, a pose or a point (3,), by its key. It needs factors before the next update."""
         self._outgrown |= key >> LETTER not in {other >> LETTER for other in self._at.others}
         self._at.others[key] = value
         self._insert(key, value)

@@ -49,7 +49,7 @@ class IncrementalGraph(GrowingGraph):
         self._work_in()
 
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
-        """Add the new variables and factors, and prepare the tree for a keyframe that may observe the landmarks `coming` (n,).
+        """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
         An update eliminates the cliques between an observed variable and the root again. So variables that may be observed
         move near the root, unless they are there. relinearise: also linearise again the variables that moved.
@@ -124,8 +124,8 @@ class IncrementalGraph(GrowingGraph):
     def solve(self, iterations: int, tolerance: float = 1e-5) -> None:
         """Optimise all variables by Levenberg-Marquardt from the current estimate, and rebuild iSAM2 there.
 
-        It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is not
-        finite, or if nothing holds some variable. The graph is unchanged then.
+        It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is
+        not finite, or if nothing holds some variable. After a SolveError the graph is unchanged.
         """
         self.refresh()
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
