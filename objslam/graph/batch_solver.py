@@ -92,8 +92,8 @@ def solve_joint(
 
     Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
     return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes.
-    If most rays of a stretch of the drive were rejected, its poses may be wrong. The rays of the stretch return once, and the
-    better solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
+    If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
+    solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
     start: (K, 4, 4) camera poses to start from instead.
     """
     rays = _share_bias(rays, association, settings)
