@@ -1,4 +1,4 @@
-"""The variables and factors of a growing graph. It stores every factor, and the factors are the same as offline."""
+"""Keep the variables and factors of a growing graph. The factors are the same as offline, and all of them are stored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class GrowingGraph(ABC):
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
         """Add a group of factors for each number, and store them by kind and number as `FactorStore` describes.
 
-        Their keyframes, landmarks and other variables must be in the graph.
+        The keyframes, landmarks and other variables of the factors must be in the graph.
         """
         self._store.add(kind, numbers, groups)
         graph = build_graph(*groups)

@@ -1,4 +1,4 @@
-"""The cost of poses and landmarks, comparable between solutions that use different rays, and the information of rays."""
+"""Compute the cost of poses and landmarks for comparing solutions with different inliers, and the information of rays."""
 
 from __future__ import annotations
 

@@ -33,8 +33,8 @@ _FIRST = 2.0
 _USUAL = 0.12
 """The usual share of boxes that are false or show moving objects. A larger share warns less often."""
 MANY, SECOND = 5, 0.25
-"""The number and the share of a label's rays that disagree with its object if there is a second object. Larger ones accept
-fewer second objects."""
+"""The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
+ones accept fewer second objects."""
 
 Progress = Callable[[str, int, int], None]
 """A function of the stage's name, the work done, and the total work (0 if it is unknown)."""
@@ -106,7 +106,7 @@ def solve(
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them. Other poses add nothing to the map."""
+    """Return the keyframes that have a ray, and the rays with indices into them. Only odometry holds other poses."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
 

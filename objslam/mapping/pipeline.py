@@ -83,7 +83,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
-    """Return the path through the solved poses (K, 4, 4). In joint mode the odometry, free of jitter, fills the gaps."""
+    """Return the path through the solved poses (K, 4, 4). In joint mode it follows the odometry between keyframes."""
+    # The localisation between two keyframes would bring back its jitter.
     after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
     way = log.odometry
     if settings.mode == "fixed" or way is None or way is path:

@@ -38,7 +38,8 @@ blocks than are free, and it counts the existing blocks too."""
 _AHEAD = 4
 """The number of images that are decoded ahead. A larger number takes more memory."""
 _TOUCH = 4
-"""The step (px) at which Open3D samples a depth image for the blocks that a frame touches. It is Open3D's own number."""
+"""The step (px) at which Open3D samples a depth image for the blocks that a frame touches. It must equal Open3D's own step.
+A larger step drops more images as out of reach."""
 
 Progress = Callable[[str, int, int], None]
 

@@ -1,4 +1,4 @@
-"""Motions between keyframes by odometry, their covariances, and their factors."""
+"""Compute motions between keyframes by odometry, their covariances, and their factors."""
 
 from __future__ import annotations
 
