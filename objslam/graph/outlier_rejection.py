@@ -19,7 +19,7 @@ from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
 """The number of neighbours in time on each side of a rejected ray, and the share of rejected rays among them above which the
-poses are wrong. Larger ones restore fewer rays. They were chosen so that a few false boxes in a row restore none."""
+poses are wrong. A larger share restores fewer rays. They were chosen so that a few false boxes in a row restore none."""
 _ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _SURE = 0.95
