@@ -93,7 +93,7 @@ def solve(
         estimate = batch_solver.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
         if trace is not None:
             trace.end_round("fixed", association, estimate)
-        rounds = []
+        rounds: list[dict[str, int]] = []
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:
