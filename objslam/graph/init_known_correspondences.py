@@ -28,7 +28,7 @@ _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 doubles. Above the second, a shorter step is tried again. Larger limits take longer steps. On MRCLAM, limits from 1 and 3 to
 5 and 15 degrees converge to the same map. iSAM2 in place of full solves does not: in half the time it lost robot 1 or 5."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger ones let more
+"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger values let more
 false boxes in. They were chosen well above the odometry's drift in one step."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter

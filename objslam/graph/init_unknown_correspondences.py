@@ -34,10 +34,10 @@ recognises landmarks after a longer absence, and confuses neighbours."""
 _STRETCH = 150
 """The most recent keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The error (m) of a measured range that is allowed besides its noise. A larger one accepts more wrong ranges."""
+"""The error (m) of a measured range that is allowed besides its noise. A larger value accepts more wrong ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
 """The uncertainty of a step's pose after its alignment with the landmarks: a share of its drift, and standard deviations
-(rad, m). Larger ones widen the gate of every ray."""
+(rad, m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
 A wrong landmark disturbs all later poses."""
@@ -45,7 +45,7 @@ _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 """The number of iterations of the solve after a step, and after a loop closure. More are slower. A loop closure needs more,
 because it starts farther from its optimum."""
 _STRAIN = 200.0
-"""The squared deviation per joined landmark by which a loop may raise the cost. A larger one closes more wrong loops. On
+"""The squared deviation per joined landmark by which a loop may raise the cost. A larger value closes more wrong loops. On
 MRCLAM correct loops took up to 110, and wrong ones 240 and more."""
 
 

@@ -12,7 +12,7 @@ from objslam.graph.factor_store import FactorStore, Stored
 from objslam.graph.variables import LETTER, X0, Variables
 
 _RELINEARISE = (0.02, 0.05)
-"""The change (rad, m) of a variable above which its factors are linearised again. Larger ones are faster and less exact.
+"""The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact.
 They were chosen below a change that affects a bearing noticeably."""
 _NEVER = 1_000_000
 """The number of updates between two automatic relinearisations. It is so large that only the caller asks for one, when it

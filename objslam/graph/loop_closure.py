@@ -16,10 +16,10 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The number of past epochs, latest first, in which a loop is searched. A larger one is slower and closes longer loops."""
+"""The number of past epochs, latest first, in which a loop is searched. A larger value is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
 """The factors on the assumed drift with which a loop is searched, because wheels slip more than a Gaussian allows. Larger
-ones find loops after a slip, and more wrong candidates."""
+values find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
 """The number of keyframes in an epoch. One keyframe represents the epoch. A larger number is faster. It also makes the drift
 since the epoch less exact."""

@@ -13,7 +13,7 @@ from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
-"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger one holds less, until the linear
+"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger value holds less, until the linear
 system is indeterminate. A landmark that only this prior holds counts as undetermined."""
 
 

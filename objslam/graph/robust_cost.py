@@ -10,7 +10,7 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 FLOOR = 0.02
-"""The least standard deviation (m) of a landmark, because the centre of a box is not a point of the object. A larger one
+"""The least standard deviation (m) of a landmark, because the centre of a box is not a point of the object. A larger value
 lets rays miss nearby landmarks by more."""
 
 

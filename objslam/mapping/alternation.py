@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
-"""The noise (m, rad) of solved poses, as the objects see it. Larger ones let an association tolerate larger residuals."""
+"""The noise (m, rad) of solved poses, as the objects see it. Larger values let an association tolerate larger residuals."""
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
 _USUAL = 0.12
 """The usual share of boxes that are false or show moving objects. A larger share warns less often."""
 MANY, SECOND = 5, 0.25
 """The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
-ones accept fewer second objects."""
+values accept fewer second objects."""
 
 Progress = Callable[[str, int, int], None]
 """A function of the stage's name, the work done, and the total work (0 if it is unknown)."""

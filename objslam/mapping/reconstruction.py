@@ -30,8 +30,8 @@ _BLOCK = 6
 """The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
 number is slower. 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""The first capacity of the grid, in blocks. A larger one takes more memory in a small scene. This one is enough for a room,
-and the grid doubles when it is full."""
+"""The first capacity of the grid, in blocks. A larger value takes more memory in a small scene. The present value is
+enough for a room. The grid doubles when it is full."""
 _SPARE = 1024
 """The number of blocks that stay free. A larger number wastes more memory. Open3D grows by itself if a call touches more
 blocks than are free, and it counts the existing blocks too."""

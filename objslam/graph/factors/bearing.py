@@ -11,14 +11,14 @@ from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""The distance (m) of a virtual camera behind its ray. A larger one leaves less perspective and rounds more coarsely. The
-relative error is the range divided by it. It was chosen so that rounding (it times 1e-16) is a nanometre."""
+"""The distance (m) of a virtual camera behind its ray. A larger value leaves less perspective and rounds more coarsely. The
+relative error is the range divided by the distance. The distance was chosen for a rounding (1e-16 of it) of a nanometre."""
 L1_RADIANS = 1e-4
 """The angle (rad) below which the loss `l1` on bearings is quadratic, which gives it a derivative at 0. A larger angle is
 smoother and less like a norm. It was chosen far below the noise of a box (a twentieth of a pixel)."""
 EQ1_SIGMA = 0.05
-"""The standard deviation (m) of the point-to-line distance in the joint solve. A larger one trusts the odometry more. It was
-chosen by hand, because Eq. 1 has no noise model to weigh it against the odometry."""
+"""The standard deviation (m) of the point-to-line distance in the joint solve. A larger value trusts the odometry more.
+Eq. 1 has no noise model, so this value weighs its distances against the odometry."""
 _ORTHOGRAPHIC = gtsam.Cal3DS2(STANDOFF, STANDOFF, 0, 0, 0, 0, 0, 0, 0)
 _CENTRE = np.zeros(2)
 
