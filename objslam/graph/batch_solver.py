@@ -1,4 +1,4 @@
-"""The whole log in one factor graph: objects with fixed poses, or poses and objects together."""
+"""Solve a whole log in one factor graph: objects at fixed poses, or poses and objects together."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def solve_fixed(
     settings: Settings,
     trace: Trace | None = None,
 ) -> Estimate:
-    """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
+    """Solve the objects at fixed poses, starting from the triangulation, with one point-to-line factor for each inlier.
 
-    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's, which also places the objects that need
-    their ranges for it. The other losses weigh each ray by its noise across at the object's distance, and take a measured
-    range as a factor along the ray. Objects that the triangulation left unresolved stay out.
+    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions of objects
+    that need their ranges. The other losses weigh each ray by its noise across at the object's distance, and add a
+    factor along the ray for a measured range. Objects that the triangulation did not resolve are left out.
     """
     loss = settings.fixed.loss
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
@@ -88,12 +88,13 @@ def solve_joint(
     start: Floats | None = None,
     trace: Trace | None = None,
 ) -> Estimate:
-    """Poses and objects together, from the localisation's poses, or from a graph that has grown along the odometry.
+    """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
-    start: camera poses (K, 4, 4) to begin from instead.
-    After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
-    that the poses now carry, or place better, enter or move, until nothing changes. Where a stretch of the drive was
-    rejected as a whole, its poses may be wrong, not its rays: these are taken back once, and the better solution counts.
+    Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
+    return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes.
+    If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
+    solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
+    start: (K, 4, 4) camera poses to start from instead.
     """
     rays = _share_bias(rays, association, settings)
     measured = Measurements.of(keyframes, rays, settings)
@@ -109,12 +110,10 @@ def solve_joint(
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        at = found.map_T_camera, found.positions, found.used
-        other = reject_outliers(measured, association, *at, back, attempt)
+        other = reject_outliers(measured, association, found.map_T_camera, found.positions, found.used, back, attempt)
         before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
         if after < before:
-            iterations = found.iterations + other.iterations
-            found = replace(other, cost_before=found.cost_before, iterations=iterations)
+            found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
@@ -150,10 +149,8 @@ def solve_joint(
 
 
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
-    """The rays with the noise of ranges widened so that all of an object's together say no more than their shared bias lets.
-
-    n ranges of noise s that share a bias b have a mean of variance b^2 + s^2 / n: that of n independent ones of s^2 + n b^2.
-    """
+    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
+    # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()
@@ -172,7 +169,7 @@ def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:
 
 
 def _witnesses(rays: Rays, association: Association, used: Bools) -> Ints:
-    """For each object (N,) the keyframe of the middle one of its used rays, 0 where it has none."""
+    """Return for each object (N,) the keyframe of its middle used ray, or 0 without one."""
     object_, keyframe = association.object[used], rays.keyframe[used]
     order = np.lexsort((keyframe, object_))
     number = np.bincount(object_, minlength=association.count)

@@ -1,4 +1,4 @@
-"""What a localisation says: the absolute pose of a keyframe."""
+"""Factors for a localisation, which measures the absolute pose of a keyframe."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from objslam.graph.variables import X0
 def localizations(
     keyframes: Keyframes, settings: Settings, first: int = 0, on_plane: bool | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Absolute pose priors on every keyframe, X(first) and on, with Huber's loss, for a localisation may jump.
+    """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
-    Keyframes that share a measurement share its information. on_plane: whether the path is planar, None to see.
+    The priors have Huber's loss, because a localisation may jump. Keyframes that share a measurement share its information.
+    on_plane: whether the path is planar. If it is None, the poses decide.
     """
     of, planar = settings.localization, settings.planar
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
