@@ -93,8 +93,7 @@ class Camera:
     def solid_angle(self) -> float:
         """The solid angle of the image, sr.
 
-        It is the sum of the spherical triangles between the optical axis and the pieces of the image edge. A piece outside
-        the lens field counts as a sector of the cone that bounds the field.
+        It is the sum of the spherical triangles between the optical axis and the image edge, or the bounding cone.
         """
         edge = _edge(-0.5, self.width - 0.5, self.height - 0.5, _ALONG)
         here, valid = undistort(self, edge)
@@ -192,7 +191,7 @@ def in_field(camera: Camera, points: Floats) -> Bools:
 
 
 def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Floats | None = None) -> tuple[Ints, Floats]:
-    """Return the indices (n,) of the points (N, 3), m, in the camera frame that the image shows, and their raw pixels (n, 2).
+    """Return the indices (n,) and raw pixels (n, 2) of the points (N, 3), m, in the camera frame that the image shows.
 
     The image shows a point inside the lens field if its pixel is between low and high, (2,) or (N, 2), px. The default is
     the whole image.
@@ -208,25 +207,19 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return the depth (N,), m, that divides the image size of an object at each point (N, 3): z, or the distance for a fisheye."""
+    """Return the depth (N,), m, of points (N, 3) that scales their image size: z, or the distance for a fisheye."""
     return np.asarray(np.linalg.norm(points, axis=1) if camera.fisheye else points[:, 2])
 
 
 def _fisheye_radius(camera: Camera) -> Floats:
-    """Return the polynomial (10,), lowest power first, from the angle to the optical axis (rad) to the image radius.
-
-    The radius is the distance from the principal point, in focal lengths.
-    """
+    """Return the image radius in focal lengths as a polynomial (10,) of the angle, rad, lowest power first."""
     radius = np.zeros(10)
     radius[1::2] = 1.0, *camera.distortion
     return radius
 
 
 def _growth(camera: Camera, angle: Floats) -> Floats:
-    """Return the derivative (A,) of the image radius at angles (A,), rad, by the angle of a fisheye, else by its tangent.
-
-    It is zero or less if the lens model has folded back.
-    """
+    """Return the derivative (A,) of the image radius by the angle (A,), rad, or its tangent. It is <= 0 beyond the fold."""
     with np.errstate(all="ignore"):  # A wrong calibration may overflow.
         if camera.fisheye:
             return np.asarray(polyval(angle, polyder(_fisheye_radius(camera))))

@@ -11,16 +11,11 @@ from objslam.core.arrays import Bools, Floats
 class Estimate:
     """The result of a solve with K keyframes, N objects and R rays.
 
-    Attributes:
-        map_T_base: (K, 4, 4) poses of the robot.
-        positions: (N, 3) m, the objects in map.
-        covariance: (N, 3, 3) m^2, NaN for an object that was not solved.
-        seen_sigma: (N,) m, the largest standard deviation of a position relative to a camera that saw the object. The drift
-            of the map up to this camera is left out. NaN for an object that was not solved.
-        solved: (N,) whether the object was part of the graph.
-        weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has no object weighs 0.
-        cost_before, cost_after: error of the graph at the first start and at the last optimum. For Eq. 1 it is the sum of
-            distances, m.
+    map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN for an object that was not solved. solved:
+    (N,) whether the object was part of the graph. seen_sigma: (N,) m, the largest standard deviation of a position relative
+    to a camera that saw the object, without the drift of the map up to this camera, NaN for an object that was not solved.
+    weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has no object weighs 0. cost_before,
+    cost_after: error of the graph at the first start and at the last optimum. For Eq. 1 it is the sum of distances, m.
     """
 
     map_T_base: Floats

@@ -58,8 +58,7 @@ def lift_se2(xy_yaw: Floats) -> Floats:
 def split_se2(pose: Floats) -> tuple[Floats, Floats]:
     """Split SE(3) poses (..., 4, 4) into their SE(2) part (..., 3) x, y, yaw and the remainder (..., 4, 4).
 
-    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis, seen from above. It is 0 if the x axis is
-    vertical.
+    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis from above, and 0 for a vertical x axis.
     """
     yaw = np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
     part = np.stack([pose[..., 0, 3], pose[..., 1, 3], yaw], axis=-1)
@@ -162,15 +161,9 @@ def adjoint(pose: Floats) -> Floats:
 def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) -> tuple[Floats, Bools]:
     """Interpolate poses by a constant twist between the two neighbours, without extrapolation. Planar poses stay planar.
 
-    Args:
-        stamps: (N,) s, increasing.
-        poses: (N, 4, 4) at the stamps.
-        query: (Q,) s.
-        max_gap: s, the longest gap between two neighbours.
-
-    Returns:
-        Poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or in a longer gap gives the identity and
-        is not valid.
+    stamps: (N,) s, increasing. poses: (N, 4, 4) at the stamps. query: (Q,) s. max_gap: s, the longest gap between two
+    neighbours. Returns poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or in a longer gap gives
+    the identity and is not valid.
     """
     result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
     if len(stamps) == 0:
@@ -216,8 +209,7 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 def widest_angle(directions: Floats) -> float:
     """Return the widest angle (rad) between any two lines with unit directions (N, 3).
 
-    Two opposite directions have the angle 0. More than 400 lines are reduced to the extremes along their main axes, because
-    the number of pairs grows with the square.
+    Two opposite directions have the angle 0. More than 400 lines are reduced to the extremes along their main axes.
     """
     if len(directions) < 2:
         return 0.0
@@ -229,6 +221,6 @@ def widest_angle(directions: Floats) -> float:
 
 
 def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the angle (R,), rad in [0, pi], at each origin (R, 3) between the unit direction (R, 3) and the point (R, 3)."""
+    """Return the angles (R,), rad in [0, pi], between unit directions (R, 3) and points (R, 3), seen from origins (R, 3)."""
     to = points - origins
     return np.arctan2(np.linalg.norm(np.cross(to, directions), axis=1), np.einsum("ri,ri->r", to, directions))

@@ -13,21 +13,16 @@ from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
 
-_FLOOR = 1e-6
-"""The least standard deviation (m) of the distance between two positions. It keeps singular covariances invertible."""
+_FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
 
 
 @dataclass(frozen=True)
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
-    Attributes:
-        position: (3,) m.
-        covariance: (3, 3) m^2. None for an unresolved object.
-        extent: width and height, m.
-        ray: origin (3,) and direction (3,) of a ray through the best guess of an unresolved object.
-        labels: share of each label among the object's boxes. None if all boxes of a label are one object.
-        existence: probability that the object exists. None if all boxes of a label are one object.
+    position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. extent: width and height, m. ray: origin (3,)
+    and direction (3,) of a ray through the best guess of an unresolved object. labels: share of each label among the
+    object's boxes. existence: probability that the object exists. Both are None if all boxes of a label are one object.
     """
 
     id: int
@@ -92,9 +87,7 @@ class ObjectMap:
         Two objects of one label are the same if the Mahalanobis distance of their positions is below the 99 % quantile. The
         Hungarian method pairs them one-to-one with the least sum of squares. A fused position is weighted by information,
         like two independent measurements. Objects keep the ids of this map. Objects of the other map alone get new ids.
-
-        Raises:
-            ValueError: when the frames of the two maps have different names.
+        Frames of different names raise ValueError.
         """
         if self.frame != other.frame:
             raise ValueError(f"the maps are in two frames, {self.frame!r} and {other.frame!r}: transform one map first")

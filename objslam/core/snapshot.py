@@ -17,8 +17,8 @@ from objslam.core.types import Trajectory
 class CameraFrame:
     """The boxes of one camera at one keyframe.
 
-    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) the id of each box's object, or -1.
-    rejected: (B,) whether the robust loss rejected the box. image: (H, W, 3) uint8 BGR, or JPEG bytes. None without an image.
+    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) the id of each box's object, or -1. rejected: (B,)
+    whether the robust loss rejected the box. image: (H, W, 3) uint8 BGR or JPEG bytes, None without an image.
     """
 
     stamp: float
@@ -34,16 +34,11 @@ class CameraFrame:
 class Snapshot:
     """The state of a session at one moment.
 
-    Attributes:
-        stamp: s, the stamp of the newest keyframe. NaN before the first keyframe.
-        map: the objects, of the same type as an offline run returns.
-        path: map_T_base of all keyframes.
-        keyframes, rebuilds: the number of keyframes, and of rebuilds of the graph.
-        lag: s from the arrival of the newest message to its place in the map.
-        update: median and 99th percentile of the time from push to updated map, s.
-        counters: the number of accepted messages by kind.
-        dropped: the number of drops by reason.
-        frames: the newest keyframe of each camera, without its image.
+    stamp: of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns them. path:
+    map_T_base of all keyframes. keyframes, rebuilds: the number of keyframes, and of rebuilds of the graph. lag: s from the
+    arrival of the newest message to its place in the map. update: median and 99th percentile of the time from push to
+    updated map, s. counters: accepted messages by kind. dropped: drops by reason. frames: the newest keyframe of each
+    camera, without its image.
     """
 
     stamp: float

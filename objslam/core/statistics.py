@@ -12,11 +12,11 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 SAME_POINT = 11.345
-"""The squared Mahalanobis distance below which 99 % of the pairs of estimates of one point lie (chi-squared, 3 degrees of
-freedom). A larger distance takes more pairs for one point."""
+"""The squared Mahalanobis distance of 99 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
+larger distance takes more pairs for one point."""
 SAME_POINT_WIDE = 16.266
-"""The squared Mahalanobis distance below which 99.9 % of the pairs of estimates of one point lie (chi-squared, 3 degrees of
-freedom). A larger distance lets more pairs compete."""
+"""The squared Mahalanobis distance of 99.9 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
+larger distance lets more pairs compete."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
 This is the share of a single number within 3 standard deviations. A larger deviation tries less likely motions."""
@@ -31,21 +31,18 @@ CLIPPED_RAY = 6.0
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half its weight in a fit of points (Cauchy's weight, about `CAUCHY_K` squared).
 A larger deviation gives stray rays more influence."""
-
 HUBER_K = 1.345
 """The deviation above which Huber's loss grows linearly: 95 % efficient on Gaussian noise (Huber, Robust Statistics, 1981).
 A larger deviation is more efficient and less robust."""
 CAUCHY_K = 2.385
 """The scale of Cauchy's loss in deviations: 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger scale is more
 efficient and less robust."""
-
 RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 """The median norm of a standard Gaussian in the plane. It scales the median residual of rays to a standard deviation."""
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 """The mean norm of a standard Gaussian in the plane. It scales the mean residual of rays to a standard deviation."""
 NORMAL_MEDIAN = 0.6745
 """The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
-
 NOISE_FACTORS = (1.0, 3.0)
 """The least and the largest factor on the nominal noise of an object's rays in association. The least factor is 1, because
 box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
@@ -53,11 +50,9 @@ MOST_NOISE_FACTOR = 5.0
 """The largest factor on the nominal noise of an object's rays in outlier rejection, since the box centres of a large object
 vary. A larger factor keeps more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
-"""The number of rays at which an object's own noise weighs as much as the noise of its class, in offline association. A
-larger number trusts the class for longer."""
+"""The number of rays at which an object's noise weighs as much as its class's, offline. More trust the class for longer."""
 POOLED_WITH_PROMISE = 20.0
-"""The number of rays at which an object's own noise weighs as much as the nominal noise, in a live session. A larger number
-trusts the nominal noise for longer."""
+"""The number of rays at which an object's noise weighs as much as the nominal noise, live. More trust the latter longer."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:

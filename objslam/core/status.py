@@ -18,13 +18,10 @@ FEWEST_RAYS = 2
 def is_resolved(sigma: Any, reach: Any, rays: Any, parallax: Any, ranged: Any, limits: config.Triangulation) -> Any:
     """Return whether the position of each object (N,) is reliable. Takes arrays, tensors, or numbers for one object.
 
-    Args:
-        sigma: (N,) m, the largest standard deviation of the position relative to a camera that saw the object. The drift of
-            the map up to this camera is left out. inf or NaN for a position that the rays do not determine.
-        reach: (N,) m, the distances that `reach` returns.
-        rays: (N,) number of rays that agree.
-        parallax: (N,) rad, the widest angle between these rays.
-        ranged: (N,) whether measured ranges replace the parallax.
+    sigma: (N,) m, the largest standard deviation of the position relative to a camera that saw the object, without the drift
+    of the map up to this camera. inf or NaN if the rays do not determine the position. reach: (N,) m, as `reach` returns it.
+    rays: (N,) number of inliers. parallax: (N,) rad, the widest angle between these rays. ranged: (N,) whether measured
+    ranges replace the parallax.
     """
     wide = ranged | (parallax >= math.radians(limits.min_parallax_deg))
     return wide & (rays >= FEWEST_RAYS) & (sigma <= limits.max_rel_sigma * reach)

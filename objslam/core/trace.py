@@ -71,6 +71,5 @@ class Trace:
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
         """End a round, which gets all iterations since the end of the last round."""
-        iterations = tuple(self._iterations)
-        self._iterations.clear()
+        iterations, self._iterations = tuple(self._iterations), []
         self.rounds.append(Round(why, association, iterations, estimate.map_T_base, estimate.positions, estimate.weight))

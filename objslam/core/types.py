@@ -18,8 +18,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 
 MAX_BOXES = 10_000
-"""The most boxes of a frame. A frame with more is rejected, because no detector finds so many and association would take too
-long."""
+"""The most boxes of a frame. A frame with more is rejected, since no detector finds so many and association is too slow."""
 
 
 def _need(condition: Any, message: str) -> None:
@@ -31,10 +30,7 @@ def _need(condition: Any, message: str) -> None:
 class Trajectory:
     """Poses of one frame in another frame over time.
 
-    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite.
-
-    Raises:
-        ValueError: when a shape is wrong, a value is not finite or a stamp does not increase.
+    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. Other values raise ValueError.
     """
 
     stamps: Floats
@@ -57,19 +53,11 @@ _BOX_COLUMNS = ("frame", "label", "scores", "depths", "track_ids")  # The fields
 class Detections:
     """All boxes of one camera. Frames without a box are kept, because they show what the camera did not see.
 
-    Attributes:
-        frame_stamps: (F,) s, strictly increasing.
-        frame: (M,) index into frame_stamps, non-decreasing.
-        boxes: (M, 4) x1, y1, x2, y2 in px of the raw (distorted) image.
-        label: (M,) index into label_names.
-        scores: (M,) in [0, 1].
-        depths: (M,) z along the optical axis, m. NaN if unknown.
-        track_ids: (M,) -1 if unknown.
-        whole: whether no box is cut off by the edge of the image. Then box centres are valid up to the edge. This holds for
-            fiducials, which need all their corners.
-
-    Raises:
-        ValueError: when a shape is wrong, an index is out of range or the order is wrong.
+    frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
+    y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether no box is cut off by the edge of the
+    image. Then box centres are valid up to the edge. This holds for fiducials, which need all their corners. Wrong shapes,
+    indices or orders raise ValueError.
     """
 
     frame_stamps: Floats
@@ -169,18 +157,13 @@ class Log:
 class Keyframes:
     """Camera frames of any camera with a pose before estimation, in the order of time.
 
-    Attributes:
-        stamps: (K,) s, non-decreasing.
-        camera: (K,) index into log.cameras.
-        frame: (K,) index into detections.frame_stamps of this camera.
-        base_T_camera: (K, 4, 4).
-        map_T_base: (K, 4, 4), the initial path by localisation. Without localisation, by odometry.
-        localized_every: number of keyframes (>= 1) that share one absolute pose measurement by interpolation. 0 if
-            map_T_base is odometry.
-        odom_T_base: (K, 4, 4) poses in a frame that starts with the odometry. None without odometry.
-        drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the frame of odom_T_base.
-        stretch: (K,) number of the odometry's stretch without a gap. -1 marks a keyframe without odometry, whose odom_T_base
-            and drift have no meaning. None if all keyframes are on one stretch.
+    stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of
+    this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4), the initial path by localisation, or by odometry without
+    localisation. localized_every: number of keyframes (>= 1) that share one absolute pose measurement by interpolation, 0 if
+    map_T_base is odometry. odom_T_base: (K, 4, 4) in a frame that starts with the odometry, None without odometry. drift:
+    (K, 6, 6) covariance that the odometry has accumulated since its start, in the frame of odom_T_base. stretch: (K,) number
+    of the odometry's stretch without a gap, None if all keyframes are on one stretch. -1 marks a keyframe without odometry,
+    whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats
@@ -205,8 +188,7 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        Across a gap of the odometry the robot may have been moved, and the odometry may have restarted elsewhere. Without
-        localisation the odometry is the only source and counts across gaps, too.
+        It did not across a gap, since the robot may have been moved. Without localisation it counts across gaps, too.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:
@@ -224,16 +206,9 @@ class Keyframes:
 class Rays:
     """Bearing rays, one for each box, from the keyframe through the undistorted centre of the box.
 
-    Attributes:
-        keyframe: (R,) index into Keyframes, non-decreasing.
-        direction: (R, 3) unit, camera frame.
-        sigma: (R,) rad, standard deviation of the angle along each of the two axes across the ray.
-        range: (R,) m along the ray. NaN if unknown.
-        range_sigma: (R,) m.
-        label: (R,) index into label_names.
-        score: (R,).
-        box: (R, 4) raw px.
-        track_id: (R,) -1 if unknown.
+    keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, camera frame. sigma: (R,) rad, standard
+    deviation of the angle along each of the two axes across the ray. range: (R,) m along the ray, NaN if unknown.
+    range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id: (R,) -1 if unknown.
     """
 
     keyframe: Ints
@@ -270,8 +245,7 @@ class Association:
     """The object of each ray.
 
     object: (R,) index of the object, or -1. label: (N,) index into the rays' label_names. label_weights: (N, L) share of
-    each label in an object's boxes. existence: (N,) probability that the object exists. The last two are None if they were
-    not computed.
+    each label in an object's boxes, None if unknown. existence: (N,) probability that the object exists, None if unknown.
     """
 
     object: Ints

@@ -1,7 +1,6 @@
 """The course of the robot, joined from odometry and localisation in the frame of the first pose.
 
-Odometry gives the pose of a frame, or localisation where no odometry exists. At each change of source, and after each gap of
-the odometry, localisation relates the new piece of the course to the old piece.
+Localisation replaces missing odometry. It also relates two pieces of the course at a change of source or after a gap.
 """
 
 from __future__ import annotations

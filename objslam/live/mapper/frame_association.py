@@ -97,12 +97,7 @@ def match(
 def match_by_label(
     rays: FrameRays, map_T_camera: Floats, landmarks: LandmarkTable, uncertainty: PoseUncertainty, gate: float
 ) -> tuple[Ints, Ints]:
-    """Match rays of different labels by their labels alone, and gate the matches.
-
-    Returns:
-        The row (n,) of each ray's landmark, or -1. The row (n,) of the landmark of its label if the ray is outside the gate,
-        or -1.
-    """
+    """Return the row (n,) of each ray's landmark inside the gate, or -1, and of its label's landmark outside, or -1."""
     rows = np.flatnonzero(np.isin(landmarks.label, rays.label))
     hit, missed = (np.full(len(rays.label), -1, dtype=np.int64) for _ in range(2))
     if not len(rows):

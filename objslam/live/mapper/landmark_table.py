@@ -26,10 +26,9 @@ _NO_ID = -2  # The id of a track among the predicted landmarks. It differs from 
 class LandmarkTable(GrowingTable):
     """The landmarks in the order of their ids.
 
-    position: m, in map. information: m^-2, from the rays. drift: the drift when the landmark was last seen. first, last: the
-    stamps of the first and the last observation. seen, expected: numbers of frames that showed the landmark and that should
-    have. far: m, the largest distance from which it was seen. squared: the sum of the squared deviations of its rays.
-    rejected: the number of rays of its label outside the gate.
+    position: m, in map. information: m^-2, from the rays. drift: at the last observation. first, last: stamps of the first
+    and the last observation. seen, expected: numbers of frames that showed the landmark and that should have. far: m, the
+    largest observed distance. squared: sum of the squared deviations of its rays. rejected: number of rays outside the gate.
     """
 
     id: Ints = column(np.int64)

@@ -26,9 +26,7 @@ def localize(m: MapState) -> bool:
         stamp = float(m.keyframes.stamp[row])
         if stamp > path.newest:
             left.append(k)
-            continue
-        found = path.at(stamp)
-        if found is None:
+        if (found := path.at(stamp)) is None:
             continue
         planar = m.localization.planar and is_planar(np.stack([np.eye(4), path.from_start(found.pose)]))
         m.localization.planar = planar

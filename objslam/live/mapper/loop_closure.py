@@ -7,14 +7,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from objslam.association.place_recognition import (
-    MIN_LANDMARKS,
-    POSE_FLOOR,
-    Recognition,
-    label_densities,
-    neighbourhood,
-    recognise_place,
-)
+from objslam.association import place_recognition
 from objslam.association.refinement import normalised_residuals
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse
@@ -49,42 +42,42 @@ def close_loop(m: MapState) -> None:
     m.schedule.compared = state
     possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~_together(m)
     one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
-    if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
+    if min(len(one), len(two)) < place_recognition.MIN_LANDMARKS:
         return
     found = _recognise(m, one, two, possible[np.ix_(one, two)], newest)
     if found is not None:
         _close(m, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.correction)
 
 
-def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) -> Recognition | None:
+def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) -> place_recognition.Recognition | None:
     landmarks, k = m.landmarks, m.keyframes
     pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
-    density = label_densities(landmarks.position, landmarks.label)[one]
+    density = place_recognition.label_densities(landmarks.position, landmarks.label)[one]
     a, b = (
-        neighbourhood(landmarks.position[which], covariances(landmarks, which), landmarks.label[which], pivot)
-        for which in (one, two)
+        place_recognition.neighbourhood(landmarks.position[n], covariances(landmarks, n), landmarks.label[n], pivot)
+        for n in (one, two)
     )
     lately = np.unique(landmarks.last[two])[::-1]
-    best: Recognition | None = None
+    best: place_recognition.Recognition | None = None
     for stamp in lately[np.linspace(0, len(lately) - 1, min(_ANCHORS, len(lately))).astype(np.int64)]:
         anchor = int(np.argmin(np.abs(k.stamp - stamp)))
         if k.stamp[anchor] >= k.stamp[newest]:
             continue
-        found = recognise_place(a, b, pivot, _planar(m, anchor, newest), density, possible)
+        found = place_recognition.recognise_place(a, b, pivot, _planar(m, anchor, newest), density, possible)
         if found is not None and found.is_sure(m.settings.association) and (best is None or found.evidence > best.evidence):
             best = found
     return best
 
 
 def _planar(m: MapState, before: int, now: int) -> Floats:
-    """Return an upper bound (3, 3) on the covariance of x, y, yaw between two keyframes. The graph's own value is too slow."""
+    """Return a fast upper bound (3, 3) on the covariance of x, y, yaw between two keyframes, by odometry or by the map."""
     k = m.keyframes
     turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
     to_camera = adjoint(k.camera_T_start[now])
     drift = to_camera @ (k.drift[now] - k.drift[before]) @ to_camera.T
     spreads = [turn @ spread @ turn.T for spread in (drift, m.pose_covariance) if np.isfinite(spread).all()]
     least = min(spreads, key=lambda spread: float(np.trace(spread[3:, 3:])))
-    return np.asarray(least[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(POSE_FLOOR) ** 2)
+    return np.asarray(least[np.ix_([3, 4, 2], [3, 4, 2])] + np.diag(place_recognition.POSE_FLOOR) ** 2)
 
 
 def _together(m: MapState) -> Bools:

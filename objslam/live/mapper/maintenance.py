@@ -33,8 +33,7 @@ _LARGE = 400  # The keyframes above which relinearisation in slices replaces the
 _ODDS = 2.5  # The least log odds that two landmarks are one, against a neighbour. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
-"""The least number of changes between inliers and outliers among a label's rays that shows two objects. A drifted path gives
-one run of outliers."""
+"""The least changes between inliers and outliers of a label that show two objects. A drifted path gives one run only."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The border around the image, as a share of it. A wider border prepares the graph for more landmarks.
 _USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. A larger one prepares more.
@@ -169,7 +168,7 @@ def _merge_duplicates(m: MapState) -> None:
 
 
 def _one(way: Floats, spread: Floats, density: float) -> bool:
-    """Return whether two landmarks `way` m apart are one. density: landmarks of the label per m^2, which may be neighbours."""
+    """Return whether two landmarks `way` m apart are one. density: possible neighbours of the label per m^2."""
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
     return squared <= SAME_POINT and -np.log(area * density) - squared / 2 >= _ODDS

@@ -86,7 +86,7 @@ class Mapper:
         return associate(m, view.rays, pose, prediction.uncertainty, predicted)
 
     def look_after(self, update: LandmarkUpdate) -> None:
-        """Do the work after a new keyframe that need not delay its association, and prepare the next prediction."""
+        """Update landmarks and tracks after a new keyframe, run maintenance, and prepare the next association."""
         m = self.state
         update_landmarks(m, update)
         rest = promote_tracks(m, update.tracks)

@@ -10,8 +10,8 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import skew
 
 HORIZON = 0.06
-"""The heading drift (rad, one standard deviation) above which a landmark counts as long unseen. At this drift, an object 5 m
-away is predicted to 0.3 m, and a neighbour may be as near. A larger drift trusts single boxes for longer."""
+"""The heading drift (rad, one sigma) above which a landmark counts as long unseen: 0.3 m at 5 m, where a neighbour may be. A
+larger drift trusts single boxes for longer."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks match again. A larger one matches more of them.
 
 
@@ -52,8 +52,7 @@ class PoseUncertainty:
     def against(self, to: Floats, then: Floats) -> Floats:
         """Return the covariance (6, 6) of the camera pose relative to several landmarks together, in the camera frame.
 
-        It is the drift since the landmark that is unseen for longest, or the covariance in the map if that is smaller.
-        to: (n, 3) m and then: (n, 6, 6) are as in `of_landmarks`.
+        It is the smaller of the drift since the longest unseen landmark and the covariance of the pose in the map.
         """
         oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
         since = self.camera_from_drift @ gathered(self.drift, oldest[None])[0] @ self.camera_from_drift.T
@@ -73,6 +72,6 @@ def gathered(now: Floats, then: Floats) -> Floats:
 def long_unseen(now: Floats, then: Floats) -> Bools:
     """Return which objects (n,) are long unseen, by a heading drift above HORIZON since they were last seen.
 
-    now: (6, 6) drift now. then: (n, 6, 6) drift when each object was last seen.
+    now: (6, 6) current drift. then: (n, 6, 6) drift when each object was last seen.
     """
     return np.asarray(now[2, 2] - then[:, 2, 2] > HORIZON**2)

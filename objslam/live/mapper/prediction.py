@@ -14,8 +14,7 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The keyframes between two slow queries of a pose covariance from the graph. Between queries the odometry adds its own
-covariance. A larger number is faster, and makes the pose less certain than it is."""
+"""The keyframes between two slow covariance queries, while odometry adds to it. More make the pose less certain."""
 
 
 @dataclass(frozen=True)

@@ -35,11 +35,7 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """The state of the localisation.
-
-    received: number of poses. pending: ids of the keyframes that the localisation may still cover. planar: whether all poses
-    of keyframes by localisation have one height, roll and pitch.
-    """
+    """The number of received poses, the ids of the keyframes without an absolute pose so far, and the planarity of poses."""
 
     received: int = 0
     pending: list[int] = field(default_factory=list)
@@ -67,9 +63,9 @@ class PairEvidence:
 class MaintenanceSchedule:
     """When the maintenance tasks last ran.
 
-    solved, culled: the number of all keyframes so far at the last full solve, and at the last culling. relinearisations: the
-    number of early relinearisations still to do after a loop closure. compared: ids of the recently seen landmarks and
-    number of the long unseen ones at the last search for loops. None before the first search.
+    solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: the number of
+    early relinearisations still to do. compared: ids of the recently seen landmarks and number of the long unseen ones at
+    the last search for loops, None before the first search.
     """
 
     solved: int = 0

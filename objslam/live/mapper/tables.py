@@ -21,7 +21,7 @@ def column(kind: DTypeLike, *shape: int) -> Any:
 class GrowingTable:
     """Columns of one length. A column is an attribute: the array of the rows (n, *shape), which may be changed in place.
 
-    A subclass declares its columns with `column`. `add` and `keep` replace the arrays of all columns.
+    Subclasses declare columns with `column`. `add` and `keep` replace all arrays.
     """
 
     def __init__(self) -> None:

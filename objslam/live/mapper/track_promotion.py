@@ -82,7 +82,7 @@ def fit_if_observable(
 ) -> PointFit | None:
     """Triangulate rays in map. None with too few inliers, an uncertain position, or too little parallax and no range.
 
-    least, share: the least number of inliers, and their share of the rays. early: accept less parallax for a certain position.
+    least, share: the least number of inliers, and their least share. early: accept less parallax for a certain position.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
