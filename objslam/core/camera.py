@@ -58,7 +58,7 @@ class Camera:
     @cached_property
     def inverse_matrix(self) -> Floats:
         """(3, 3) matrix from homogeneous pixels to directions with z = 1."""
-        return np.linalg.inv(self.matrix)
+        return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
 
     @cached_property
     def fisheye(self) -> bool:

@@ -78,10 +78,7 @@ def log_se3(pose: Floats) -> Floats:
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """Return the angle (N,), rad, and the arc length (N,), m, of the motions by poses (N, 4, 4).
-
-    They are the norms of the two halves of `log_se3`.
-    """
+    """Return the norms (N,), rad, and (N,), m, of the two halves of `log_se3` of poses (N, 4, 4)."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))

@@ -27,10 +27,8 @@ def one_torch_thread() -> Iterator[None]:
 def torch_device(device: str, worth: bool = True) -> str:
     """Return "cpu" or "cuda" for the setting `triangulation.device`.
 
-    The setting "auto" gives CUDA if torch sees a CUDA device and `worth` says that the work is large enough for it.
-
-    Raises:
-        ConfigError: when the setting is "cuda" and torch sees no CUDA device.
+    The setting "auto" gives CUDA if torch sees a CUDA device and `worth` says that the work is large enough for it. The
+    setting "cuda" raises ConfigError if torch sees no CUDA device.
     """
     import torch
 

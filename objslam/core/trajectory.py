@@ -17,7 +17,7 @@ def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats
 def correct_poses(stamps: Floats, poses: Floats, keyframe_stamps: Floats, before: Floats, after: Floats) -> Floats:
     """Correct poses (N, 4, 4) at stamps (N,) by keyframes that moved from poses before to poses after, (K, 4, 4) each.
 
-    The correction is interpolated between two keyframes. It is constant before the first keyframe and after the last one.
+    The correction is interpolated between keyframes, and constant outside of them.
     """
     known, first = np.unique(keyframe_stamps, return_index=True)
     correction = after[first] @ inverse(before[first])

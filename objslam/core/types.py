@@ -38,8 +38,10 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         n = len(self.stamps)
-        _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N,4,4) poses")
-        _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "a trajectory has values not finite")
+        _need(
+            self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps and (N, 4, 4) poses"
+        )
+        _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
         _need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
 
     def __len__(self) -> int:
@@ -78,8 +80,13 @@ class Detections:
         _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
         _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
-            _need(0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps), "frame out of range")
-            _need(0 <= self.label.min() and self.label.max() < len(self.label_names), "label out of range")
+            _need(
+                0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps),
+                "frame must be an index into frame_stamps",
+            )
+            _need(
+                0 <= self.label.min() and self.label.max() < len(self.label_names), "label must be an index into label_names"
+            )
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -103,7 +110,7 @@ class Images:
     paths: tuple[Path, ...]
 
     def __post_init__(self) -> None:
-        _need(self.stamps.shape == (len(self.paths),), "one stamp an image")
+        _need(self.stamps.shape == (len(self.paths),), "images need one stamp for each path")
         _need((np.diff(self.stamps) > 0).all(), "the stamps of images must increase")
 
 

@@ -20,8 +20,7 @@ _CROWDED = 1.2  # The factor on live.max_keyframes above which landmarks keep _L
 def cull_keyframes(m: MapState) -> None:
     """Remove old keyframes where they are densest, if the map has more than live.max_keyframes.
 
-    One call never removes two neighbours. Some new keyframes must come before the next removal. The odometry between the
-    remaining keyframes is accumulated.
+    One call never removes two neighbours. Some new keyframes must come before the next removal. The odometry is summed up.
     """
     k, most = m.keyframes, m.settings.live.max_keyframes
     if len(k) <= most or m.next_id.keyframe < m.schedule.culled + _AGAIN * most:

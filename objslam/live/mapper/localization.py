@@ -47,10 +47,7 @@ def localize(m: MapState) -> bool:
 
 
 def chain_keyframes(m: MapState) -> None:
-    """Connect consecutive keyframes by the motions of the odometry. The caller must rebuild the graph.
-
-    Two keyframes without a measured motion get a weak motion factor, unless localisation fixes both.
-    """
+    """Connect consecutive keyframes by odometry, or by weak motion factors. The caller must rebuild the graph."""
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)
     if every.odom_T_base is None:

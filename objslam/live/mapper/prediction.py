@@ -21,9 +21,9 @@ _ASK = 10
 class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
-    camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion
-    (4, 4) from its camera, and the covariance (6, 6) of the motion in the new camera frame. None without a previous
-    keyframe, and if localisation replaces a motion that the odometry did not measure.
+    camera_T_start: (4, 4) start of the course in the camera frame. motion: id of the previous keyframe, motion (4, 4) from
+    its camera, and covariance (6, 6) of the motion in the new camera frame. None without a previous keyframe, or if
+    only localisation gives the pose.
     """
 
     map_T_camera: Floats

@@ -16,7 +16,7 @@ _PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_pl
 
 
 class OnPath(NamedTuple):
-    """A pose (4, 4) on a path, the drift (6, 6) accumulated up to it, and the number of its stretch."""
+    """A pose (4, 4) on a path, the drift (6, 6) accumulated up to the pose, and the number of its stretch."""
 
     pose: Floats
     drift: Floats
