@@ -21,8 +21,8 @@ class MapObject:
     """One object of the map, with the fields of objects.json.
 
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. extent: width and height, m. ray: origin (3,)
-    and direction (3,) of a ray through the best guess of an unresolved object. labels: share of each label among the
-    object's boxes. existence: probability that the object exists. Both are None if all boxes of a label are one object.
+    and direction (3,) of a ray through the best guess of an unresolved object. labels: share of each label among the boxes.
+    existence: probability that the object exists. labels and existence are None if all boxes of a label are one object.
     """
 
     id: int

@@ -38,9 +38,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         n = len(self.stamps)
-        _need(
-            self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps and (N, 4, 4) poses"
-        )
+        _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N, 4, 4) poses")
         _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
         _need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
 
@@ -80,13 +78,8 @@ class Detections:
         _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
         _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
-            _need(
-                0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps),
-                "frame must be an index into frame_stamps",
-            )
-            _need(
-                0 <= self.label.min() and self.label.max() < len(self.label_names), "label must be an index into label_names"
-            )
+            _need(0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps), "frame must index frame_stamps")
+            _need(0 <= self.label.min() and self.label.max() < len(self.label_names), "label must index label_names")
 
     def __len__(self) -> int:
         return len(self.frame)

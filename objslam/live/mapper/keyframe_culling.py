@@ -18,7 +18,7 @@ _CROWDED = 1.2  # The factor on live.max_keyframes above which landmarks keep _L
 
 
 def cull_keyframes(m: MapState) -> None:
-    """Remove old keyframes where they are densest, if the map has more than live.max_keyframes.
+    """Remove old keyframes from their densest places, if the map has more than live.max_keyframes.
 
     One call never removes two neighbours. Some new keyframes must come before the next removal. The odometry is summed up.
     """

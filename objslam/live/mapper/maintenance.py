@@ -88,7 +88,7 @@ def _polish_if_grown(m: MapState) -> None:
 
 
 def _reconsider(m: MapState) -> bool:
-    """Reject the rays that are outliers of their landmark now, restore those that are inliers, and return if any changed."""
+    """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed."""
     rays, landmarks = m.rays, m.landmarks
     m.graph.refresh()
     m.read_positions()
@@ -186,7 +186,7 @@ def _drifted(m: MapState, rows: Ints) -> Floats:
 
 
 def _drop_ghosts(m: MapState) -> None:
-    """Remove the landmarks that are rarely seen where they are expected."""
+    """Remove the landmarks that are rarely seen in frames that should show them."""
     landmarks, live = m.landmarks, m.settings.live
     rarely_seen = landmarks.seen < live.ghost_share * landmarks.expected
     ghost = np.flatnonzero((landmarks.expected >= live.ghost_frames) & rarely_seen)
