@@ -19,7 +19,7 @@ _FLOOR = 0.01  # The standard deviation (m) added to each landmark. A larger val
 _HELD = 1e-4  # The information (m^-2) added to each landmark, for parallel rays. A larger value makes landmarks too certain.
 _INNER = 0.05  # The share of the image along its edge where a box may be cut off. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
-_FURTHER = 1.1  # The factor on a landmark's largest observed distance for its expectation. A larger one counts more misses.
+_FURTHER = 1.1  # The factor on the largest observed distance up to which a landmark is expected. More counts more misses.
 _NO_ID = -2  # The id of a track among the predicted landmarks. It differs from all ids, and from -1 for no landmark.
 
 

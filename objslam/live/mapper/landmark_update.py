@@ -15,7 +15,7 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)  # The residual (rad) above which a loop is closing. A larger one leaves less time to settle.
+_JUMP = np.radians(2.0)  # The residual (rad) above which a loop is closing. A larger angle leaves less time to settle.
 _TRACKS = 4096  # The detector tracks whose landmark is stored. More serve a detector that reuses numbers after a long time.
 
 

@@ -19,15 +19,15 @@ from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmark
 from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
-_ANCHORS = 3  # The past keyframes with which a loop is searched, each with the drift since then. More keyframes take longer.
-_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger one relies more on the next updates.
-_TURNED = 0.05  # The same limit for the heading of a correction, rad.
-_AROUND = 6.0  # The radius (m) around recognised landmarks where others are expected: the view from one place in a hall.
-_ERA = 15.0  # The difference (s) of their stamps from the recognised ones. A larger one expects more, which count as missed.
-_ITERATIONS = 5  # The iterations of the solve after a loop closure. More delay the next frame; graph updates do the rest.
+_ANCHORS = 3  # The past keyframes from which the drift to a loop is computed. More keyframes take longer.
+_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value relies on updates.
+_TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. A larger value relies on updates.
+_AROUND = 6.0  # The radius (m) around recognised landmarks in which others are expected, about the view in a hall.
+_ERA = 15.0  # The time (s) between the last observations of recognised and expected landmarks. More time adds misses.
+_ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
-_BENT = 0.02  # The error (m) of the corrected path besides the rays' noise. A larger error accepts more rays.
+_BENT = 0.02  # The error (m) of the corrected path, added to the noise of rays. A larger error accepts more rays.
 
 
 def close_loop(m: MapState) -> None:

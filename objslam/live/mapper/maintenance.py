@@ -36,7 +36,7 @@ _VISITS = 6
 """The least changes between inliers and outliers of a label that show two objects. A drifted path gives one run only."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The border around the image, as a share of it. A wider border prepares the graph for more landmarks.
-_USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. A larger one prepares more.
+_USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. More prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:

@@ -35,7 +35,7 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """The number of received poses, the ids of the keyframes without an absolute pose so far, and the planarity of poses."""
+    """The localisation so far: `received` poses, `pending` ids of keyframes without a pose, and whether poses are `planar`."""
 
     received: int = 0
     pending: list[int] = field(default_factory=list)

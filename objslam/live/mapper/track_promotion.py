@@ -19,9 +19,9 @@ from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
 SLACK = 0.02  # The relative error (m) of poses on one stretch. A larger error accepts rays that pass a point less closely.
-_AGREE_BY_LABEL = 0.5  # The same share if the rays have only the label in common, since some may be of another object.
+_AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
 _AGAIN = 1.2  # The growth in rays or in spread before a track is tried again. Less growth costs time.
-_EARLY = 0.4  # The share of joint.min_parallax_deg for a certain position. A larger share makes landmarks later.
+_EARLY = 0.4  # The share of joint.min_parallax_deg that a certain position needs. A larger share makes landmarks later.
 _SURE = 0.05  # The sigma of a certain position as a share of its distance. A larger share makes more false landmarks.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 

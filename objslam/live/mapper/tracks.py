@@ -14,7 +14,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.graph.isam2 import IncrementalGraph
 
 _DEPTH = 2.5  # The assumed distance (m) of an object seen from one place only, about the middle of a room.
-_DEPTH_SIGMA = 2.0  # The standard deviation (m) of this distance. A larger value relies more on the rays.
+_DEPTH_SIGMA = 2.0  # The standard deviation (m) of a track along its last ray. A larger value relies more on the rays.
 _DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More slows the position down.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
 _RECENT = 30  # The newest rays that define a track's position. More rays average more noise over a longer drift.

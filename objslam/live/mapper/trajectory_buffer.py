@@ -12,7 +12,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.frontend.odometry_drift import add_step
 
-_PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_planar`. A larger one accepts more paths.
+_PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_planar`. A larger value accepts more paths.
 
 
 class OnPath(NamedTuple):
