@@ -33,7 +33,8 @@ _LARGE = 400  # The keyframes above which relinearisation in slices replaces the
 _ODDS = 2.5  # The least log odds that two landmarks are one, against a neighbour. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
-"""The least changes between inliers and outliers of a label that show two objects. A drifted path gives one run only."""
+"""The least number of changes between inliers and outliers that shows two objects of a label. A drifted path gives one run
+of outliers. A larger number keeps one object for longer."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The border around the image, as a share of it. A wider border prepares the graph for more landmarks.
 _USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. More prepares more landmarks.

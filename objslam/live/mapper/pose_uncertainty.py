@@ -10,8 +10,8 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import skew
 
 HORIZON = 0.06
-"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark at 5 m by 0.3 m, where
-a neighbour may be. A larger drift trusts single boxes for longer."""
+"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark at 5 m by 0.3 m. A
+neighbour may be as near. A larger drift trusts single boxes for longer."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks match again. A larger value matches more.
 
 

@@ -35,7 +35,7 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """The localisation so far: `received` poses, `pending` ids of keyframes without a pose, and whether poses are `planar`."""
+    """The localisation so far: the number of poses, the ids of keyframes without a pose, and whether poses are planar."""
 
     received: int = 0
     pending: list[int] = field(default_factory=list)
