@@ -1,4 +1,4 @@
-"""The array types that every room speaks of."""
+"""Short names of the array types."""
 
 from __future__ import annotations
 
