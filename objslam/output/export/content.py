@@ -1,4 +1,4 @@
-"""What a format writes: a result read back from its folder."""
+"""The content of an export: a result that is read back from its folder."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from objslam.results.read import load_map, load_motions, load_trajectory
 class Content:
     """A result to export."""
 
-    out: Path  # The result folder, for error messages.
+    out: Path  # The result folder; error messages name it.
     objects: ObjectMap
-    path: Trajectory  # map_T_base at each keyframe's stamp.
-    motions: Motions | None  # The odometry between consecutive poses of the path; None where the run used none.
-    datum: Datum | None = None  # Where the map lies on the earth; None where nobody said.
+    path: Trajectory  # map_T_base at the stamp of each keyframe.
+    motions: Motions | None  # The odometry between consecutive poses of the path; None if the run used no odometry.
+    datum: Datum | None = None  # The position of the map on the earth; None if it is unknown.
 
 
 def load_content(out: Path, datum: Datum | None = None) -> Content:
-    """Read a result folder; OutputError says what is missing or malformed."""
+    """Read a result folder; OutputError names a missing or malformed file."""
     return Content(out, load_map(out), load_trajectory(out), load_motions(out), datum)

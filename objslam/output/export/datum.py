@@ -1,4 +1,4 @@
-"""The place of a map on the earth."""
+"""The datum: the position and the heading of a map on the earth."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.errors import ConfigError
 
-_SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
-_FLATTENING = 1 / 298.257223563  # Its flattening.
-_E2 = _FLATTENING * (2 - _FLATTENING)  # The square of its eccentricity.
-_ROUNDS = 6  # The rounds in which a latitude is found; each divides its error by 150, so two suffice near the ground.
+_SEMI_MAJOR = 6_378_137.0  # This is the semi-major axis of the WGS 84 ellipsoid, m.
+_FLATTENING = 1 / 298.257223563  # This is the flattening of the WGS 84 ellipsoid.
+_E2 = _FLATTENING * (2 - _FLATTENING)  # This is the squared eccentricity of the WGS 84 ellipsoid.
+_ROUNDS = 6  # A latitude takes this many iterations. Each divides the error by 150, so 2 suffice near the ground.
 
 
 @dataclass(frozen=True)
 class Datum:
-    """The WGS 84 position of the map's origin, and the compass heading of its x axis."""
+    """The WGS 84 position of the map's origin and the compass heading of the map's x axis."""
 
     latitude: float  # Degrees north.
     longitude: float  # Degrees east.
@@ -26,20 +26,20 @@ class Datum:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The datum in "latitude,longitude,heading"; ConfigError where the text is something else."""
+        """Parse the text "latitude,longitude,heading"; ConfigError if the text is malformed or out of range."""
         try:
             latitude, longitude, heading = (float(part) for part in text.split(","))
         except ValueError as error:
-            hint = "for example 52.4006,16.9508,90: degrees; the map's x axis points east"
+            hint = "give degrees: 52.4006,16.9508,90 is a map whose x axis points east"
             raise ConfigError(f"--datum {text!r} is not latitude,longitude,heading", hint=hint) from error
         if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(heading) <= 360):
-            raise ConfigError(f"--datum {text!r}: latitude within 90, longitude within 180, heading within 360 degrees")
+            raise ConfigError(f"--datum {text!r}: use degrees, latitude within 90, longitude within 180, heading within 360")
         return cls(latitude, longitude, heading)
 
     def geodetic(self, points: Floats) -> Floats:
-        """Longitude and latitude (N, 2), degrees, of points (N, 3) in map, m; exact to well below 1 mm.
+        """Return longitude and latitude (N, 2), degrees, of points (N, 3) in map, m; the error is well below 1 mm.
 
-        The points go from east, north and up at the datum to earth-centred coordinates, and from there to the ellipsoid.
+        The points are converted to east, north and up at the datum, then to earth-centred and to geodetic coordinates.
         """
         latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
         sine, cosine = np.sin(latitude), np.cos(latitude)

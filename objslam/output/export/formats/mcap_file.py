@@ -1,6 +1,6 @@
-"""MCAP with ROS 2 messages: the map and the path, for Foxglove, RViz (`ros2 bag play`) and anything that reads ROS 2 bags.
+"""The MCAP format with ROS 2 messages: map and path, for Foxglove, RViz (`ros2 bag play`) and readers of ROS 2 bags.
 
-https://mcap.dev/spec, https://docs.ros.org/en/rolling/p/vision_msgs. No ROS is needed to write it.
+The module writes such a file without ROS. Source: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -16,24 +16,20 @@ if TYPE_CHECKING:
     from objslam.output.export.content import Content
     from objslam.output.export.map_messages import MapMessages
 
-_POSE_TOPIC = "/objslam/pose"
-"""The topic of the robot's pose: the only one with a message per stamp."""
-
+_POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose. No other topic has a message per stamp.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  liveliness_lease_duration:\n"
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
-"""The offered QoS as rosbag2 records it: reliable and transient local, so that RViz gets the map whenever it joins."""
-
-_LAST_STAMP = 2.0**31
-"""The stamp, s, from which builtin_interfaces/Time overflows; it also has no stamp below 0."""
+"""The offered QoS in the format of rosbag2: reliable and transient local, so that an RViz that joins late gets the map."""
+_LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows from this stamp, s. It has no stamps below 0.
 
 
 def _dump(content: Content) -> bytes:
-    """The content of the file: objects, markers and path once, at the start; the robot's pose at each stamp of the path.
+    """Write the objects, the markers and the path once, at the start, and the robot's pose at each stamp of the path.
 
-    One message holds all resolved objects with their covariances. Chunks carry CRCs.
+    One message contains all resolved objects with their covariances. Each chunk has a CRC.
     """
     from mcap.writer import CompressionType, Writer
 
@@ -41,7 +37,7 @@ def _dump(content: Content) -> bytes:
 
     stamps = content.path.stamps
     if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < _LAST_STAMP:
-        raise OutputError("stamps that are no ROS time, before 1970 or after 2038", where=str(content.out))
+        raise OutputError("stamps that are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
     messages = MapMessages(content.objects.frame)
     start = float(stamps[0]) if len(stamps) else 0.0
     buffer = io.BytesIO()
@@ -58,7 +54,7 @@ def _dump(content: Content) -> bytes:
 
 
 def _channels(writer: Any, messages: MapMessages) -> Callable[[str, float, Any], None]:
-    """A function that writes a message to a topic; a topic and its type are registered with their first message."""
+    """Return a function that writes a message to a topic; the first message of a topic registers topic and type."""
     channels: dict[str, int] = {}
 
     def put(topic: str, stamp: float, message: Any) -> None:
