@@ -38,8 +38,8 @@ def prepare_output(out: Path) -> None:
     """Make the folder for a result and try to write there; call this function before a long computation.
 
     Raises:
-        OutputError: the folder cannot be written, or the result would replace files that no run wrote: the files of a log, of
-            a ground truth, or foreign files that have the name of a result file.
+        OutputError: the folder cannot be written, or the result would replace files that no run wrote: files of a log, files
+            of a ground truth, or foreign files with the name of a result file.
     """
     with disk_errors(out):
         if out.exists() and not out.is_dir():

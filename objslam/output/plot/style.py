@@ -19,11 +19,11 @@ REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is be
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
-"""Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in such
-a colour has a contrast of at least 4.5 on white (WCAG 2.1)."""
+"""Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
+either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _FENCE = (3.0, 0.5, 1.0)
-"""An object is framed up to the largest of three distances from the path: this multiple of the median distance, this share of
-the path's diagonal, and this length, m. Larger values frame more far objects and shrink the rest of the map."""
+"""An object is framed up to the largest of three distances from the path: this multiple of the median distance, this share
+of the path's diagonal, and this length, m. Larger values frame more far objects and shrink the rest of the map."""
 
 
 def is_date(stamp: float) -> bool:
@@ -84,7 +84,7 @@ def _colour(hue: float, number: int) -> tuple[float, float, float]:
 
 
 def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
-    """Return the half axes (3,), m, of an object's 2-sigma ellipsoid and their directions (3, 3) in columns, right-handed.
+    """Return the half axes (3,), m, of an object's 2-sigma ellipsoid, and their directions (3, 3), right-handed columns.
 
     None if the object has no finite covariance.
     """

@@ -1,4 +1,4 @@
-"""Curves: the residuals and kinds of a frame's rays by stamp, cost and objects by iteration."""
+"""Curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from objslam.output.plot.style import ray_kinds
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
-_GAP = 1.0  # The shortest pause between stamps, s, that breaks a curve.
-_GAP_STEPS = 5.0  # The shortest pause that breaks a curve, in usual steps between stamps; the longer of both counts.
-_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # RGB colours of curves.
+_GAP, _GAP_STEPS = 1.0, 5.0
+"""A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 median steps."""
+_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # Curves have these colours.
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
-    """`plots/residual/median` and `worst` of the used rays of a stamp, deg; `plots/boxes/KIND`, the number of its rays."""
+    """Log the residuals of the used rays by stamp, `plots/residual`, deg, and the ray counts, `plots/boxes/KIND`."""
     stamps, moment = np.unique(result.keyframes.stamps, return_inverse=True)
     of = moment[result.rays.keyframe]
     kinds = ray_kinds(result)
@@ -36,14 +36,14 @@ def log_residuals(recording: Any, result: RunResult) -> None:
 
 
 def broken(stamps: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """A curve (N,) at ascending stamps (N,), s, with a NaN in the middle of each gap, so that no line crosses the gap."""
+    """Insert a NaN into each gap of a curve (N,) at ascending stamps (N,), s, so that no line crosses the gap."""
     step = np.diff(stamps)
     gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
     return np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2), np.insert(values, gap + 1, np.nan)
 
 
 def log_costs(recording: Any, result: RunResult) -> None:
-    """`plots/cost/solve` and `plots/cost/grow` by iteration; `plots/rounds`, the objects and unexplained rays by then."""
+    """Log the cost by iteration, `plots/cost`, and the counts of objects and unexplained rays, `plots/rounds`."""
     steps = [(i.stage, i.cost, r.association) for r in result.trace for i in r.iterations]
     numbers = np.arange(len(steps))
     stage, cost = np.array([stage for stage, _, _ in steps]), np.array([cost for _, cost, _ in steps])
@@ -56,7 +56,7 @@ def log_costs(recording: Any, result: RunResult) -> None:
         objects = np.array([float(found.count) for _, _, found in steps])
         unexplained = np.array([float((found.object < 0).sum()) for _, _, found in steps])
         _send(recording, "plots/rounds/objects", at, objects, _GREEN, "objects")
-        _send(recording, "plots/rounds/unexplained", at, unexplained, _GREY, "rays that none explains")
+        _send(recording, "plots/rounds/unexplained", at, unexplained, _GREY, "rays that no object explains")
 
 
 def _send(recording: Any, path: str, at: Any, values: Any, colour: tuple[int, int, int], name: str) -> None:
@@ -65,6 +65,6 @@ def _send(recording: Any, path: str, at: Any, values: Any, colour: tuple[int, in
 
 
 def log_seconds(recording: Any, seconds: dict[str, float]) -> None:
-    """`plots/seconds`: a bar for each stage of the run, in the order in which `summary` names them."""
+    """Log the time of each stage as bars, `plots/seconds`, in the order of the table in `summary`."""
     if seconds:
         recording.log("plots/seconds", rr.BarChart(list(seconds.values()), color=_BLUE), static=True)

@@ -1,4 +1,4 @@
-"""A live session in a recording: each snapshot is drawn at its stamp, in place of the one before."""
+"""The recording of a live session: each snapshot is logged at its stamp and replaces the earlier snapshot."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from objslam.core.arrays import Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import undistort
 from objslam.core.geometry import quaternion
 from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import CameraFrame
 from objslam.output.plot.style import is_date
 from objslam.output.viewer.blueprint import blueprint
-from objslam.output.viewer.cameras import camera_path, lighter, log_pinhole
-from objslam.output.viewer.event_log import map_changes
+from objslam.output.viewer.cameras import camera_path, light_colours, log_pinhole
+from objslam.output.viewer.event_log import map_changes, table
 from objslam.output.viewer.live.wire import ShownSnapshot
-from objslam.output.viewer.objects import colours, log_objects
+from objslam.output.viewer.objects import log_objects
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import STAMP
 from objslam.output.viewer.view_point import ViewPoint, first_view_point
 
-_PATH = (40, 44, 52)  # RGB: nearly black.
-_FREE_REACH = 2.0  # The length, m, of a ray that has no object.
+_PATH = (40, 44, 52)  # The path is nearly black (RGB).
+_FREE_REACH = 2.0  # A ray without an object is drawn with this length, m.
 
 
 class LiveLog:
@@ -38,14 +38,14 @@ class LiveLog:
         self.begin()
 
     def begin(self) -> None:
-        """Log what is logged once, which a viewer that was started later has not got."""
+        """Log the static data; a restarted viewer needs them again."""
         self._recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._recording.log("map/base", rr.TransformAxes3D(0.3), static=True)
         self._cameras.clear()
         self._view_point = None
 
     def show(self, shown: ShownSnapshot, frames: list[CameraFrame]) -> None:
-        """Log a snapshot, and the frames that came with it."""
+        """Log a snapshot and its frames."""
         view_point = self._look(shown, frames)
         for frame in sorted(frames, key=lambda f: f.stamp):
             self._at(frame.stamp)
@@ -61,7 +61,7 @@ class LiveLog:
             self._recording.set_time(STAMP, duration=stamp)
 
     def _look(self, shown: ShownSnapshot, frames: list[CameraFrame]) -> ViewPoint:
-        """The view point from which all is seen; a new layout is sent where the map outgrows it, or for a new camera."""
+        """Return the view point; send a new layout for a new camera, or if the map outgrows the old view."""
         view_point, before = first_view_point(shown.map, shown.path), self._view_point
         places = np.concatenate([np.array([o.position for o in shown.map.objects]).reshape(-1, 3), shown.path])
         new = [f.camera for f in frames if f.camera.name not in self._cameras]
@@ -76,12 +76,10 @@ class LiveLog:
 
     def _snapshot(self, shown: ShownSnapshot, view_point: ViewPoint) -> None:
         recording = self._recording
-        line = rr.LineStrips3D([shown.path], colors=[_PATH], radii=rr.Radius.ui_points(2))
-        recording.log("map/path/after", line)
+        recording.log("map/path/after", rr.LineStrips3D([shown.path], colors=[_PATH], radii=rr.Radius.ui_points(2)))
         log_objects(recording, shown.map, view_point, shown.path, static=False)
         if shown.base is not None:
-            pose = rr.Transform3D(translation=shown.base[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion(shown.base)))
-            recording.log("map/base", pose)
+            recording.log("map/base", _transform(shown.base))
         n = shown.numbers
         resolved = len(shown.map.resolved())
         curves = {
@@ -101,17 +99,16 @@ class LiveLog:
         recording.log("summary", rr.TextDocument(_counters(shown), media_type="text/markdown"), static=True)
 
     def _frame(self, frame: CameraFrame, objects: ObjectMap) -> None:
-        recording, path, pose = self._recording, self._cameras[frame.camera.name], frame.map_T_camera
-        recording.log(path, rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion(pose))))
+        recording, path = self._recording, self._cameras[frame.camera.name]
+        recording.log(path, _transform(frame.map_T_camera))
         if isinstance(frame.image, bytes):
             recording.log(f"{path}/image", rr.EncodedImage(contents=frame.image, media_type="image/jpeg"))
         place = {o.id: i for i, o in enumerate(objects.objects)}
         index = np.array([place.get(j, -1) for j in frame.objects.tolist()], dtype=np.int64)
-        palette = np.array([lighter(c) for c in colours(objects)], dtype=np.uint8).reshape(-1, 3)
         used = (index >= 0) & ~frame.rejected
         colour = np.where(frame.rejected[:, None], RAY_COLOURS["rejected"], RAY_COLOURS["unexplained"])
         ray_colour = np.where(used[:, None], RAY_COLOURS["used"], colour)
-        colour[used] = palette[index[used]]
+        colour[used] = light_colours(objects)[index[used]]
         radius, corners = rr.Radius.ui_points(1.5), rr.Box2DFormat.XYXY
         boxes = rr.Boxes2D(array=frame.boxes, array_format=corners, colors=colour.astype(np.uint8), radii=radius)
         recording.log(f"{path}/boxes", boxes)
@@ -119,18 +116,20 @@ class LiveLog:
         recording.log("map/rays/now", rr.LineStrips3D(rays, colors=ray_colour.astype(np.uint8), radii=radius))
 
 
+def _transform(pose: Floats) -> rr.Transform3D:
+    return rr.Transform3D(translation=pose[:3, 3], quaternion=rr.Quaternion(xyzw=quaternion(pose)))
+
+
 def _rays(frame: CameraFrame, objects: ObjectMap, index: Ints) -> NDArray[np.float32]:
-    """The rays (B, 2, 3) of the boxes, from the camera to as far out as their objects."""
-    pixels = (frame.boxes[:, :2] + frame.boxes[:, 2:]) / 2
-    directions, _ = undistort(frame.camera, pixels)
+    """Return the rays (B, 2, 3) of the boxes, from the camera to the distance of their objects."""
+    directions, _ = undistort(frame.camera, (frame.boxes[:, :2] + frame.boxes[:, 2:]) / 2)
     origin = frame.map_T_camera[:3, 3]
     ahead = directions @ frame.map_T_camera[:3, :3].T
-    reach = np.full(len(pixels), _FREE_REACH)
-    held = np.flatnonzero(index >= 0)
-    if len(held):
-        positions = np.stack([o.position for o in objects.objects])[index[held]]
-        distance = np.linalg.norm(positions - origin, axis=1)
-        reach[held] = np.where(np.isfinite(distance), distance, _FREE_REACH)
+    reach = np.full(len(ahead), _FREE_REACH)
+    held = index >= 0
+    positions = np.array([o.position for o in objects.objects]).reshape(-1, 3)[index[held]]
+    distance = np.linalg.norm(positions - origin, axis=1)
+    reach[held] = np.where(np.isfinite(distance), distance, _FREE_REACH)
     return np.stack([np.broadcast_to(origin, ahead.shape), origin + reach[:, None] * ahead], axis=1).astype(np.float32)
 
 
@@ -139,5 +138,5 @@ def _counters(shown: ShownSnapshot) -> str:
     rows += [(name, str(value)) for name, value in shown.counters.items()]
     rows += [(f"dropped: {name}", str(value)) for name, value in shown.dropped.items()]
     if shown.numbers["unseen"]:
-        rows.append(("snapshots that the viewer had no time for", f"{shown.numbers['unseen']:g}"))
-    return "\n".join(["| | |", "|---|---:|", *(f"| {name} | {value} |" for name, value in rows)])
+        rows.append(("snapshots that the viewer missed", f"{shown.numbers['unseen']:g}"))
+    return "\n".join(table(rows))

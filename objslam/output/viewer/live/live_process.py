@@ -1,8 +1,8 @@
-"""The process that a live view logs from.
+"""The process that logs the snapshots of a session to a viewer or a file.
 
-rerun's connection blocks as long as a viewer hangs, and keeps its process from ending. This process can be killed. It is
-started as `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`, with messages on its input. It
-answers each with a line: "ok" where the viewer or the file has it, "lost" where that is not sure.
+A hanging viewer blocks rerun's connection and the end of the connected process. This process can be killed.
+Start: `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`. The process reads messages from stdin
+and answers each message with a line: "ok" if the viewer or the file has received it, "lost" if this is uncertain.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import rerun as rr
 from objslam.output.viewer.live.live_log import LiveLog
 from objslam.output.viewer.live.wire import read_snapshot
 
-_GRACE = 5.0  # The time, s, that a viewer has to take the last message once the session is gone.
-_RETRY = 2.0  # The time, s, between two attempts to reach a viewer that is gone.
+_GRACE = 5.0  # After the end of the session, a viewer has this time, s, to receive the last message.
+_RETRY = 2.0  # Two attempts to reach a lost viewer are at least this time, s, apart.
 
 
 def main() -> None:
@@ -31,34 +31,28 @@ def main() -> None:
     parent = os.getppid()
     recording = rr.RecordingStream("objslam")
     _connect(recording, options)
-    log, source, tried = LiveLog(recording), sys.stdin.buffer, time.monotonic()
-    lost = False
-    while (message := read_snapshot(source)) is not None:
+    log, tried, lost = LiveLog(recording), time.monotonic(), False
+    while (message := read_snapshot(sys.stdin.buffer)) is not None:
         if lost and time.monotonic() - tried > _RETRY:
             _connect(recording, options)
             log.begin()
             tried = time.monotonic()
         log.show(*message)
         lost = not _delivered(recording, parent)
-        sys.stdout.write("lost\n" if lost else "ok\n")
-        sys.stdout.flush()
-    timer = threading.Timer(_GRACE, lambda: os._exit(1))  # a viewer that hangs would keep this process for ever
+        print("lost" if lost else "ok", flush=True)
+    timer = threading.Timer(_GRACE, lambda: os._exit(1))  # A hanging viewer would block `disconnect` for ever.
     timer.daemon = True
     timer.start()
     recording.disconnect()
 
 
 def _connect(recording: Any, options: argparse.Namespace) -> None:
-    sinks: list[Any] = []
-    if options.file is not None:
-        sinks.append(rr.FileSink(options.file))
-    if options.address is not None:
-        sinks.append(rr.GrpcSink(options.address))
-    recording.set_sinks(*sinks)
+    chosen = ((rr.FileSink, options.file), (rr.GrpcSink, options.address))
+    recording.set_sinks(*(sink(target) for sink, target in chosen if target is not None))
 
 
 def _delivered(recording: Any, parent: int) -> bool:
-    """Wait until what was logged has arrived, as long as the session lives; False where it was lost."""
+    """Wait until the logged data have arrived; return False if they are lost, and exit if the session has ended."""
     while True:
         try:
             recording.flush(timeout_sec=1.0)
