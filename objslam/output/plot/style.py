@@ -78,7 +78,9 @@ def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
 
 def _colour(hue: float, number: int) -> tuple[float, float, float]:
     linear = np.array(colorsys.hsv_to_rgb(hue, _SATURATION, 1.0)) ** 2.2
-    linear *= _LUMINANCES[number % 2] / float(linear @ [0.2126, 0.7152, 0.0722])  # These are the weights of red, green, blue.
+    linear *= _LUMINANCES[number % 2] / float(
+        linear @ [0.2126, 0.7152, 0.0722]
+    )  # These are the weights of red, green, blue.
     r, g, b = np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
     return float(r), float(g), float(b)
 

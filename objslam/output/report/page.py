@@ -78,13 +78,6 @@ def write_report(
         OutputError: the result cannot be read, or the page cannot be written.
         LogError: the ground truth cannot be read.
     """
-    file = out / REPORT
-    write_file(file, render(out, log=log, crops=crops, progress=progress).encode("utf-8", errors="replace"))
-    return file
-
-
-def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, int, int], None]) -> str:
-    """Return the page of a result folder as text; every text from the result is escaped."""
     import jinja2
 
     progress("reading the result", 0, 0)
@@ -106,16 +99,17 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
     cards = _cards(objects, rays, residual_deg, mine, crops_of, errors, begin)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.output.report", ""),
-        autoescape=True,
+        autoescape=True,  # Texts of the result may contain HTML.
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
     picture, examples = out / PICTURE, summary.get("dropped_examples", {})
-    return environment.get_template("page.html.jinja").render(
-        style=_resource("page.css"),
-        script=_resource("page.js"),
+    source = resources.files("objslam.output.report")
+    page = environment.get_template("page.html.jinja").render(
+        style=(source / "page.css").read_text(encoding="utf-8"),
+        script=(source / "page.js").read_text(encoding="utf-8"),
         name=str(summary.get("log", out.resolve().name)),
         folder=out.resolve().name,
         mode=settings.mode,
@@ -139,6 +133,8 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
         changed=_changed(settings),
         settings=dump_settings(settings),
     )
+    write_file(out / REPORT, page.encode("utf-8", errors="replace"))
+    return out / REPORT
 
 
 def _cards(
@@ -229,7 +225,3 @@ def _natural(text: str) -> tuple[str, int]:
     """Return a sort key that places landmark_9 before landmark_10."""
     head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
     return head, int(number or -1)
-
-
-def _resource(name: str) -> str:
-    return resources.files("objslam.output.report").joinpath(name).read_text(encoding="utf-8")

@@ -104,7 +104,10 @@ def start(*arguments: str) -> Viewer:
 def show(files: list[Path]) -> None:
     """Open recordings in the native viewer and wait until it is closed; OutputError if the viewer fails."""
     viewer = start("--port", str(free_port()), *map(str, files))
-    _, said = _until_closed(viewer)
+    try:
+        _, said = viewer.communicate()
+    finally:
+        stop(viewer)
     if viewer.returncode not in (0, -15, -2):
         raise _failure(viewer.returncode, said, "use --web, or --screenshot FILE.png")
 
@@ -117,7 +120,7 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
         with suppress(KeyboardInterrupt):  # Ctrl+C ends the server.
             _wait_for(viewer, web)
             say(f"{web_address(web, data)} (Ctrl+C ends it)")
-            _, said = _until_closed(viewer)
+            _, said = viewer.communicate()
             raise _failure(viewer.returncode, said, None)
     finally:
         stop(viewer)
@@ -239,14 +242,6 @@ def start_listening(port: int, *arguments: str) -> Viewer:
     # A thread reads the viewer's stderr and ignores it, because the viewer would block at a full pipe.
     threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True).start()
     return viewer
-
-
-def _until_closed(viewer: Viewer) -> tuple[bytes, bytes]:
-    try:
-        return viewer.communicate()
-    except KeyboardInterrupt:
-        stop(viewer)
-        raise
 
 
 def stop(viewer: Viewer) -> None:

@@ -15,12 +15,12 @@ from objslam.core.geometry import inverse
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.output.plot.style import captions, ray_kinds
-from objslam.output.viewer.image_labels import label_rows
 from objslam.output.viewer.images import choose_images, jpegs
 from objslam.output.viewer.objects import colours
 from objslam.output.viewer.paths import send_poses
 from objslam.output.viewer.rays import RAY_COLOURS, kind_colours
 from objslam.output.viewer.times import moments, stamp_column
+from objslam.output.viewer.view_point import label_rows
 
 _BLOCK = 500_000  # This many pairs of an object and a frame are tested at once. A larger value takes more memory.
 _NEAR = 0.2  # A camera is expected to see an object from this distance, m.

@@ -15,6 +15,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
 from objslam.output.plot.style import RayKind, captions, evenly
+from objslam.output.viewer.event_log import table
 from objslam.output.viewer.objects import log_objects
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.view_point import ViewPoint, first_view_point, look_at
@@ -155,19 +156,20 @@ def _text(f: ProximityField, objects: ObjectMap, o: MapObject, name: str, rays: 
     gap = float(np.linalg.norm(f.minimum - o.position))
     off = np.linalg.norm(np.cross(f.minimum - rays.origin[pull], rays.direction[pull]), axis=1)
     x, y, z = f.minimum
+    rows = [
+        ("used rays (blue)", str(pull.sum())),
+        ("rejected rays (red)", str((rays.object == o.id).sum() - pull.sum())),
+        ("parallax", f"{o.parallax_deg:.1f} deg"),
+        ("minimum of Eq. 1", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
+        ("mean distance of its used rays", _metres(f.cost)),
+        ("median distance, largest distance", f"{_metres(float(np.median(off)))}, {_metres(float(off.max()))}"),
+        ("distance from the run's estimate", _metres(gap)),
+    ]
     return "\n".join(
         [
             f"**{name}**, {o.status}, in a map of {len(objects)} objects",
             "",
-            "| | |",
-            "|---|---:|",
-            f"| used rays (blue) | {pull.sum()} |",
-            f"| rejected rays (red) | {(rays.object == o.id).sum() - pull.sum()} |",
-            f"| parallax | {o.parallax_deg:.1f} deg |",
-            f"| minimum of Eq. 1 | {x:.3f}, {y:.3f}, {z:.3f} m |",
-            f"| mean distance of its used rays | {_metres(f.cost)} |",
-            f"| median distance, largest distance | {_metres(float(np.median(off)))}, {_metres(float(off.max()))} |",
-            f"| distance from the run's estimate | {_metres(gap)} |",
+            *table(rows),
             "",
             "The colour of a point is its mean distance from the used rays: Eq. 1's cost divided by the number of rays. "
             "Bright points are close. A valley along the rays means that the distance of the object is uncertain.",

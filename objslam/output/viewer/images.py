@@ -63,11 +63,11 @@ def _read(path: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def pack(pixels: np.ndarray, size: tuple[int, int]) -> bytes:
-    """Encode pixels (H, W, 3) uint8 BGR, or (H, W), as a JPEG of a size (width, height), px."""
+def pack(pixels: np.ndarray, size: tuple[int, int] | None = None) -> bytes:
+    """Encode pixels (H, W, 3) uint8 BGR, or (H, W), as a JPEG; `size` is (width, height), px, if it differs."""
     import cv2
 
-    if (pixels.shape[1], pixels.shape[0]) != size:
+    if size is not None and (pixels.shape[1], pixels.shape[0]) != size:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return data.tobytes()

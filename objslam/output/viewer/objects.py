@@ -41,13 +41,9 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
             recording.log(f"map/objects{name}", archetype, static=static)
 
     resolved = [i for i, o in enumerate(every) if o.status == "ok"]
-    points = rr.Points3D(
-        [every[i].position for i in resolved],
-        colors=[colour[i] for i in resolved],
-        radii=rr.Radius.ui_points(5),
-        labels=[texts[i] for i in resolved],
-        show_labels=False,
-    )
+    dots, shades = [every[i].position for i in resolved], [colour[i] for i in resolved]
+    known = [texts[i] for i in resolved]
+    points = rr.Points3D(dots, colors=shades, labels=known, radii=rr.Radius.ui_points(5), show_labels=False)
     log("", points, bool(resolved))
     shapes = [(i, shape) for i in resolved if (shape := ellipsoid(every[i])) is not None]
     bodies = rr.Ellipsoids3D(
@@ -84,11 +80,6 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 def log_truth(recording: Any, truth: Truth) -> None:
     """Log the true objects as static black dots, `map/truth`."""
-    points = rr.Points3D(
-        [o.position for o in truth.objects],
-        colors=[_TRUTH],
-        radii=rr.Radius.ui_points(3),
-        labels=[o.label for o in truth.objects],
-        show_labels=False,
-    )
+    places, labels = [o.position for o in truth.objects], [o.label for o in truth.objects]
+    points = rr.Points3D(places, colors=[_TRUTH], labels=labels, radii=rr.Radius.ui_points(3), show_labels=False)
     recording.log("map/truth", points, static=True)

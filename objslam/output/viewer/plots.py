@@ -43,7 +43,12 @@ def broken(stamps: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def log_costs(recording: Any, result: RunResult) -> None:
-    """Log the cost by iteration, `plots/cost`, and the counts of objects and unexplained rays, `plots/rounds`."""
+    """Log curves by iteration: the cost, `plots/cost`, and the counts of objects and unexplained rays, `plots/rounds`.
+
+    `plots/seconds` has a bar for the time of each stage, in the order of the table in `summary`.
+    """
+    if seconds := result.summary.get("seconds", {}):
+        recording.log("plots/seconds", rr.BarChart(list(seconds.values()), color=_BLUE), static=True)
     steps = [(i.stage, i.cost, r.association) for r in result.trace for i in r.iterations]
     numbers = np.arange(len(steps))
     stage, cost = np.array([stage for stage, _, _ in steps]), np.array([cost for _, cost, _ in steps])
@@ -62,9 +67,3 @@ def log_costs(recording: Any, result: RunResult) -> None:
 def _send(recording: Any, path: str, at: Any, values: Any, colour: tuple[int, int, int], name: str) -> None:
     recording.send_columns(path, [at], rr.Scalars.columns(scalars=values))
     recording.log(path, rr.SeriesLines(colors=[colour], names=[name], widths=[1.5]), static=True)
-
-
-def log_seconds(recording: Any, seconds: dict[str, float]) -> None:
-    """Log the time of each stage as bars, `plots/seconds`, in the order of the table in `summary`."""
-    if seconds:
-        recording.log("plots/seconds", rr.BarChart(list(seconds.values()), color=_BLUE), static=True)

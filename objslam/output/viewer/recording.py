@@ -17,7 +17,7 @@ from objslam.output.viewer.cameras import camera_path, log_cameras
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
 from objslam.output.viewer.objects import log_objects, log_truth
 from objslam.output.viewer.paths import log_base, log_paths, log_steps, thinned
-from objslam.output.viewer.plots import log_costs, log_residuals, log_seconds
+from objslam.output.viewer.plots import log_costs, log_residuals
 from objslam.output.viewer.rays import log_rays
 from objslam.output.viewer.surface import log_surfaces
 from objslam.output.viewer.times import iteration_column, stamp_column
@@ -62,7 +62,6 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
         _log_events(recording, events, stamp_column)
     log_steps(recording, result)
     log_costs(recording, result)
-    log_seconds(recording, result.summary.get("seconds", {}))
     rounds = round_events(result.trace, result.rays.label_names)
     _log_events(recording, rounds, lambda at: iteration_column(at.astype(np.int64)))
     recording.log("summary", rr.TextDocument(summary_text(result), media_type="text/markdown"), static=True)

@@ -1,4 +1,4 @@
-"""The first view of a map: its view point, and the places of the labels so that no label covers another label."""
+"""The first view of a map, and the placement of labels on the map and in camera images."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import ObjectMap
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
-from objslam.output.viewer.image_labels import LETTER, PADDING
 
 _FOV = np.radians(55.0)  # The viewer has this field of view, rad, from the lower to the upper edge.
 _VIEW = np.array([900.0, 620.0])  # The view of the map has this width and height, px, in a window of 1600 x 900.
 _FILLED = 0.86  # The map fills this share of the view.
 _FROM = np.array([-0.28, -0.80, 0.78])  # The first view point lies in this direction: south, slightly west, 43 deg up.
 _LINE = 24.0  # A label on the map has this height, px.
+_LETTER, _PADDING = 7.3, 12.0  # A letter, and both margins of a label together, have these widths, px on the screen.
+_IMAGE_LINE = 21.0  # A label in an image has this height, px on the screen.
+_IMAGE_VIEW = (580.0, 350.0)  # The view of a camera has this width and height, px, in a window of 1600 x 900.
+_ROWS = 6  # A label hangs at most this many rows below its dot.
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,43 @@ def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid
         return anchors, anchors
     dots, depth = view_point.project(anchors)
     crowd, ahead = view_point.project(avoid)
-    sizes = np.column_stack([np.array([len(text) for text in texts]) * LETTER + PADDING, np.full(len(texts), _LINE)])
+    sizes = np.column_stack([np.array([len(text) for text in texts]) * _LETTER + _PADDING, np.full(len(texts), _LINE)])
     corners, found = place_labels(dots, sizes, np.stack([np.zeros(2), _VIEW]), crowd[ahead > 0])
     corners = np.where((found & (depth > 0))[:, None], corners, dots - [0.5, 0.0] * sizes)
     hung = corners + [0.5, 0.0] * sizes
     near = np.clip(dots, corners, corners + sizes)
     return anchors + view_point.offset(hung - dots, depth), anchors + view_point.offset(near - dots, depth)
+
+
+def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, float]) -> tuple[Floats, Bools]:
+    """Place labels in rows, from left to right; each label gets the first free row below its dot.
+
+    Args:
+        frame: (S,) the image of each dot.
+        dots: (S, 2) px of the image.
+        letters: (S,) the length of each label.
+        size: width and height of the images, px; the viewer scales an image to its view.
+    Returns:
+        The places (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
+    """
+    scale = min(_IMAGE_VIEW[0] / size[0], _IMAGE_VIEW[1] / size[1])  # px on the screen per px of the image
+    half = (letters * _LETTER + _PADDING) / 2 / scale
+    line = _IMAGE_LINE / scale
+    order = np.lexsort((dots[:, 0] - half, frame))
+    first = np.searchsorted(frame[order], frame[order])
+    rank = np.arange(len(order)) - first
+    row = np.ceil(dots[:, 1] / line).astype(np.int64)
+    frames = int(frame.max()) + 1 if len(frame) else 0
+    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Each row is occupied up to this px.
+    hung, found = dots.copy(), np.zeros(len(dots), dtype=bool)
+    for k in range(int(rank.max()) + 1 if len(rank) else 0):
+        mine = order[rank == k]  # the k-th label of each frame
+        for below in range(_ROWS):
+            at = row[mine] + below
+            free = until[frame[mine], at] <= dots[mine, 0] - half[mine]
+            take = mine[free]
+            until[frame[take], at[free]] = dots[take, 0] + half[take]
+            hung[take, 1] = at[free] * line
+            found[take] = True
+            mine = mine[~free]
+    return hung, found

@@ -40,19 +40,10 @@ def _dump(content: Content) -> bytes:
 
 
 def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
-    properties = {
-        "kind": "object",
-        "label": o.label,
-        "status": o.status,
-        "z": _finite(o.position[2]),
-        "sigma": _finite(o.sigma),
-        "width": o.extent[0] if o.extent else None,
-        "height": o.extent[1] if o.extent else None,
-        "rays": o.rays,
-        "first_seen": _finite(o.first_seen),
-        "last_seen": _finite(o.last_seen),
-        "existence": _finite(o.existence),
-    }
+    width, height = o.extent or (None, None)
+    properties: dict[str, Any] = {"kind": "object", "label": o.label, "status": o.status}
+    properties |= {"z": _finite(o.position[2]), "sigma": _finite(o.sigma), "width": width, "height": height, "rays": o.rays}
+    properties |= {name: _finite(getattr(o, name)) for name in ("first_seen", "last_seen", "existence")}
     geometry = None
     if o.status == "ok":
         geometry = {"type": "Point", "coordinates": _coordinates(o.position[None], datum)[0]}

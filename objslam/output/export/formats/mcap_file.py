@@ -6,7 +6,6 @@ The module writes such a file without ROS. Source: https://mcap.dev/spec.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import OutputError
@@ -14,7 +13,6 @@ from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
     from objslam.output.export.content import Content
-    from objslam.output.export.map_messages import MapMessages
 
 _POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose. No other topic has a message per stamp.
 _LATCHED = (
@@ -43,18 +41,6 @@ def _dump(content: Content) -> bytes:
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library="objslam")
-    put = _channels(writer, messages)
-    put("/objslam/objects", start, messages.detections(start, content.objects.resolved()))
-    put("/objslam/markers", start, messages.markers(start, content.objects))
-    put("/objslam/path", start, messages.path(start, stamps, content.path.poses))
-    for stamp, pose in zip(stamps.tolist(), content.path.poses, strict=True):
-        put(_POSE_TOPIC, stamp, messages.stamped(stamp, pose))
-    writer.finish()
-    return buffer.getvalue()
-
-
-def _channels(writer: Any, messages: MapMessages) -> Callable[[str, float, Any], None]:
-    """Return a function that writes a message to a topic; the first message of a topic registers topic and type."""
     channels: dict[str, int] = {}
 
     def put(topic: str, stamp: float, message: Any) -> None:
@@ -67,7 +53,13 @@ def _channels(writer: Any, messages: MapMessages) -> Callable[[str, float, Any],
         at = round(stamp * 1e9)
         writer.add_message(channels[topic], at, bytes(messages.store.serialize_cdr(message, name)), at)
 
-    return put
+    put("/objslam/objects", start, messages.detections(start, content.objects.resolved()))
+    put("/objslam/markers", start, messages.markers(start, content.objects))
+    put("/objslam/path", start, messages.path(start, stamps, content.path.poses))
+    for stamp, pose in zip(stamps.tolist(), content.path.poses, strict=True):
+        put(_POSE_TOPIC, stamp, messages.stamped(stamp, pose))
+    writer.finish()
+    return buffer.getvalue()
 
 
 EXPORT = ExportFormat("mcap", "map.mcap", "map and path as ROS 2 messages, for Foxglove and RViz", _dump)

@@ -15,6 +15,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.io.objects_json import dump_objects, parse_objects
 from objslam.output.plot.style import evenly
+from objslam.output.viewer.images import pack
 
 _LENGTH = struct.Struct("<Q")  # A message begins with the length of its JSON text, bytes.
 _MAX_POINTS = 500  # A message has at most this many points of the path.
@@ -51,7 +52,7 @@ def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
         "dropped": {name: int(n) for name, n in snapshot.dropped.items()},
         "frames": [_fields(f, _FRAME) | {"camera": _fields(f.camera, _CAMERA)} for f in frames],
     }
-    blobs = [b"" if f.image is None else f.image if isinstance(f.image, bytes) else _packed(f.image) for f in frames]
+    blobs = [pack(f.image) if isinstance(f.image, np.ndarray) else f.image or b"" for f in frames]
     head["blobs"] = [len(b) for b in blobs]
     text = json.dumps(head, default=np.ndarray.tolist).encode()
     return _LENGTH.pack(len(text)) + text + b"".join(blobs)
@@ -91,9 +92,3 @@ def _parse_frame(entry: dict[str, Any], blob: bytes) -> CameraFrame:
         rejected=np.array(entry["rejected"], dtype=bool),
         image=blob or None,
     )
-
-
-def _packed(pixels: np.ndarray) -> bytes:
-    from objslam.output.viewer.images import pack
-
-    return pack(pixels, (pixels.shape[1], pixels.shape[0]))
