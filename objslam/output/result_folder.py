@@ -49,11 +49,8 @@ def prepare_output(out: Path) -> None:
             raise OutputError("this is a log, not a place for its result", where=str(out), hint=hint)
         names = _existing_files(out)
         if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
-            raise OutputError(
-                f"in the way of a result, and not written by a run: {', '.join(names)}",
-                where=str(out),
-                hint="name another folder with -o, or move these files",
-            )
+            what = f"in the way of a result, and not written by a run: {', '.join(names)}"
+            raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
         for name in _FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
                 raise OutputError("a folder stands where a file of the result goes: move it", where=str(out / name))

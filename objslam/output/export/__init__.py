@@ -12,7 +12,7 @@ from objslam.errors import ConfigError, OutputError
 from objslam.output.export.formats import FORMATS
 
 if TYPE_CHECKING:
-    from objslam.output.export.datum import Datum
+    from objslam.output.export.content import Datum
 
 
 def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | None = None) -> Path:

@@ -5,6 +5,7 @@ Sources: https://docs.ros.org/en/rolling/p/vision_msgs, https://docs.ros.org/en/
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -83,7 +84,7 @@ class MapMessages:
         """
         colours, made = label_colours(objects), []
         if clear_first:
-            made.append(self._marker(stamp, "", 0, _SPHERE, np.eye(4), np.zeros(3), (0.0,) * 4, action=_DELETE_ALL))
+            made.append(replace(self._marker(stamp, "", 0, np.eye(4), np.zeros(3), (0.0,) * 4), action=_DELETE_ALL))
         for number, (o, name) in enumerate(zip(objects.objects, captions(objects), strict=True)):
             if o.status != "ok":
                 continue
@@ -91,12 +92,12 @@ class MapMessages:
             size = np.maximum([o.extent[0], o.extent[0], o.extent[1]] if o.extent else np.zeros(3), _MIN_SIZE)
             at = make_pose(np.eye(3), o.position)
             above = make_pose(np.eye(3), o.position + np.array([0.0, 0.0, size[2] / 2 + _TEXT_SIZE]))
-            made.append(self._marker(stamp, "objects", number, _SPHERE, at, size, (*colour, 0.9)))
-            made.append(self._marker(stamp, "labels", number, _TEXT, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
+            made.append(self._marker(stamp, "objects", number, at, size, (*colour, 0.9)))
+            made.append(self._marker(stamp, "labels", number, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
             axes = ellipsoid(o)
             if axes is not None:
                 turned = make_pose(axes[1], o.position)
-                made.append(self._marker(stamp, "covariances", number, _SPHERE, turned, 2 * axes[0], (*colour, 0.3)))
+                made.append(self._marker(stamp, "covariances", number, turned, 2 * axes[0], (*colour, 0.3)))
         return self.make("visualization_msgs/MarkerArray", made)
 
     def _marker(
@@ -104,12 +105,10 @@ class MapMessages:
         stamp: float,
         namespace: str,
         number: int,
-        kind: int,
         pose: Floats,
         size: Floats,
         colour: tuple[float, ...],
         text: str = "",
-        action: int = _ADD,
     ) -> Any:
         make, header, nothing = self.make, self.header(stamp), np.zeros(0, dtype=np.uint8)
         marker: Any = self.store.types["visualization_msgs/msg/Marker"]
@@ -118,8 +117,8 @@ class MapMessages:
             header=header,
             ns=namespace,
             id=number,
-            type=kind,
-            action=action,
+            type=_TEXT if namespace == "labels" else _SPHERE,
+            action=_ADD,
             pose=self.pose(pose),
             scale=self._vector("Vector3", np.maximum(size, 1e-3)),
             color=make("std_msgs/ColorRGBA", *(float(part) for part in colour)),

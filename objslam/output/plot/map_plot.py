@@ -27,11 +27,7 @@ _BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The path before, 
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw the map of a run from above as a PNG: both paths, rays, objects with 2-sigma ellipses, ground truth.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Draw the map of a run from above as a PNG (paths, rays, objects, ground truth); OSError if the file cannot be written."""
     import matplotlib
 
     with matplotlib.rc_context():
@@ -49,7 +45,6 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     shown, low, high = _frame(result, points, crosses)
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
-
     width, height = (high - low) / (high - low).max() * _LONG_SIDE
     size = max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3  # Title and legend take the margins.
     figure = Figure(figsize=size, dpi=150, layout="constrained")
@@ -61,7 +56,6 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     axes.set_axisbelow(True)
     for side in axes.spines.values():
         side.set_color("#c4c4c4")
-
     _draw_rays(axes, result)
     _draw_paths(axes, result)
     if len(crosses):

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
-from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
 from objslam.evaluation.alignment import lay_truth
@@ -58,7 +57,7 @@ class Card:
     error: float | None  # The distance from the matching true object, m; None without a match.
     matched: str | None  # A text that names the matching true object.
     histogram: Histogram | None
-    crops: tuple[Crop, ...]
+    crops: list[Crop]
 
 
 def write_report(
@@ -87,16 +86,14 @@ def write_report(
     except ConfigError as error:
         raise OutputError(error.message.splitlines()[0], where=error.where) from error
     errors, scores = _evaluation(out, objects)
-    mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
-    chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
+    chosen = {o.id: best_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects.objects}
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
-    crops_of = {number: tuple(pictures[i] for i in index.tolist() if i in pictures) for number, index in chosen.items()}
+    crops_of = {number: [pictures[i] for i in index.tolist() if i in pictures] for number, index in chosen.items()}
     begin = float(rays.stamp.min()) if len(rays) else 0.0
-    residual_deg = np.degrees(rays.residual)
-    cards = _cards(objects, rays, residual_deg, mine, crops_of, errors, begin)
+    cards = _cards(objects, rays, crops_of, errors, begin)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.output.report", ""),
         autoescape=True,  # Texts of the result may contain HTML.
@@ -120,15 +117,13 @@ def write_report(
         cards=cards,
         with_errors=any(card.error is not None for card in cards),
         with_existence=any(card.object.existence is not None for card in cards),
-        histogram=histogram(residual_deg, rays.weight, _BINS),
+        histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
         unexplained=summary.get("unexplained_share", {}),
         dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
-        warnings=summary.get("warnings", []),
-        seconds=summary.get("seconds", {}),
-        versions=summary.get("versions", {}),
+        **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if key in summary},
         changed=_changed(settings),
         settings=dump_settings(settings),
@@ -138,26 +133,17 @@ def write_report(
 
 
 def _cards(
-    objects: ObjectMap,
-    rays: RaysTable,
-    residual_deg: Floats,
-    mine: dict[int, Ints],
-    crops: dict[int, tuple[Crop, ...]],
-    errors: dict[int, tuple[float, str]],
-    begin: float,
+    objects: ObjectMap, rays: RaysTable, crops: dict[int, list[Crop]], errors: dict[int, tuple[float, str]], begin: float
 ) -> list[Card]:
-    """Return the cards, sorted by label.
-
-    Args:
-        mine: the indices of each object's rays.
-        begin: the stamp, s, at which the times on the page begin.
-    """
+    """Return the cards, sorted by label; the times on the page are relative to `begin`, s."""
+    residual_deg = np.degrees(rays.residual)
     kept = residual_deg[(rays.weight >= REJECTED_BELOW) & np.isfinite(residual_deg)]
     top = axis_end(kept) if len(kept) else None
     colours = label_colours(objects)
     cards = []
     for o, caption in zip(objects.objects, captions(objects), strict=True):
-        weight = rays.weight[mine[o.id]]
+        mine = rays.object == o.id
+        weight = rays.weight[mine]
         error, matched = errors.get(o.id, (None, None))
         card = Card(
             object=o,
@@ -168,7 +154,7 @@ def _cards(
             rejected=int((weight < REJECTED_BELOW).sum()),
             error=error,
             matched=matched,
-            histogram=histogram(residual_deg[mine[o.id]], weight, _FEW_BINS, top),
+            histogram=histogram(residual_deg[mine], weight, _FEW_BINS, top),
             crops=crops[o.id],
         )
         cards.append(card)

@@ -130,8 +130,12 @@ def _send_objects(
     resolved = [i for i, o in enumerate(result.map.objects) if o.status == "ok"]
     if not resolved:
         return
-    positions = np.stack([result.map.objects[i].position for i in resolved])
-    frame, seen, pixels = points_in_frames(camera, poses, positions, _farthest(result, resolved))
+    used = np.flatnonzero(ray_kinds(result)["used"])
+    index = result.association.object[used]
+    positions = np.stack([o.position for o in result.map.objects])
+    reach = np.zeros(len(positions))
+    np.maximum.at(reach, index, np.linalg.norm(positions[index] - result.origins[used], axis=1))
+    frame, seen, pixels = points_in_frames(camera, poses, positions[resolved], _BEYOND * reach[resolved])
     pixels *= scale
     names = np.array(captions(result.map), dtype=object)[resolved]
     palette = light_colours(result.map)[resolved]
@@ -168,13 +172,3 @@ def points_in_frames(camera: Camera, map_T_camera: Floats, points: Floats, farth
         found.append((pose[inside] + begin, point[inside], pixels))
     pose, point, pixels = (np.concatenate(c) for c in zip(*found, strict=True))
     return pose, point, pixels
-
-
-def _farthest(result: RunResult, objects: list[int]) -> Floats:
-    """Return the distance (n,), m, up to which a camera is expected to see each object."""
-    used = np.flatnonzero(ray_kinds(result)["used"])
-    index = result.association.object[used]
-    every = np.stack([o.position for o in result.map.objects])
-    reach = np.zeros(len(every))
-    np.maximum.at(reach, index, np.linalg.norm(every[index] - result.origins[used], axis=1))
-    return _BEYOND * reach[objects]

@@ -57,9 +57,10 @@ def write_field(out: Path, number: int, file: Path) -> ProximityField:
     if pull.sum() < 2:
         raise OutputError(f"object {number} has {pull.sum()} rays: Eq. 1 has no minimum below 2 rays", where=str(out))
     f = proximity_field(rays.origin[pull], rays.direction[pull])
-    view_point = _view_point(f, rays.direction[pull])
+    ahead = main_heading(rays.direction[pull])
+    back = _FROM @ np.stack([ahead, [-ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+    view_point = look_at(f.minimum, back, _DISTANCE * float(np.ptp(f.vertical.points[..., 2])) / 2)
     name = captions(objects)[objects.objects.index(o)]
-
     recording = rr.RecordingStream("objslam")
     memory = recording.memory_recording()
     recording.send_recording_name(f"proximity field of {name}")
@@ -131,14 +132,6 @@ def _log_marks(recording: Any, f: ProximityField, o: MapObject, name: str, view_
         recording.log(f"map/field/{path}/label", text, static=True)
         pole = rr.LineStrips3D([[place + nearer, top]], colors=[colour], radii=rr.Radius.ui_points(1))
         recording.log(f"map/field/{path}/pole", pole, static=True)
-
-
-def _view_point(f: ProximityField, directions: Floats) -> ViewPoint:
-    ahead = main_heading(directions)
-    aside = np.array([-ahead[1], ahead[0], 0.0])
-    back = _FROM @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
-    reach = float(np.ptp(f.vertical.points[..., 2])) / 2
-    return look_at(f.minimum, back, _DISTANCE * reach)
 
 
 def _blueprint(view_point: ViewPoint) -> Any:

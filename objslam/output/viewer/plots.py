@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from objslam.core.arrays import Floats
 from objslam.core.result import RunResult
 from objslam.core.statistics import grouped_quantile
 from objslam.output.plot.style import ray_kinds
@@ -26,20 +25,16 @@ def log_residuals(recording: Any, result: RunResult) -> None:
     kinds = ray_kinds(result)
     used = kinds["used"]
     degrees = np.degrees(result.residual[used])
+    step = np.diff(stamps)
+    gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
+    at = stamp_column(np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2))  # No line crosses a gap.
     for name, share, colour in (("median", 0.5, _BLUE), ("worst", 1.0, _ORANGE)):
-        at, curve = broken(stamps, grouped_quantile(degrees, of[used], len(stamps), share))
+        curve = np.insert(grouped_quantile(degrees, of[used], len(stamps), share), gap + 1, np.nan)
         if np.isfinite(curve).any():
-            _send(recording, f"plots/residual/{name}", stamp_column(at), curve, colour, f"{name} residual, deg")
+            _send(recording, f"plots/residual/{name}", at, curve, colour, f"{name} residual, deg")
     for kind, mask in kinds.items():
         counts = np.bincount(of[mask], minlength=len(stamps)).astype(np.float64)
         _send(recording, f"plots/boxes/{kind}", stamp_column(stamps), counts, RAY_COLOURS[kind], kind)
-
-
-def broken(stamps: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Insert a NaN into each gap of a curve (N,) at ascending stamps (N,), s, so that no line crosses the gap."""
-    step = np.diff(stamps)
-    gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
-    return np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2), np.insert(values, gap + 1, np.nan)
 
 
 def log_costs(recording: Any, result: RunResult) -> None:

@@ -11,8 +11,7 @@ from objslam.output.export.export_format import ExportFormat
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.core.object_map import MapObject
-    from objslam.output.export.content import Content
-    from objslam.output.export.datum import Datum
+    from objslam.output.export.content import Content, Datum
 
 _DEGREE_DIGITS = 9  # Longitudes and latitudes, deg, have this many decimal places. 1e-9 deg is 0.1 mm on the ground.
 _METRE_DIGITS = 6  # Coordinates, m, have this many decimal places. 1e-6 m is far below the accuracy of any map.
