@@ -27,7 +27,7 @@ _BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The path before, 
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw the map of a run from above as a PNG (paths, rays, objects, ground truth); OSError if the file cannot be written."""
+    """Draw a map from above as a PNG: paths, rays, objects, ground truth. OSError if the file cannot be written."""
     import matplotlib
 
     with matplotlib.rc_context():
@@ -98,11 +98,9 @@ def _draw_rays(axes: Any, result: RunResult) -> None:
     from matplotlib.collections import LineCollection
 
     kinds, ends = ray_kinds(result), ray_ends(result)
-    rejected = f"rejected rays ({int(kinds['rejected'].sum()):,})"
-    for mask, colour, most, label in (
-        (kinds["used"], _USED, _MAX_RAYS, "rays"),
-        (kinds["rejected"], _REJECTED, _MAX_REJECTED, rejected),
-    ):
+    used, out = kinds["used"], kinds["rejected"]
+    many = f"rejected rays ({int(out.sum()):,})"
+    for mask, colour, most, label in ((used, _USED, _MAX_RAYS, "rays"), (out, _REJECTED, _MAX_REJECTED, many)):
         index = sample(mask, most)
         if len(index):
             lines = list(np.stack([result.origins[index, :2], ends[index, :2]], axis=1))

@@ -138,6 +138,8 @@ def screenshot(
         ConfigError: the picture's name does not end in .png.
         OutputError: there is no Vulkan driver, the viewer fails, or the picture cannot be written.
     """
+    from rerun.experimental import ViewerClient
+
     if picture.suffix.lower() != ".png":
         raise ConfigError("a picture is a PNG", where=str(picture), hint="name the file FILE.png")
     if not picture.parent.is_dir():
@@ -146,8 +148,17 @@ def screenshot(
     port = free_port()
     window = f"{size[0]}x{size[1]}"
     viewer = start("--headless", "--hide-welcome-screen", "--port", str(port), "--window-size", window, *map(str, files))
+
+    def attempt() -> ViewerClient | None:
+        client = ViewerClient.connect(address(port))
+        state = client.get_state()
+        return client if state.recordings and not state.loading and state.views else None
+
     try:
-        client = _connect(viewer, port, files)
+        client = _retry(viewer, attempt)
+        if client is None:
+            where = ", ".join(map(str, files))
+            raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
         _set_time(client, at, timeline)
         time.sleep(_SETTLE)
         client.save_screenshot(str(temporary.resolve()))
@@ -159,22 +170,6 @@ def screenshot(
     finally:
         stop(viewer)
         temporary.unlink(missing_ok=True)
-
-
-def _connect(viewer: Viewer, port: int, files: list[Path]) -> ViewerClient:
-    """Connect to a viewer and wait until it has loaded the recordings."""
-    from rerun.experimental import ViewerClient
-
-    def attempt() -> ViewerClient | None:
-        client = ViewerClient.connect(address(port))
-        state = client.get_state()
-        return client if state.recordings and not state.loading and state.views else None
-
-    client = _retry(viewer, attempt)
-    if client is None:
-        where = ", ".join(map(str, files))
-        raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
-    return client
 
 
 def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:

@@ -28,7 +28,7 @@ def blueprint(view_point: ViewPoint, cameras: list[tuple[str, str]], *, solver: 
     right = [rrb.Tabs(*views) if len(views) > 1 else views[0]] if views else []
     right.append(_live_curves() if live else _curves(solver))
     column = rrb.Vertical(*right, row_shares=[3, 2][-len(right) :])
-    # All lines of the log have one entity path, and a text begins with its time, so both columns are hidden.
+    # The log hides the entity path, which all lines share, and the times, because each text begins with its time.
     shown = {"LogLevel": True, "Body": True, "EntityPath": False}
     columns = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(name, visible=False) for name in (STAMP, ITERATION)],

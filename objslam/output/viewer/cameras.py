@@ -35,15 +35,11 @@ def camera_path(camera: Camera) -> str:
 
 
 def log_cameras(recording: Any, result: RunResult, size: float) -> int:
-    """Log each camera that moves with the robot, `map/camera/NAME`, and three entities below it.
+    """Log each camera that moves with the robot, `map/camera/NAME`, and return the number of unreadable images.
 
     `image` has the images. `boxes` has the boxes in the colours of their objects. `map` has the projected objects. The
     setting `output.image_width` limits the width of the images, and all pixel coordinates are scaled with the images.
-
-    Args:
-        size: the size of the map, m.
-    Returns:
-        The number of images that could not be read.
+    The size of the map, `size`, m, sets the depth of the frusta.
     """
     unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera

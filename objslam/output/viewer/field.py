@@ -87,7 +87,7 @@ def heat(cost: Floats, low: float, high: float) -> NDArray[np.uint8]:
     """Return RGB colours (..., 3) for costs (...), m: bright at the lowest cost `low`, dark at the highest cost `high`."""
     from matplotlib import colormaps
 
-    # The cost is a cone, so the square root gives more colours to the part near the minimum.
+    # The cost rises from the minimum like a cone, so the square root gives more colours to the part near the minimum.
     share = np.sqrt(np.clip((cost - low) / max(high - low, 1e-12), 0.0, 1.0))
     return (255 * colormaps["inferno"](0.97 * (1 - share))[..., :3]).round().astype(np.uint8)
 
@@ -158,16 +158,10 @@ def _text(f: ProximityField, objects: ObjectMap, o: MapObject, name: str, rays: 
         ("median distance, largest distance", f"{_metres(float(np.median(off)))}, {_metres(float(off.max()))}"),
         ("distance from the run's estimate", _metres(gap)),
     ]
-    return "\n".join(
-        [
-            f"**{name}**, {o.status}, in a map of {len(objects)} objects",
-            "",
-            *table(rows),
-            "",
-            "The colour of a point is its mean distance from the used rays: Eq. 1's cost divided by the number of rays. "
-            "Bright points are close. A valley along the rays means that the distance of the object is uncertain.",
-        ]
-    )
+    head = f"**{name}**, {o.status}, in a map of {len(objects)} objects"
+    colour = "The colour of a point is its mean distance from the used rays: Eq. 1's cost divided by the number of rays."
+    valley = "Bright points are close. A valley along the rays means that the distance of the object is uncertain."
+    return "\n".join([head, "", *table(rows), "", f"{colour} {valley}"])
 
 
 def _metres(value: float) -> str:

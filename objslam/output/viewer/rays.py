@@ -12,17 +12,11 @@ from objslam.core.result import RunResult
 from objslam.output.plot.style import RayKind, ray_ends, ray_kinds, sample
 from objslam.output.viewer.times import moments, stamp_column
 
-RAY_COLOURS: dict[RayKind, tuple[int, int, int]] = {
-    "used": (62, 128, 214),
-    "rejected": (224, 62, 50),
-    "unexplained": (150, 150, 150),
-}
+_Palette = dict[RayKind, tuple[int, int, int]]
+
+RAY_COLOURS: _Palette = {"used": (62, 128, 214), "rejected": (224, 62, 50), "unexplained": (150, 150, 150)}
 """The RGB colour of each kind of ray."""
-_FAINT: dict[RayKind, tuple[int, int, int]] = {
-    "used": (186, 212, 243),
-    "rejected": (246, 205, 200),
-    "unexplained": (222, 222, 222),
-}
+_FAINT: _Palette = {"used": (186, 212, 243), "rejected": (246, 205, 200), "unexplained": (222, 222, 222)}
 """The RGB colour of each kind of static ray: about a third of the strength of `RAY_COLOURS`, on white."""
 _MAX_RAYS = 240  # The map shows at most this many static rays of each kind. Lines are opaque, so more would hide the map.
 

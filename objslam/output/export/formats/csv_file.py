@@ -18,8 +18,7 @@ _COLUMNS = (
     *("rays", "frames", "parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"),
 )
 """The columns: positions and sizes are in m, covariances in m^2, and stamps in s. The cell of an unknown value is empty."""
-_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The rows and columns of the six covariance values in `_COLUMNS`."""
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows and columns of the covariance values.
 
 
 def _dump(content: Content) -> bytes:

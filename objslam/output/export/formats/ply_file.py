@@ -34,16 +34,12 @@ def _dump(content: Content) -> bytes:
     names = sorted({o.label for o, _ in drawn})
     rows = [(*o.position, *(round(255 * c) for c in rgb), o.id, names.index(o.label), o.sigma or 0.0) for o, rgb in drawn]
     vertices = np.array(rows, dtype=[(name, kind) for name, kind, _ in _PROPERTIES])
-    header = ["ply", "format binary_little_endian 1.0", f"comment frame {_one_line(content.objects.frame)}, metres"]
-    header += [f"comment label {i} {_one_line(name)}" for i, name in enumerate(names)]
+    # A line break ends a PLY comment, so all texts are joined to one line.
+    header = ["ply", "format binary_little_endian 1.0", f"comment frame {' '.join(content.objects.frame.split())}, metres"]
+    header += [f"comment label {i} {' '.join(name.split())}" for i, name in enumerate(names)]
     header.append(f"element vertex {len(vertices)}")
     header += [f"property {kind} {name}" for name, _, kind in _PROPERTIES]
     return "\n".join([*header, "end_header\n"]).encode() + vertices.tobytes()
-
-
-def _one_line(text: str) -> str:
-    """Replace line breaks by spaces, because a line break ends a PLY comment."""
-    return " ".join(text.split())
 
 
 EXPORT = ExportFormat("ply", "objects.ply", "objects as points", _dump)

@@ -111,10 +111,7 @@ class LiveLog:
             self._snapshot(shown, view_point)
 
     def _at(self, stamp: float) -> None:
-        if is_date(stamp):
-            self._recording.set_time(STAMP, timestamp=stamp)
-        else:
-            self._recording.set_time(STAMP, duration=stamp)
+        self._recording.set_time(STAMP, **{"timestamp" if is_date(stamp) else "duration": stamp})
 
     def _look(self, shown: ShownSnapshot, frames: list[CameraFrame]) -> ViewPoint:
         """Return the view point; send a new layout for a new camera, or if the map outgrows the old view."""
@@ -136,17 +133,10 @@ class LiveLog:
         log_objects(recording, shown.map, view_point, shown.path, static=False)
         if shown.base is not None:
             recording.log("map/base", _transform(shown.base))
-        n = shown.numbers
-        resolved = len(shown.map.resolved())
-        curves = {
-            "lag/now": 1e3 * n["lag"],
-            "lag/p50": 1e3 * n["p50"],
-            "lag/p99": 1e3 * n["p99"],
-            "objects/resolved": resolved,
-            "objects/unresolved": len(shown.map) - resolved,
-            "dropped/messages": sum(shown.dropped.values()),
-            "dropped/snapshots": n["unseen"],
-        }
+        n, resolved = shown.numbers, len(shown.map.resolved())
+        curves = {"lag/now": 1e3 * n["lag"], "lag/p50": 1e3 * n["p50"], "lag/p99": 1e3 * n["p99"]}
+        curves |= {"objects/resolved": resolved, "objects/unresolved": len(shown.map) - resolved}
+        curves |= {"dropped/messages": sum(shown.dropped.values()), "dropped/snapshots": n["unseen"]}
         for name, value in curves.items():
             recording.log(f"plots/live/{name}", rr.Scalars(value))
         for level, text in map_changes(self._map, shown.map):
