@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from objslam.errors import OutputError
 from objslam.output.export.export_format import ExportFormat
@@ -39,7 +39,7 @@ def _dump(content: Content) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _numbers(poses: Floats, *more: Floats) -> list[str]:
+def _numbers(poses: Floats, *more: Any) -> list[str]:
     """Write x, y, z, the quaternion (x, y, z, w) and the columns of `more` (N, C), for each pose (N, 4, 4)."""
     import numpy as np
 
