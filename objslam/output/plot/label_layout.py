@@ -8,7 +8,7 @@ from objslam.core.arrays import Bools, Floats
 
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # The candidates of a label lie in these directions, rad.
 _RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
-"""The candidates of a label lie at these distances, px, from its dot. A candidate costs its distance."""
+"""The candidates of a label lie at these distances, px, from its dot. The distance adds to the cost of a candidate."""
 _DOT = 6.0  # Labels keep out of a square around each dot. Half its side is this length, px.
 _PAD = 2.0  # Labels keep this distance, px, from each other.
 _CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.

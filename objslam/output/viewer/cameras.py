@@ -38,7 +38,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
     """Log each camera that moves with the robot, `map/camera/NAME`, and return the number of unreadable images.
 
     `image` has the images. `boxes` has the boxes in the colours of their objects. `map` has the projected objects. The
-    setting `output.image_width` limits the width of the images, and all pixel coordinates are scaled with the images.
+    setting `output.image_width` limits the width of the images. All pixel coordinates are scaled with the images.
     The size of the map, `size`, m, sets the depth of the frusta.
     """
     unread = 0

@@ -17,10 +17,10 @@ Level = Literal["INFO", "WARN"]
 _MAX_CHANGES = 40  # The log lists at most this many changes of objects per round.
 _MERGED = 0.5  # A deleted object counts as merged if another object of its label lies within this distance, m.
 _WHY = {
-    "fixed": "association at the poses as they are",
+    "fixed": "association at the fixed poses",
     "labels": "every label taken for one object",
     "association": "association at the poses so far",
-    "merge": "objects that the poses brought together are one",
+    "merge": "merge of objects that the new poses place together",
 }
 """The words in the log for the reason of a round."""
 _COUNTS = {

@@ -55,7 +55,7 @@ def coarser(surface: Surface, most: int) -> Surface:
         colours = surface.colours
         if colours is not None:
             colours = (_sums(colours, into, len(counts)) / counts[:, None]).round().astype(np.uint8)
-        # A thin part that falls into one cell flips triangles. The surface leaves them out.
+        # Triangles of a thin part flip if the part falls into one cell. Flipped triangles are removed.
         a, b, c = (vertices[corner] for corner in triangles.T)
         upright = np.einsum("ti,ti->t", np.cross(b - a, c - a), normals[triangles].sum(axis=1)) > 0
         return Surface(vertices=vertices, normals=normals, colours=colours, triangles=triangles[upright])

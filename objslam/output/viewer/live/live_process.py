@@ -94,7 +94,7 @@ class LiveLog:
         self.begin()
 
     def begin(self) -> None:
-        """Log the static data; a restarted viewer needs them again."""
+        """Log the static data, which a restarted viewer needs again."""
         self._recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._recording.log("map/base", rr.TransformAxes3D(0.3), static=True)
         self._cameras.clear()
