@@ -35,6 +35,6 @@ def export(
 ) -> None:
     """Write a result's map for other tools."""
     from objslam.output.export import write_export
-    from objslam.output.export.datum import Datum
+    from objslam.output.export.content import Datum
 
     say(f"wrote {write_export(out, to, file, None if datum is None else Datum.parse(datum))}")
