@@ -1,4 +1,4 @@
-"""A set of box files that are named after the stamp of their frame: a folder, or a tar archive read where it is."""
+"""Read sets of box files from a folder or a tar archive. The name of each file is the stamp of its frame."""
 
 from __future__ import annotations
 
@@ -16,25 +16,26 @@ from objslam.io.box_collector import BoxCollector
 from objslam.io.text import read_bytes
 from objslam.sources.tum_rgbd.box_text import add_boxes
 
-_STAMPED = re.compile(r"(\d+\.\d+)\.txt")  # the name of a file of boxes is its stamp, s
-_ARCHIVES = ("*.tar", "*.tar.gz", "*.tgz", "*.tar.bz2", "*.tar.xz")  # names of archives that may hold files of boxes
-_MAX_SIZE = 1 << 20  # bytes; a file of boxes has a few hundred, a larger one is dropped
-_BAD_ARCHIVE = (tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, OSError, ValueError)  # what a damaged one raises
+_STAMPED = re.compile(r"(\d+\.\d+)\.txt")  # The name of a box file, a stamp in s.
+_ARCHIVES = ("*.tar", "*.tar.gz", "*.tgz", "*.tar.bz2", "*.tar.xz")  # The names of archives that may hold box files.
+_MAX_SIZE = 1 << 20  # The largest box file in an archive, bytes. A usual file has a few hundred bytes.
+_BAD_ARCHIVE = (tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, OSError, ValueError)
+"""The exceptions that reading a damaged archive raises."""
 
 
 def find_box_sets(folder: Path) -> list[Path]:
-    """The folders and archives right below a folder that hold box files named after stamps."""
+    """Find the subfolders and the archives of a folder that hold box files."""
     folders = [f for f in sorted(folder.iterdir()) if f.is_dir() and any(_STAMPED.fullmatch(i.name) for i in f.iterdir())]
     archives = sorted({file for pattern in _ARCHIVES for file in folder.glob(pattern) if file.is_file()})
     return folders + [archive for archive in archives if _holds_boxes(archive)]
 
 
 def read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
-    """The detections of a set of box files, in the order of their stamps; `label` where the files name no class.
+    """Read a set of box files in the order of their stamps. `label` is the label of boxes without a class.
 
-    An archive is read without unpacking it: members that are no regular files, that are too large, or whose name is no stamp
-    are dropped and counted; of an archive that is cut off, what comes before is read, with a warning. LogError where no file
-    can be read.
+    An archive is not unpacked to disk. Files that are not regular, files that are too large, and files not named after a
+    stamp are dropped and counted. A damaged archive is read up to the damage, with a warning.
+    Raises LogError if no file can be read.
     """
     files = _archive_files(source, ledger) if source.is_file() else _folder_files(source, ledger)
     collector = BoxCollector()
@@ -42,7 +43,7 @@ def read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
         collector.add_frame(stamp, place)
         add_boxes(data, place, label, collector, ledger)
     if not collector.stamps:
-        raise LogError("no box file in it can be read", where=str(source))
+        raise LogError("none of the box files can be read", where=str(source))
     return collector.checked(ledger)
 
 
@@ -50,7 +51,7 @@ def _folder_files(folder: Path, ledger: Ledger) -> Iterator[tuple[float, str, by
     for file in sorted(folder.iterdir()):
         match = _STAMPED.fullmatch(file.name)
         if match is None:
-            ledger.drop("box file whose name is no stamp", where=str(file))
+            ledger.drop("box file not named after a stamp", where=str(file))
         elif file.is_symlink() or not file.is_file():
             ledger.drop("box file that is not a regular file", where=str(file))
         else:
@@ -69,13 +70,13 @@ def _archive_files(archive: Path, ledger: Ledger) -> Iterator[tuple[float, str, 
                 if not member.isreg():
                     ledger.drop("box file that is not a regular file", where=place)
                 elif match is None:
-                    ledger.drop("box file whose name is no stamp", where=place)
+                    ledger.drop("box file not named after a stamp", where=place)
                 elif member.size > _MAX_SIZE:
                     ledger.drop("box file that is too large", where=place)
                 elif content := members.extractfile(member):
                     yield float(match[1]), place, content.read()
     except _BAD_ARCHIVE as error:
-        ledger.warn(f"{archive}: damaged or cut off, what comes after is left out ({error})")
+        ledger.warn(f"{archive}: damaged or cut off, the rest of the archive is left out ({error})")
 
 
 def _holds_boxes(archive: Path) -> bool:

@@ -1,4 +1,7 @@
-"""Text files of detector boxes, one file a frame: "[class] x y w h score" a line, x y the top left corner in px."""
+"""Parse the text files of detector boxes. Each file is a frame. Each line is "[class] x y w h score" of a box in px.
+
+The point (x, y) is the top left corner.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,9 @@ from objslam.io.text import parse_numbers, split_lines
 
 
 def add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledger: Ledger) -> None:
-    """Add the boxes of one file to the frame begun last.
+    """Add the boxes of a file to the collector's last frame. `place` names the file in messages.
 
-    Lines of 5 numbers carry no class and get `label`; of 6, a COCO class number first. Malformed lines are dropped and
-    counted; `place` names the file.
+    A line of 6 numbers starts with a COCO class number. A line of 5 numbers gets `label`. Other lines are dropped and counted.
     """
     for number, text in split_lines(data, place, ledger):
         where = f"{place}:{number}"
@@ -23,7 +25,7 @@ def add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledg
         name = label
         if len(values) == 6:
             if values[0] not in range(len(COCO_NAMES)):
-                ledger.drop("box line with a class that COCO does not have", where=where)
+                ledger.drop("box line with a class number that is not in COCO", where=where)
                 continue
             name = COCO_NAMES[int(values[0])]
         x, y, width, height, score = values[-5:]

@@ -1,13 +1,14 @@
-"""RGB-D recordings in the style of the TUM benchmark (Sturm et al., IROS 2012) with the text files of a detector.
+"""Read RGB-D recordings of the TUM benchmark (Sturm et al., IROS 2012) with text files of detector boxes.
 
-Two layouts. Numbered (as cube_slam ships its sample): truth_cam_poses.txt with one pose a frame, and boxes/, raw_imgs/,
-depth_imgs/ whose files begin with the frame's number, from 0. Stamped (the benchmark's own): groundtruth.txt, rgb.txt,
-depth.txt, and box files named after the stamp in a folder or a tar archive. The path is the camera's, so base is the camera.
+The numbered layout is that of the cube_slam sample: truth_cam_poses.txt has a pose for each frame, and the names of the files
+in boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The stamped layout is that of the benchmark:
+groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are the camera's, so base is the camera.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,28 +30,29 @@ from objslam.sources.tum_rgbd import TumOptions
 from objslam.sources.tum_rgbd.box_files import find_box_sets, read_box_set
 from objslam.sources.tum_rgbd.box_text import add_boxes
 
-_POSES, _BOXES, _RGB, _DEPTH = "truth_cam_poses.txt", "boxes", "raw_imgs", "depth_imgs"  # the names in the numbered layout
-_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # the names of the path in the stamped layout
-_LABEL = "object"  # the label of boxes without a class, where the options give none
-_DEPTH_SCALE = 5000.0  # units per metre, in all depth images of the benchmark
-_FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])  # px, as the benchmark gives it
+_POSES, _BOXES, _IMAGES = "truth_cam_poses.txt", "boxes", ("raw_imgs", "depth_imgs")  # The names in the numbered layout.
+_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The names of the path in the stamped layout.
+_LABEL = "object"  # The default label of boxes without a class.
+_DEPTH_SCALE = 5000.0  # The units per metre of the benchmark's depth images.
+_FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])
+"""The camera matrix of freiburg3, px, from the benchmark."""
 
 
 def is_numbered(path: Path) -> bool:
-    """Whether the folder has the numbered layout."""
+    """Return whether the folder has the numbered layout."""
     return (path / _POSES).is_file() and (path / _BOXES).is_dir()
 
 
 def is_stamped(path: Path) -> bool:
-    """Whether the folder has the stamped layout."""
+    """Return whether the folder has the stamped layout."""
     return _stamped_path(path) is not None and ((path / "rgb.txt").is_file() or bool(find_box_sets(path)))
 
 
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the numbered layout: line n of the poses (comments not counted) belongs to the files whose name begins with n.
+    """Read the numbered layout. Files whose names begin with n belong to pose line n, not counting comments.
 
-    The camera is that of freiburg3 unless there is a camera.yaml. Files without a pose and second files of one number are
-    dropped and counted. LogError where poses or boxes cannot be used.
+    The calibration is in camera.yaml. Without the file, it is that of freiburg3. Files without a pose, and a second file with
+    the same number, are dropped and counted. Raises LogError if the poses or the boxes are unusable.
     """
     with reading(path):
         table = read_pose_table(path / _POSES, ledger)
@@ -60,13 +62,13 @@ def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()
             collector.add_frame(stamp_of[number], str(file))
             add_boxes(read_bytes(file), str(file), options.label or _LABEL, collector, ledger)
         if not collector.stamps:
-            raise LogError("no box file that a pose belongs to", where=str(path / _BOXES))
-        rgb, depth = (_numbered_images(path / name, stamp_of, ledger) for name in (_RGB, _DEPTH))
-        return _log(path, to_trajectory(table), collector.checked(ledger), rgb, depth, options.with_range, ledger)
+            raise LogError("no box file belongs to a pose", where=str(path / _BOXES), hint="number the files from 0")
+        images = [_numbered_images(path / name, stamp_of, ledger) for name in _IMAGES]
+        return _log(path, to_trajectory(table), collector.checked(ledger), images, options, ledger)
 
 
 def read_stamped(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the stamped layout; boxes may be missing where there is rgb.txt. Errors as in `read_numbered`."""
+    """Read the stamped layout. Boxes are optional if the folder has rgb.txt. Raises the errors of `read_numbered`."""
     with reading(path):
         file = _stamped_path(path)
         if file is None:
@@ -76,36 +78,30 @@ def read_stamped(path: Path, ledger: Ledger, options: TumOptions = TumOptions())
             names = ", ".join(source.name for source in sets)
             raise LogError(f"several sets of boxes: {names}", where=str(path), hint="keep one of them")
         detections = read_box_set(sets[0], options.label or _LABEL, ledger) if sets else None
-        rgb, depth = (
-            read_images(path / name, ledger) if (path / name).exists() else None for name in ("rgb.txt", "depth.txt")
-        )
-        return _log(path, read_trajectory(file, ledger), detections, rgb, depth, options.with_range, ledger)
+        lists = (path / "rgb.txt", path / "depth.txt")
+        images = [read_images(listed, ledger) if listed.exists() else None for listed in lists]
+        return _log(path, read_trajectory(file, ledger), detections, images, options, ledger)
 
 
 def _log(
     path: Path,
     camera_path: Trajectory,
     detections: Detections | None,
-    rgb: Images | None,
-    depth: Images | None,
-    with_range: bool,
+    images: Sequence[Images | None],
+    options: TumOptions,
     ledger: Ledger,
 ) -> Log:
-    camera = _camera(path, ledger)
-    if detections and depth and with_range:
+    if (path / "camera.yaml").exists():
+        camera = read_camera(path / "camera.yaml", ledger, place_needed=False, depth_scale=_DEPTH_SCALE)
+        camera = replace(camera, base_T_camera=np.eye(4))
+    else:
+        ledger.warn(f"{path}: no camera.yaml, the calibration of TUM freiburg3 is used")
+        camera = Camera("camera", 640, 480, _FREIBURG3.copy(), depth_scale=_DEPTH_SCALE)
+    rgb, depth = images
+    if detections and depth and options.with_range:
         detections = depths_at_boxes(detections, depth, camera, ledger)
-    camera_log = CameraLog(camera, detections, rgb, depth)
-    name = path.resolve().name
-    return Log(name, (camera_log,), localization=camera_path, truth=read_truth(path / "groundtruth", ledger))
-
-
-def _camera(path: Path, ledger: Ledger) -> Camera:
-    file = path / "camera.yaml"
-    if file.exists():
-        camera = read_camera(file, ledger, place_needed=False, depth_scale=_DEPTH_SCALE)
-        return replace(camera, base_T_camera=np.eye(4))
-    ledger.warn(f"{path}: no camera.yaml, the camera is taken as that of TUM freiburg3")
-    return Camera("camera", 640, 480, _FREIBURG3.copy(), depth_scale=_DEPTH_SCALE)
+    cameras = (CameraLog(camera, detections, rgb, depth),)
+    return Log(path.resolve().name, cameras, localization=camera_path, truth=read_truth(path / "groundtruth", ledger))
 
 
 def _stamped_path(path: Path) -> Path | None:
@@ -120,7 +116,7 @@ def _numbered_images(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -
 
 
 def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[int, Path]:
-    """The files of a folder by the number that their name begins with, in its order."""
+    """Map the number at the start of each file's name to the file, sorted by number."""
     inside = Inside(folder)
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()):
@@ -132,7 +128,7 @@ def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[
         elif number not in stamp_of:
             ledger.drop("numbered file that no pose belongs to", where=str(file))
         elif number in found:
-            ledger.drop("numbered file whose number another has", where=str(file))
+            ledger.drop("numbered file with the number of another file", where=str(file))
         else:
             found[number] = file
     return dict(sorted(found.items()))
