@@ -1,4 +1,4 @@
-"""The images of a bag, written into files."""
+"""Extract the images of a bag into files."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from objslam.ros.messages.images import image_file
 
 
 def extract_images(recording: Recording, folders: Mapping[str, tuple[Path, bool]], ledger: Ledger) -> dict[str, Images]:
-    """Write the images of topics into files, and list them by topic.
+    """Write the images of topics into files, and return the written images by topic.
 
-    folders: for each topic where to, and whether it is depth. JPEG and PNG are written as they are, all else as PNG; depth
-    as 16 bit PNG in `DEPTH_SCALE` units per metre, 0 where unknown. Files are named after the stamp. Images that cannot be
-    decoded, and stamps that repeat or go back, are dropped and counted. One image is in memory at a time. LogError where
-    they cannot be written.
+    folders: the target folder of each topic, and whether the topic is depth. JPEG and PNG data is copied. Other images are
+    written as PNG. Depth is written as 16 bit PNG in `DEPTH_SCALE` units per metre, with 0 for unknown depth. The name of a
+    file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
+    Only one image is in memory at a time. Raises LogError if a file cannot be written.
     """
     written: dict[str, dict[int, Path]] = {topic: {} for topic in folders}
     decoders: dict[int, tuple[Connection, Callable[[bytes], Any]]] = {}
     reports: list[FileReport] = []
     for folder, _ in folders.values():
-        with _writing("cannot be made for the images", folder):
+        with _writing("the folder for images cannot be made", folder):
             folder.mkdir(parents=True, exist_ok=True)
     for connection, logged, data in read_messages(recording, lambda connection: connection.topic in folders, reports):
         folder, depth = folders[connection.topic]
