@@ -140,7 +140,7 @@ def _camera_log(
     ledger: Ledger,
 ) -> CameraLog:
     camera = replace(camera, depth_scale=DEPTH_SCALE)
-    rgb, depth = (topic and images.get(topic.name) for topic in (topics.image, topics.depth))
+    rgb, depth = (images.get(topic.name) if topic else None for topic in (topics.image, topics.depth))
     detections = _detections(topics.detections, camera, ledger) if topics.detections is not None else None
     if detections is not None and depth is not None and options.with_range:
         detections = depths_at_boxes(detections, depth, camera, ledger)

@@ -83,7 +83,7 @@ def test_all_that_is_missing_is_listed(makers, tmp_path):
     info = describe(path)
     assert [line.split(" (")[0] for line in info.missing] == [
         "x: there is neither odometry nor localisation",
-        "camera camera: no CameraInfo belongs to it",
+        "camera camera: no CameraInfo belongs to this camera",
     ]
     assert info.topics[0].role == "detections"
     assert (info.base, info.odometry, info.places) == ("", "", ())
