@@ -13,10 +13,8 @@ from objslam.core.geometry import inverse
 from objslam.core.types import Detections
 from objslam.simulation.settings import DriveSettings
 
-FALSE_SIZES = (20.0, 120.0)
-"""The least and largest side of a false box, px."""
-TRACK_PATIENCE = 1.0
-"""The time without a box after which a tracker loses an object, s."""
+FALSE_SIZES = (20.0, 120.0)  # The least and largest side of a false box, px.
+TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an object, s.
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from objslam.simulation.furniture import Room
 
 Reals = NDArray[np.floating]
 
-NEAR = 0.05
-"""The least depth of all points of an object with a box, m."""
+NEAR = 0.05  # The least depth of all points of an object with a box, m.
 _NOISE = 64  # The number of grid points of the solid noise along each axis. A larger value repeats later.
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 

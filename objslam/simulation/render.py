@@ -30,25 +30,18 @@ from objslam.simulation.trajectory import frame_stamps, localization, odometry
 
 TRUTH_BOXES = "boxes.jsonl"
 """The file of the true boxes in the groundtruth folder of a rendered drive, in the format of detections.jsonl."""
-ROUNDS = 40
-"""The number of random rooms that are tried until every object is seen well. A larger value fails later."""
+ROUNDS = 40  # The number of random rooms that are tried until every object is seen well. A larger value fails later.
 LOOK_AHEAD = 4
 """The factor by which the images of a room's trial are smaller than those of the drive."""
-_KINDS = (("rgb", "jpg"), ("depth", "png"))
-"""The folders of images and the endings of their files."""
 
 
 class BoxLimits(Section):
     """The limits of the true boxes that count. Other boxes are too small or too hidden for a detector."""
 
-    visible: Probability = 0.6
-    """The least share of an object's pixels in the image that nothing hides."""
-    inside: Probability = 0.6
-    """The least share of the area of an object's box that is inside the image."""
-    long_side: NotNegative = 20.0
-    """The least length of a box's longer side, px."""
-    short_side: NotNegative = 10.0
-    """The least length of a box's shorter side, px."""
+    visible: Probability = 0.6  # The least share of an object's pixels in the image that nothing hides.
+    inside: Probability = 0.6  # The least share of the area of an object's box that is inside the image.
+    long_side: NotNegative = 20.0  # The least length of a box's longer side, px.
+    short_side: NotNegative = 10.0  # The least length of a box's shorter side, px.
 
 
 class RenderSettings(CourseSettings):
@@ -62,12 +55,10 @@ class RenderSettings(CourseSettings):
     odometry: config.Odometry | PoseNoise | None = config.Odometry()
     localization: PoseNoise | None = PoseNoise(xy=0.02, yaw=0.005)
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
-    labels: tuple[str, ...] = LABELS
-    """The labels of the objects in the room. A label may be repeated."""
+    labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
     """The least number of frames in which an object's box is whole and within the limits."""
-    min_parallax_deg: NotNegative = 33.0
-    """The least parallax over these frames, degrees."""
+    min_parallax_deg: NotNegative = 33.0  # The least parallax over these frames, degrees.
     limits: BoxLimits = BoxLimits()
     sensor: Sensor = Sensor()
 
@@ -147,6 +138,8 @@ def render_drive(
     progress: a function that is called with the numbers of rendered frames and of all frames.
     Raises ConfigError if no room shows every object well enough, and OutputError if `check_target` refuses `out`.
     """
+    import cv2
+
     from objslam.io.detections_jsonl import write_detections
     from objslam.sources.log_folder import TRUTH, beside, check_target, write_log_folder
 
@@ -164,13 +157,20 @@ def render_drive(
     gains = exposures(settings.sensor, settings.frames, np.random.default_rng(seeds[3]))
     grain_seeds = seeds[3].spawn(settings.frames)
     with beside(out) as work:
-        for kind, _ in _KINDS:
-            (work / kind).mkdir()
+        names = [f"{i:06d}" for i in range(settings.frames)]
+        rgb_files = tuple(work / "rgb" / f"{name}.jpg" for name in names)
+        depth_files = tuple(work / "depth" / f"{name}.png" for name in names)
+        for files in (rgb_files, depth_files):
+            files[0].parent.mkdir()
 
         def render(i: int) -> TrueBoxes:
             rng = np.random.default_rng(grain_seeds[i])
             rgb, depth, found = render_frame(caster, map_T_camera[i], settings.sensor, gains[i], settings.limits, rng)
-            _write_images(work, i, rgb, depth * settings.camera.depth_scale)
+            units = np.clip(depth * settings.camera.depth_scale + 0.5, 0, 65535).astype(np.uint16)
+            jpg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])[1]
+            png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+            for file, content in ((rgb_files[i], jpg), (depth_files[i], png)):
+                file.write_bytes(content.tobytes())
             return found
 
         boxes = []
@@ -182,11 +182,10 @@ def render_drive(
                     progress(len(boxes), settings.frames)
         finally:
             pool.shutdown(cancel_futures=True)  # After an error, no further frame is rendered.
-        files = (tuple(work / kind / f"{i:06d}.{end}" for i in range(settings.frames)) for kind, end in _KINDS)
         objects = tuple(TruthObject(i, label, room.middle[i]) for i, label in enumerate(room.labels))
         log = Log(
             name=settings.name,
-            cameras=(CameraLog(settings.camera, None, *(Images(stamps, paths) for paths in files)),),
+            cameras=(CameraLog(settings.camera, None, Images(stamps, rgb_files), Images(stamps, depth_files)),),
             odometry=odometry(motion, course, stamps, odometry_rng),
             localization=localization(motion, course, stamps, localization_rng),
             truth=Truth(objects, Trajectory(stamps, map_T_base)),
@@ -202,17 +201,6 @@ def drive_room(settings: RenderSettings, seed: int) -> Room:
     course = Course.lay(settings.motion, np.random.default_rng(seeds[0]))
     stamps = frame_stamps(settings.motion)[:, 0]
     return _good_room(settings, lift_se2(course.at(stamps)) @ settings.camera.base_T_camera, seeds[4])
-
-
-def _write_images(folder: Path, number: int, rgb: NDArray[np.uint8], depth: Reals) -> None:
-    import cv2
-
-    contents = (
-        cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])[1],
-        cv2.imencode(".png", np.clip(depth + 0.5, 0, 65535).astype(np.uint16), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1],
-    )
-    for (kind, end), content in zip(_KINDS, contents, strict=True):
-        (folder / kind / f"{number:06d}.{end}").write_bytes(content.tobytes())
 
 
 def _as_detections(frames: list[TrueBoxes], stamps: Floats, labels: tuple[str, ...]) -> Detections:

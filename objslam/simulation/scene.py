@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count, islice
+from itertools import chain, count, islice
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -32,16 +32,12 @@ EXTENTS = {
     "lamp": (0.22, 0.4),
 }
 """The width and height of each class, m. Drives use the classes in this order."""
-OTHER_EXTENT = (0.2, 0.2)
-"""The width and height of objects of other classes, m."""
-WALL = 0.3
-"""The least distance of random objects from the walls, m."""
-CLEARANCE = 0.4
-"""The least horizontal distance of random objects from the path, m."""
+OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m.
+WALL = 0.3  # The least distance of random objects from the walls, m.
+CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
 """The largest number of frames of each camera in which the views of a place are counted. They are evenly spaced."""
-ROUNDS = 50
-"""The number of rounds of random places. A larger value finds places for more objects."""
+ROUNDS = 50  # The number of rounds of random places. A larger value finds places for more objects.
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,8 @@ def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.r
 
     Raises ConfigError if there are not enough places.
     """
-    names = list(islice(_class_names(), settings.classes or settings.objects))
+    numbered = (f"{name} {number}" for number in count(2) for name in EXTENTS)
+    names = list(islice(chain(EXTENTS, numbered), settings.classes or settings.objects))
     labels = [name for name, _ in settings.placed] + [names[i % len(names)] for i in range(settings.objects)]
     classes, label = label_table(labels)
     random_extent = _extents(labels[len(settings.placed) :])
@@ -97,12 +94,6 @@ def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roa
     rate = rng.uniform(0.2, 0.4, (moving, 3)) / np.maximum(reach, 1.0)
     extent = _extents([scene.classes[i] for i in label])
     return Roamers(label, extent, middle, reach, rate, rng.uniform(0.0, 2 * np.pi, (moving, 3)))
-
-
-def _class_names() -> Iterator[str]:
-    yield from EXTENTS
-    for number in count(2):
-        yield from (f"{name} {number}" for name in EXTENTS)
 
 
 def _extents(labels: Sequence[str]) -> Floats:

@@ -16,23 +16,17 @@ class Sensor(Section):
     exposure: NotNegative = 0.25
     """The standard deviation of the exposure's logarithm around automatic exposure. The exposure drifts over a drive."""
     white: NotNegative = 0.04
-    """The standard deviation of each colour channel's gain around the right white balance. The gains are fixed in a drive."""
-    blur: NotNegative = 0.5
-    """The sigma of the lens blur, px."""
-    vignette: Probability = 0.2
-    """The share of light that is lost in the image's corners."""
-    shot: NotNegative = 0.02
-    """The standard deviation of the shot noise at full light. It grows with the root of the light."""
-    read: NotNegative = 0.006
-    """The standard deviation of the read noise, which is also present in the dark."""
-    depth_sigma: NotNegative = 0.002
-    """The constant part of the depth noise, m."""
+    """The standard deviation of each colour channel's gain around the right white balance, drawn once a drive."""
+    blur: NotNegative = 0.5  # The sigma of the lens blur, px.
+    vignette: Probability = 0.2  # The share of light that is lost in the image's corners.
+    shot: NotNegative = 0.02  # The standard deviation of the shot noise at full light. It grows with the root of the light.
+    read: NotNegative = 0.006  # The standard deviation of the read noise, which is also present in the dark.
+    depth_sigma: NotNegative = 0.002  # The constant part of the depth noise, m.
     depth_sigma_per_m2: NotNegative = 0.002
     """The part of the depth noise that grows with the square of the depth, m per m^2."""
     depth_missing: Probability = 0.01
     """The share of pixels without depth, in addition to pixels at edges and on glancing surfaces."""
-    depth_range: tuple[Positive, Positive] = (0.3, 6.0)
-    """The least and largest measured depth, m."""
+    depth_range: tuple[Positive, Positive] = (0.3, 6.0)  # The least and largest measured depth, m.
 
 
 def exposures(sensor: Sensor, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -51,14 +51,10 @@ class PoseNoise(Section):
 class DepthNoise(Section):
     """The errors of the depths of boxes. A depth is z along the optical axis."""
 
-    sigma: NotNegative = 0.03
-    """The constant part of the standard deviation, m."""
-    sigma_per_m: NotNegative = 0.02
-    """The part of the standard deviation that grows with the depth, m per m."""
-    missing: Probability = 0.0
-    """The share of boxes whose depth is missing (NaN)."""
-    wrong: Probability = 0.0
-    """The share of boxes with the depth of something else, at random up to max_range."""
+    sigma: NotNegative = 0.03  # The constant part of the standard deviation, m.
+    sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
+    missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
+    wrong: Probability = 0.0  # The share of boxes with the depth of something else, at random up to max_range.
 
 
 class CourseSettings(Section):
@@ -69,64 +65,46 @@ class CourseSettings(Section):
     """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
     """The swings along x and y in a lap of a Lissajous curve, without a common divisor. (1, 1) is an ellipse."""
-    margin: Positive = 1.0
-    """The distance between the path and the walls, m."""
+    margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
     """The number of frames of each camera. Several cameras fire one after the other."""
-    frame_rate: Positive = 5.0
-    """The frames of each camera per second, Hz."""
-    laps: Positive | None = None
-    """The laps in the whole drive. They determine the speed."""
+    frame_rate: Positive = 5.0  # The frames of each camera per second, Hz.
+    laps: Positive | None = None  # The laps in the whole drive. They determine the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift. config.Odometry: a random walk with the distance, without the floors. PoseNoise: per frame. None: no odometry."""
-    localization: PoseNoise | None = PoseNoise()
-    """The error of each localised pose. None: no localisation."""
+    """The drift, per distance (config.Odometry, whose floors are unused) or per frame (PoseNoise). None: no odometry."""
+    localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
 class DriveSettings(CourseSettings):
     """The settings of a drive. The default is a drive without errors."""
 
-    speed: Positive = 0.6
-    """The mean speed, m/s, if `laps` is None. The robot is slower in bends."""
+    speed: Positive = 0.6  # The mean speed, m/s, if `laps` is None. The robot is slower in bends.
     cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
-    max_range: Positive = 6.0
-    """The largest distance at which a camera sees an object, m."""
+    max_range: Positive = 6.0  # The largest distance at which a camera sees an object, m.
     cut_off: bool = False
     """Whether boxes are cut off at the image's edge, as a real detector does. Otherwise objects at the edge get no box."""
-
     objects: Annotated[int, Field(ge=0)] = 15
     """The number of objects at random places."""
     classes: Annotated[int, Field(ge=1)] | None = None
     """The number of classes of the objects, assigned in turn. None gives each object a class of its own."""
     placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     """The label and the x, y, z (m, in map) of additional objects. They have the first ids."""
-    heights: tuple[float, float] = (0.1, 1.5)
-    """The range of the heights of the objects' centres, m."""
-    min_distance: NotNegative = 0.6
-    """The least distance between two random objects, m."""
+    heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
+    min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
     """The least number of views of a random object without detector errors, as a share of one camera's frames."""
-    min_parallax_deg: NotNegative = 30.0
-    """The least parallax over these views, degrees."""
+    min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the others and are no part of the ground truth."""
-
-    pixel_sigma: NotNegative = 0.0
-    """The standard deviation of a box centre, px per axis."""
-    missed: Probability = 0.0
-    """The share of visible objects without a box."""
-    false: Probability = 0.0
-    """The probability of a false box, in each frame for each class."""
-    depth: DepthNoise | None = None
-    """The errors of depths. None: boxes have no depths."""
+    pixel_sigma: NotNegative = 0.0  # The standard deviation of a box centre, px per axis.
+    missed: Probability = 0.0  # The share of visible objects without a box.
+    false: Probability = 0.0  # The probability of a false box, in each frame for each class.
+    depth: DepthNoise | None = None  # The errors of depths. None: boxes have no depths.
     tracks: Literal["none", "broken", "perfect"] = "none"
     """The track ids of boxes. `perfect` ids are the ids of the objects in the ground truth, then those of moving objects.
     `broken` ids start again after one second without a box. False boxes have no id."""
-
-    odometry_rate: Positive | None = 30.0
-    """The rate of odometry, Hz. None: at the frames' stamps."""
-    localization_rate: Positive | None = 10.0
-    """The rate of the localisation, Hz. None: at the frames' stamps."""
+    odometry_rate: Positive | None = 30.0  # The rate of odometry, Hz. None: at the frames' stamps.
+    localization_rate: Positive | None = 10.0  # The rate of the localisation, Hz. None: at the frames' stamps.
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

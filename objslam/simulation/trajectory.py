@@ -13,8 +13,7 @@ from objslam.core.geometry import inverse, lift_se2, split_se2
 from objslam.core.types import Trajectory
 from objslam.simulation.settings import DriveSettings, PoseNoise
 
-START = 1_700_000_000.0
-"""The stamp of the start of every drive, s."""
+START = 1_700_000_000.0  # The stamp of the start of every drive, s.
 WHEEL_OFFSET = 0.5
 """The distance from the robot's centre of a wheel with constant speed, m. A larger value makes bends slower."""
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import ConfigError, LogError
@@ -48,16 +48,12 @@ class Source:
 
     def detects(self, path: Path) -> bool:
         """Return whether a path is a recording of this kind."""
-        return _function(self.detector)(path)
+        return resolve_name(f"objslam.{self.detector}")(path)
 
     def reads(self, path: Path, ledger: Ledger, options: SourceOptions) -> Log:
         """Read a recording of this kind into a `Log`. Raises LogError if it cannot be read."""
-        return _function(self.reader)(path, ledger, *([] if self.options is None else [options]))
-
-
-def _function(place: str) -> Any:
-    module, _, name = place.partition(":")
-    return getattr(import_module(f"objslam.{module}"), name)
+        more = () if self.options is None else (options,)
+        return resolve_name(f"objslam.{self.reader}")(path, ledger, *more)
 
 
 SOURCES = (
@@ -142,10 +138,10 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
 def choose(path: Path, name: str | None = None) -> Source:
     """Return the kind called `name`, or without a name the kind of the recording at a path. Raises the errors of `read`."""
     if name is not None:
-        for source in SOURCES:
-            if source.name == name:
-                return source
-        raise ConfigError(f"there is no format {name!r}", hint=f"choose {', '.join(source.name for source in SOURCES)}")
+        named = {source.name: source for source in SOURCES}
+        if name not in named:
+            raise ConfigError(f"there is no format {name!r}", hint=f"choose {', '.join(named)}")
+        return named[name]
     try:
         path.stat()
         for source in SOURCES:

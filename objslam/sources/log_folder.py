@@ -182,34 +182,28 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
     single = len(log.cameras) == 1
     for camera_log in log.cameras:
         place = Path() if single else Path(CAMERAS, camera_log.camera.name)
-        (folder / place).mkdir(parents=True, exist_ok=True)
-        _write_camera_log(camera_log, folder / place, final / place)
+        own = folder / place
+        own.mkdir(parents=True, exist_ok=True)
+        write_camera(camera_log.camera, own / CAMERA)
+        if camera_log.mount is not None:
+            write_trajectory(camera_log.mount, own / MOUNT)
+        if camera_log.detections is not None and len(camera_log.detections.frame_stamps):
+            write_detections(camera_log.detections, own / DETECTIONS)
+        for images, kind in ((camera_log.rgb, RGB), (camera_log.depth, DEPTH)):
+            if images is not None and images.paths:
+                write_images(_link_images(images, kind, own, final / place), own / f"{kind}.txt")
     truth = log.truth or Truth()
-    for trajectory, file in (
-        (log.odometry, folder / ODOMETRY),
-        (log.localization, folder / LOCALIZATION),
-        (truth.trajectory, folder / TRUTH / TRUTH_TRAJECTORY),
-    ):
+    paths = {ODOMETRY: log.odometry, LOCALIZATION: log.localization, f"{TRUTH}/{TRUTH_TRAJECTORY}": truth.trajectory}
+    for name, trajectory in paths.items():
         if trajectory is not None:
-            file.parent.mkdir(exist_ok=True)
-            write_trajectory(trajectory, file)
+            (folder / name).parent.mkdir(exist_ok=True)
+            write_trajectory(trajectory, folder / name)
     if truth.objects:
         (folder / TRUTH).mkdir(exist_ok=True)
         entries = [{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in truth.objects]
         content = {"format": FORMAT, "frame": "map", "objects": entries}
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
         (folder / TRUTH / TRUTH_OBJECTS).write_text(text, encoding="utf-8")
-
-
-def _write_camera_log(camera_log: CameraLog, folder: Path, final: Path) -> None:
-    write_camera(camera_log.camera, folder / CAMERA)
-    if camera_log.mount is not None:
-        write_trajectory(camera_log.mount, folder / MOUNT)
-    if camera_log.detections is not None and len(camera_log.detections.frame_stamps):
-        write_detections(camera_log.detections, folder / DETECTIONS)
-    for images, kind in ((camera_log.rgb, RGB), (camera_log.depth, DEPTH)):
-        if images is not None and images.paths:
-            write_images(_link_images(images, kind, folder, final), folder / f"{kind}.txt")
 
 
 def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images:

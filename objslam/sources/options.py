@@ -1,7 +1,7 @@
 """The declaration of command line options by sources, and the options that several sources share.
 
-Each source declares its options as the fields of a frozen dataclass. `--help` imports every file with options, so these files
-import nothing heavy at their top, not even numpy.
+Each source declares its options as the fields of a frozen dataclass. `--help` imports all files that declare options, so such
+a file imports nothing heavy at its top, not even numpy.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.types import Detections, Images, Log, Trajectory
 
-FIND_BOXES = "run a detector on its images (--detector)"
-"""The advice for a camera with images but without detections."""
+FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
 
 
 @dataclass(frozen=True)

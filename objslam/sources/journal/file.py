@@ -64,7 +64,7 @@ class Journal:
         except OSError as error:
             os.close(self._stream)
             raise OutputError("another session writes this journal", where=str(file)) from error
-        self._end = _sound_end(file) if resume else 0
+        self._end = _end_of_records(file) if resume else 0
         self.torn = file.stat().st_size - self._end if resume else 0
         os.ftruncate(self._stream, self._end)
         os.lseek(self._stream, 0, os.SEEK_END)
@@ -76,10 +76,7 @@ class Journal:
         self._syncing.start()
 
     def write(self, message: Message) -> None:
-        """Append one message. From then on, a killed process does not lose it. After the next sync, a power failure does not.
-
-        Raises OutputError if the message is too long or the disk refuses.
-        """
+        """Append one message. Raises OutputError if the message is too long or the disk refuses."""
         if self._broken is not None:
             raise OutputError(f"cannot write the journal: {self._broken.strerror}", where=str(self.file))
         content = encode(message)
@@ -101,7 +98,7 @@ class Journal:
             os.close(stream)
 
     def _sync(self) -> None:
-        """Sync in a thread of its own. A sync takes milliseconds or more, and no message may wait for it."""
+        """Sync in a thread of its own, so that no message waits for the disk."""
         synced = 0
         while not self._closed.wait(_SYNC_EVERY):
             end = self._end
@@ -237,8 +234,7 @@ def _records(stream: BinaryIO) -> Iterator[bytes]:
         return
 
 
-def _sound_end(file: Path) -> int:
-    """Return the position of the first torn record, or the file's size if no record is torn."""
+def _end_of_records(file: Path) -> int:
     if file.stat().st_size == 0:
         return 0
     if not is_journal(file):

@@ -60,11 +60,14 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
             numbers = ", ".join(map(str, found)) or "none"
             raise LogError(f"{what}, the folder has: {numbers}", where=str(folder), hint="choose a robot with --robot")
         prefix = f"Robot{robot}"
+        detections = _read_measurements(folder, prefix, options, ledger)
+        _, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
+        stamps, velocities = table.values[:, 0], table.values[:, 1:]
         camera = Camera("camera", _WIDTH, _HEIGHT, _MATRIX, base_T_camera=_FORWARD, sees_size=False)
         return Log(
             name=f"{folder.resolve().name}_robot{robot}",
-            cameras=(CameraLog(camera, _read_measurements(folder, prefix, options, ledger)),),
-            odometry=_read_odometry(folder, prefix, ledger),
+            cameras=(CameraLog(camera, detections),),
+            odometry=_trajectory(stamps, integrate(stamps, velocities)),
             truth=_read_truth(folder, prefix, options.anonymous, ledger),
         )
 
@@ -108,12 +111,6 @@ def _read_forward(folder: Path, name: str, columns: int, ledger: Ledger, what: s
 def _trajectory(stamps: Floats, xy_yaw: Floats) -> Trajectory:
     first = np.concatenate([[True], np.diff(stamps) > 0])  # A Trajectory takes one pose for each stamp.
     return Trajectory(stamps[first], lift_se2(xy_yaw[first]))
-
-
-def _read_odometry(folder: Path, prefix: str, ledger: Ledger) -> Trajectory:
-    _, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
-    stamps = table.values[:, 0]
-    return _trajectory(stamps, integrate(stamps, table.values[:, 1:]))
 
 
 def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger: Ledger) -> Detections:

@@ -75,11 +75,6 @@ class BagInfo:
     damage: tuple[str, ...]
     warnings: tuple[str, ...]
 
-    @property
-    def duration(self) -> float:
-        """The time between the first and the last message, s."""
-        return self.end - self.start
-
 
 def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) -> BagInfo:
     """Summarise a bag. Raises LogError if no file can be read, and ConfigError for options that do not fit the bag."""

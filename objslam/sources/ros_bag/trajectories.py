@@ -53,8 +53,8 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     """Read the odometry and the localisation of the robot's base.
 
     Odometry is a nav_msgs/Odometry topic, else tf from odom to base. Localisation is tf from map to odom, composed with the
-    odometry at the odometry's stamps, else a topic of poses in map. If map never moves against odom, there is no localisation
-    and the odometry is given in map. Raises LogError if both are missing, or if tf does not connect the necessary frames.
+    odometry at the odometry's stamps, else a topic of poses in map. If map never moves against odom, the odometry is given
+    in map and there is no localisation. Raises LogError if both are missing, or if tf does not connect a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]
@@ -104,7 +104,7 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
     if child in ("", base):
         return odometry
     if child not in tree.frames or base not in tree.frames:
-        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: they are taken as the same frame")
+        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: taken as the same frame")
         return odometry
     child_T_base, known = tree.at(child, base, odometry.stamps)
     ledger.drop(f"odometry message with a stamp at which tf {child} -> {base} is not known", int((~known).sum()))

@@ -1,4 +1,4 @@
-"""Read sets of box files from a folder or a tar archive. The name of each file is the stamp of its frame."""
+"""Read the text files of detector boxes, each for one frame, from folders and tar archives."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from objslam.core.coco import COCO_NAMES
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections
 from objslam.errors import LogError
 from objslam.io.box_collector import BoxCollector
-from objslam.io.text import read_bytes
-from objslam.sources.tum_rgbd.box_text import add_boxes
+from objslam.io.text import parse_numbers, read_bytes, split_lines
 
 _STAMPED = re.compile(r"(\d+\.\d+)\.txt")  # The name of a box file, a stamp in s.
 _ARCHIVES = ("*.tar", "*.tar.gz", "*.tgz", "*.tar.bz2", "*.tar.xz")  # The names of archives that may hold box files.
@@ -45,6 +45,28 @@ def read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
     if not collector.stamps:
         raise LogError("none of the box files can be read", where=str(source))
     return collector.checked(ledger)
+
+
+def add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledger: Ledger) -> None:
+    """Add the boxes of a file to the collector's last frame. `place` names the file in messages.
+
+    Each line is "[class] x y w h score" in px. The class is a COCO number. The point (x, y) is the box's top left corner.
+    Boxes without a class get `label`. Malformed lines are dropped and counted.
+    """
+    for number, text in split_lines(data, place, ledger):
+        where = f"{place}:{number}"
+        values = parse_numbers(text.split())
+        if values is None or len(values) not in (5, 6):
+            ledger.drop('box line that is not "[class] x y w h score"', where=where)
+            continue
+        name = label
+        if len(values) == 6:
+            if values[0] not in range(len(COCO_NAMES)):
+                ledger.drop("box line with a class number that is not in COCO", where=where)
+                continue
+            name = COCO_NAMES[int(values[0])]
+        x, y, width, height, score = values[-5:]
+        collector.add_box([x, y, x + width, y + height], name, score, where)
 
 
 def _folder_files(folder: Path, ledger: Ledger) -> Iterator[tuple[float, str, bytes]]:

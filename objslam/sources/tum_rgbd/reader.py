@@ -1,7 +1,7 @@
 """Read RGB-D recordings of the TUM benchmark (Sturm et al., IROS 2012) with text files of detector boxes.
 
-The numbered layout is that of the cube_slam sample: truth_cam_poses.txt has a pose for each frame, and the names of the files
-in boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The stamped layout is that of the benchmark:
+The numbered layout is that of the cube_slam sample. truth_cam_poses.txt has a pose for each frame. The names of files in
+boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The stamped layout is that of the benchmark, with
 groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are the camera's, so base is the camera.
 """
 
@@ -27,8 +27,7 @@ from objslam.io.text import read_bytes, reading
 from objslam.io.tum_trajectory import read_pose_table, read_trajectory, to_trajectory
 from objslam.sources.log_folder import read_truth
 from objslam.sources.tum_rgbd import TumOptions
-from objslam.sources.tum_rgbd.box_files import find_box_sets, read_box_set
-from objslam.sources.tum_rgbd.box_text import add_boxes
+from objslam.sources.tum_rgbd.box_files import add_boxes, find_box_sets, read_box_set
 
 _POSES, _BOXES, _IMAGES = "truth_cam_poses.txt", "boxes", ("raw_imgs", "depth_imgs")  # The names in the numbered layout.
 _PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The names of the path in the stamped layout.
@@ -51,8 +50,8 @@ def is_stamped(path: Path) -> bool:
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
     """Read the numbered layout. Files whose names begin with n belong to pose line n, not counting comments.
 
-    The calibration is in camera.yaml. Without the file, it is that of freiburg3. Files without a pose, and a second file with
-    the same number, are dropped and counted. Raises LogError if the poses or the boxes are unusable.
+    Without camera.yaml, the calibration is that of freiburg3. Files without a pose, and further files with the same number,
+    are dropped and counted. Raises LogError if the poses or the boxes are unusable.
     """
     with reading(path):
         table = read_pose_table(path / _POSES, ledger)
