@@ -126,7 +126,6 @@ def _shell(size: tuple[float, float], rng: np.random.Generator) -> list[Part]:
 
 
 def _wall_row(size: tuple[float, float], wall: int, rng: np.random.Generator) -> tuple[list[Part], list[Floats]]:
-    """Make the furniture along a wall, and the poses (4, 4) of the places on it."""
     along, across = size if wall % 2 == 0 else size[::-1]
     # In the frame of the row, the wall is at y = 0 and the room at negative y.
     to_wall = lift_se2(np.array([0.0, 0.0, wall * np.pi / 2])) @ lift_se2(np.array([0.0, across / 2, 0.0]))

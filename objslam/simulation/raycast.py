@@ -56,7 +56,6 @@ class Caster:
 
     @cached_property
     def _alone(self) -> list[Any]:
-        """A scene for each object alone."""
         return [_scene(self.room, np.flatnonzero(self.room.owner == i)) for i in range(len(self.room.labels))]
 
     @cached_property
@@ -112,7 +111,6 @@ class Caster:
         return sizes
 
     def _local(self, number: int, map_T_camera: Floats) -> Floats:
-        """Return the vertices (V, 3) of an object in the camera frame, m."""
         camera_T_map = inverse(map_T_camera)
         points = np.concatenate([self.room.parts[p].vertices for p in np.flatnonzero(self.room.owner == number)])
         return np.asarray(points @ camera_T_map[:3, :3].T + camera_T_map[:3, 3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,6 +9,8 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 
+LABELS = ("ring", "sponge", "dispenser_button", "probe", "button", "stand_a", "stand_b")
+"""The labels of the paper's seven objects."""
 Pattern = Literal["plain", "noise", "stripes", "checks"]
 
 
@@ -94,70 +95,47 @@ def _plastic(rng: np.random.Generator, hue: float, saturation: float, value: flo
     return Material(colour, colour, gloss=float(rng.uniform(0.1, 0.4)))
 
 
-def _ring(rng: np.random.Generator) -> list[Part]:
-    first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The second draw keeps later draws the same.
-    return [torus(0.095, 0.026, 0.026, Material(first.colour, first.colour * 0.75, "noise", 0.03, 0.3))]
-
-
-def _sponge(rng: np.random.Generator) -> list[Part]:
-    foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)
-    return [
-        box((0.17, 0.11, 0.055), (0, 0, 0.0275), Material(foam, foam * 0.55, "noise", 0.006, 0.0)),
-        box((0.17, 0.11, 0.022), (0, 0, 0.066), Material(pad, pad * 0.6, "noise", 0.004, 0.0)),
-    ]
-
-
-def _dispenser_button(rng: np.random.Generator) -> list[Part]:
-    body, key, dark = _plastic(rng, 0.58, 0.05, 0.85), _plastic(rng, 0.6, 0.85, 0.7), _plastic(rng, 0.0, 0.0, 0.08)
-    return [
-        turned([(0.06, 0.0), (0.062, 0.15), (0.045, 0.17)], body),
-        turned([(0.063, 0.05), (0.063, 0.085)], dark),
-        turned([(0.04, 0.17), (0.042, 0.2), (0.03, 0.215)], key),
-    ]
-
-
-def _probe(rng: np.random.Generator) -> list[Part]:
-    steel, tip = _plastic(rng, 0.6, 0.05, 0.5), _plastic(rng, 0.985, 0.9, 0.65)
-    return [turned([(0.055, 0.0), (0.05, 0.02), (0.014, 0.03), (0.014, 0.19)], steel), ball(0.036, 0.22, tip)]
-
-
-def _button(rng: np.random.Generator) -> list[Part]:
-    case, head = _plastic(rng, 0.15, 0.9, 0.85), _plastic(rng, 0.99, 0.9, 0.7)
-    return [
-        box((0.15, 0.15, 0.07), (0, 0, 0.035), case),
-        turned([(0.03, 0.07), (0.03, 0.09), (0.058, 0.095), (0.055, 0.12), (0.03, 0.13)], head),
-    ]
-
-
-def _stand_a(rng: np.random.Generator) -> list[Part]:
-    blue, white = _plastic(rng, 0.62, 0.85, 0.55), _plastic(rng, 0.0, 0.0, 0.9)
-    return [
-        turned([(0.1, 0.0), (0.1, 0.015), (0.07, 0.02), (0.05, 0.105)], blue),
-        turned([(0.05, 0.105), (0.04, 0.15)], white),
-        turned([(0.04, 0.15), (0.025, 0.21)], blue),
-    ]
-
-
-def _stand_b(rng: np.random.Generator) -> list[Part]:
-    green = _plastic(rng, 0.4, 0.8, 0.5)
-    plates = [box((0.02, 0.14, 0.15), (x, 0, 0.095), green) for x in (-0.08, 0.0, 0.08)]
-    return [box((0.2, 0.14, 0.02), (0, 0, 0.01), green), *plates]
-
-
-MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
-    "ring": _ring,
-    "sponge": _sponge,
-    "dispenser_button": _dispenser_button,
-    "probe": _probe,
-    "button": _button,
-    "stand_a": _stand_a,
-    "stand_b": _stand_b,
-}
-"""The functions that make the seven objects of the paper on z = 0 around the z axis, in slightly random colours."""
-LABELS = tuple(MAKERS)
-
-
 def make_object(label: str, rng: np.random.Generator) -> list[Part]:
-    """Make one of the seven objects, with a random size factor of 0.92 to 1.08."""
+    """Make one of the seven objects on z = 0 around the z axis, with a random size factor of 0.92 to 1.08."""
     scale = float(rng.uniform(0.92, 1.08))
-    return [replace(part, vertices=part.vertices * scale) for part in MAKERS[label](rng)]
+    return [replace(part, vertices=part.vertices * scale) for part in _parts(label, rng)]
+
+
+def _parts(label: str, rng: np.random.Generator) -> list[Part]:
+    if label == "ring":
+        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The second draw keeps later draws the same.
+        return [torus(0.095, 0.026, 0.026, Material(first.colour, first.colour * 0.75, "noise", 0.03, 0.3))]
+    if label == "sponge":
+        foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)
+        return [
+            box((0.17, 0.11, 0.055), (0, 0, 0.0275), Material(foam, foam * 0.55, "noise", 0.006, 0.0)),
+            box((0.17, 0.11, 0.022), (0, 0, 0.066), Material(pad, pad * 0.6, "noise", 0.004, 0.0)),
+        ]
+    if label == "dispenser_button":
+        body, key, dark = _plastic(rng, 0.58, 0.05, 0.85), _plastic(rng, 0.6, 0.85, 0.7), _plastic(rng, 0.0, 0.0, 0.08)
+        return [
+            turned([(0.06, 0.0), (0.062, 0.15), (0.045, 0.17)], body),
+            turned([(0.063, 0.05), (0.063, 0.085)], dark),
+            turned([(0.04, 0.17), (0.042, 0.2), (0.03, 0.215)], key),
+        ]
+    if label == "probe":
+        steel, tip = _plastic(rng, 0.6, 0.05, 0.5), _plastic(rng, 0.985, 0.9, 0.65)
+        return [turned([(0.055, 0.0), (0.05, 0.02), (0.014, 0.03), (0.014, 0.19)], steel), ball(0.036, 0.22, tip)]
+    if label == "button":
+        case, head = _plastic(rng, 0.15, 0.9, 0.85), _plastic(rng, 0.99, 0.9, 0.7)
+        return [
+            box((0.15, 0.15, 0.07), (0, 0, 0.035), case),
+            turned([(0.03, 0.07), (0.03, 0.09), (0.058, 0.095), (0.055, 0.12), (0.03, 0.13)], head),
+        ]
+    if label == "stand_a":
+        blue, white = _plastic(rng, 0.62, 0.85, 0.55), _plastic(rng, 0.0, 0.0, 0.9)
+        return [
+            turned([(0.1, 0.0), (0.1, 0.015), (0.07, 0.02), (0.05, 0.105)], blue),
+            turned([(0.05, 0.105), (0.04, 0.15)], white),
+            turned([(0.04, 0.15), (0.025, 0.21)], blue),
+        ]
+    if label == "stand_b":
+        green = _plastic(rng, 0.4, 0.8, 0.5)
+        plates = [box((0.02, 0.14, 0.15), (x, 0, 0.095), green) for x in (-0.08, 0.0, 0.08)]
+        return [box((0.2, 0.14, 0.02), (0, 0, 0.01), green), *plates]
+    raise ValueError(f"no object is called {label!r}")

@@ -31,13 +31,10 @@ class SourceOptions(BagOptions, TumOptions, MrclamOptions, AnyOptions):
 class Source:
     """A kind of recording.
 
-    Attributes:
-        name: the value of `--format` that selects this kind.
-        looks_for: the files that identify this kind, as text for an error message.
-        detector: "module:function". The function takes a path and returns whether the path is of this kind. The module is
-            imported at the first call.
-        reader: "module:function". The function takes (path, ledger), and also the options if the kind has any.
-        options: the class of the kind's options, a base class of `SourceOptions`. None if the kind has no options.
+    name: the value of `--format` that selects this kind. looks_for: the files that identify this kind, for error messages.
+    detector: "module:function" that takes a path and returns whether the path is of this kind.
+    reader: "module:function" that takes (path, ledger), and also the options if the kind has any.
+    options: the class of the kind's options, a base class of `SourceOptions`. None if the kind has no options.
     """
 
     name: str
@@ -104,13 +101,9 @@ SOURCES = (
 def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
     """Read a recording of any kind in `SOURCES`.
 
-    Args:
-        path: the recording. Its content determines its kind, unless `options.format` names the kind.
-        ledger: counts dropped data. It also gets a warning for each given option that this kind does not take.
-        options: facts that the recording does not contain.
-    Raises:
-        LogError: if no kind fits or the recording cannot be read.
-        ConfigError: if `options.format` is unknown.
+    The content of the recording determines its kind, unless `options.format` names the kind. The ledger counts dropped data,
+    and gets a warning for each given option that this kind does not take.
+    Raises LogError if no kind fits or the recording cannot be read, and ConfigError if `options.format` is unknown.
     """
     options = options or SourceOptions()
     source = choose(path, options.format)

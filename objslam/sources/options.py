@@ -1,7 +1,7 @@
 """The declaration of command line options by sources, and the options that several sources share.
 
-Each source declares its options as the fields of a frozen dataclass. `--help` imports all files that declare options, so such
-a file imports nothing heavy at its top, not even numpy.
+Each source declares its options as the fields of a frozen dataclass. `--help` imports every file that declares options, so
+such a file imports nothing heavy at its top, not even numpy.
 """
 
 from __future__ import annotations
@@ -16,12 +16,8 @@ class Option:
     """The command line option of a field, as in `stride: Annotated[int, Option("--stride", "Every Nth frame.")] = 1`.
 
     A field without an Option can be set from Python only. The option of a tuple field may be given several times.
-
-    Attributes:
-        flag: the option's name. "--rectified/--raw" names the true and the false value of a bool. A single name for a bool
-            sets the opposite of the default.
-        help: the text in `--help`.
-        metavar: the name of the value in `--help`.
+    flag: the option's name. "--rectified/--raw" names the true and the false value of a bool. A single name for a bool sets
+    the opposite of the default. help: the text in `--help`. metavar: the name of the value in `--help`.
     """
 
     flag: str

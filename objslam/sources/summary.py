@@ -59,6 +59,11 @@ def timing(stamps: Floats) -> Timing:
 def contents(log: Log) -> Contents:
     """Summarise a log."""
     streams = [_path("odometry", log.odometry), _path("localization", log.localization)]
+    missing = []
+    if log.odometry is None and log.localization is None:
+        missing.append("there is neither odometry nor localisation")
+    if not log.cameras:
+        missing.append("there is no camera")
     for camera_log in log.cameras:
         name = f"{camera_log.camera.name}." if len(log.cameras) > 1 else ""
         streams += [
@@ -67,19 +72,6 @@ def contents(log: Log) -> Contents:
             _images(f"{name}depth", camera_log.depth),
             _path(f"{name}camera_poses", camera_log.mount),
         ]
-    if log.truth is not None:
-        streams.append(_path("truth", log.truth.trajectory))
-    cameras = tuple(camera_log.camera for camera_log in log.cameras)
-    return Contents(log.name, tuple(s for s in streams if s is not None), cameras, _missing(log))
-
-
-def _missing(log: Log) -> tuple[str, ...]:
-    missing = []
-    if log.odometry is None and log.localization is None:
-        missing.append("there is neither odometry nor localisation")
-    if not log.cameras:
-        missing.append("there is no camera")
-    for camera_log in log.cameras:
         where, frames = f"camera {camera_log.camera.name}", np.zeros(0)
         if camera_log.detections is not None:
             frames = camera_log.detections.frame_stamps
@@ -89,7 +81,10 @@ def _missing(log: Log) -> tuple[str, ...]:
         else:
             missing.append(f"{where}: neither detections nor images")
         missing += off_path(where, frames, log.localization or log.odometry)
-    return tuple(missing)
+    if log.truth is not None:
+        streams.append(_path("truth", log.truth.trajectory))
+    cameras = tuple(camera_log.camera for camera_log in log.cameras)
+    return Contents(log.name, tuple(stream for stream in streams if stream), cameras, tuple(missing))
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:

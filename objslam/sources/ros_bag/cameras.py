@@ -35,11 +35,6 @@ class CameraTopics:
     calibration: Calibration | None
     rectified: bool
 
-    def roles(self) -> dict[str, Topic]:
-        """Return the topics by role."""
-        topics = {"detections": self.detections, "image": self.image, "depth": self.depth, "camera_info": self.info}
-        return {role: topic for role, topic in topics.items() if topic is not None}
-
 
 def find_cameras(
     pool: TopicPool, tree: TfTree, calibrations: Sequence[Calibration], rectified: bool | None

@@ -125,8 +125,10 @@ def _roles(assembly: Assembly) -> dict[str, str]:
     if assembly.paths is not None:
         roles.update(assembly.paths.roles)
     for topics in assembly.cast:
-        for role, topic in topics.roles().items():
-            roles[topic.name] = f"{topics.name}.{role}" if len(assembly.cast) > 1 else role
+        prefix = f"{topics.name}." if len(assembly.cast) > 1 else ""
+        for role in ("detections", "image", "depth", "camera_info"):
+            if topic := getattr(topics, role.removeprefix("camera_")):
+                roles[topic.name] = prefix + role
     return roles
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory
+from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
 from objslam.io.camera_yaml import read_calibrations
@@ -25,7 +25,7 @@ from objslam.ros.topics import parse_topics
 from objslam.sources.ros_bag.cameras import CameraTopics, build_camera, find_cameras
 from objslam.sources.ros_bag.images import extract_images
 from objslam.sources.ros_bag.options import BagOptions
-from objslam.sources.ros_bag.survey import Survey, Topic, take_survey
+from objslam.sources.ros_bag.survey import Survey, take_survey
 from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
@@ -104,16 +104,14 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
             cameras.append((topics, *build_camera(topics, tree, base, ledger)))
         except LogError as error:
             refused.append(error)
+    if not cameras and not refused:
+        images = any(topic.type.endswith(("/Image", "/CompressedImage")) for topic in survey.topics.values())
+        what = "images, but none with a CameraInfo" if images else "no images and no detections"
+        hint = "record Detection2DArray or AprilTag detections, or images with CameraInfo (or give --camera-info FILE)"
+        problems.append(LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint))
     if not cameras:
-        problems += refused or [_no_camera(survey)]
+        problems += refused
     return Assembly(survey, tree, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))
-
-
-def _no_camera(survey: Survey) -> LogError:
-    images = any(topic.type.endswith(("/Image", "/CompressedImage")) for topic in survey.topics.values())
-    what = "images, but none with a CameraInfo" if images else "no images and no detections"
-    hint = "record vision_msgs/Detection2DArray, AprilTag detections, or images with CameraInfo (or give --camera-info FILE)"
-    return LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint)
 
 
 def _extract(assembly: Assembly, options: BagOptions, ledger: Ledger) -> dict[str, Images]:
@@ -140,17 +138,15 @@ def _camera_log(
     ledger: Ledger,
 ) -> CameraLog:
     camera = replace(camera, depth_scale=DEPTH_SCALE)
-    rgb, depth = (images.get(topic.name) if topic else None for topic in (topics.image, topics.depth))
-    detections = _detections(topics.detections, camera, ledger) if topics.detections is not None else None
+    rgb, depth = (images.get(shown.name) if shown else None for shown in (topics.image, topics.depth))
+    detections, topic = None, topics.detections
+    if topic is not None:
+        boxes = replace(topic.boxes, stamps=(topic.times() / 1e9).tolist(), boxes=list(topic.boxes.boxes))
+        if topic.points:
+            projected = boxes_of_points(camera, np.array(list(topic.points.values())))
+            for index, box in zip(topic.points, projected.tolist(), strict=True):
+                boxes.boxes[index] = box
+        detections = replace(boxes.checked(ledger), whole=is_tags(topic.type))
     if detections is not None and depth is not None and options.with_range:
         detections = depths_at_boxes(detections, depth, camera, ledger)
     return CameraLog(camera, detections, rgb, depth, mount)
-
-
-def _detections(topic: Topic, camera: Camera, ledger: Ledger) -> Detections:
-    boxes = replace(topic.boxes, stamps=(topic.times() / 1e9).tolist(), boxes=list(topic.boxes.boxes))
-    if topic.points:
-        projected = boxes_of_points(camera, np.array(list(topic.points.values())))
-        for index, box in zip(topic.points, projected.tolist(), strict=True):
-            boxes.boxes[index] = box
-    return replace(boxes.checked(ledger), whole=is_tags(topic.type))

@@ -113,7 +113,6 @@ def take_survey(recording: Recording, label: str) -> Survey:
 
 
 def _make_handler(connection: Connection, topic: Topic, tf: TfRows, label: str) -> _Handler:
-    """Return the function that takes each message of a connection."""
     kind = connection.type
     makers = {ODOMETRY: _add_pose, CAMERA_INFO: _add_info, IMAGE: _add_image, COMPRESSED: _add_image}
     makers |= dict.fromkeys(POSES, _add_pose)
