@@ -47,8 +47,8 @@ class Boxes:
         """Concatenate boxes."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
-    def take(self, boxes: Bools) -> Self:
-        """Select boxes by a mask (M,)."""
+    def take(self, boxes: Bools | Ints) -> Self:
+        """Select boxes by a mask (M,) or by indices."""
         return type(self)(*(getattr(self, f.name)[boxes] for f in fields(self)))
 
 
@@ -84,14 +84,8 @@ def detect(
     box = np.column_stack([centre - seen.size / 2, centre + seen.size / 2])
     if settings.cut_off:
         box = np.clip(box, 0.0, np.tile(camera.size - 1, 2))
-    boxes = Boxes(
-        frame=seen.frame,
-        object=seen.object + first_id,
-        label=label[seen.object],
-        box=box,
-        score=score.uniform(0.5, 1.0, count),
-        depth=_depths(settings, seen.depth, depth),
-    )
+    scores, z = score.uniform(0.5, 1.0, count), _depths(settings, seen.depth, depth)
+    boxes = Boxes(seen.frame, seen.object + first_id, label[seen.object], box, scores, z)
     reach = _reach(settings, seen.size)
     inside = np.asarray(((centre - reach >= 0) & (centre + reach <= camera.size - 1)).all(axis=1))
     return boxes.take(inside & (miss.random(count) >= settings.missed))
@@ -104,14 +98,9 @@ def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.rand
     count = len(frame)
     size = rng.uniform(*FALSE_SIZES, (count, 2))
     corner = rng.random((count, 2)) * (camera.size - 1 - size)
-    return Boxes(
-        frame=frame,
-        object=np.full(count, -1),
-        label=label,
-        box=np.column_stack([corner, corner + size]),
-        score=rng.uniform(0.3, 0.8, count),
-        depth=_depths(settings, depth.uniform(0.3, settings.max_range, count), depth),
-    )
+    box, scores = np.column_stack([corner, corner + size]), rng.uniform(0.3, 0.8, count)
+    z = _depths(settings, depth.uniform(0.3, settings.max_range, count), depth)
+    return Boxes(frame, np.full(count, -1), label, box, scores, z)
 
 
 def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> Floats:
@@ -126,16 +115,8 @@ def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> 
 def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
     """Turn boxes into detections, sorted by frame and by falling score."""
     order = np.lexsort((-boxes.score, boxes.frame))
-    return Detections(
-        frame_stamps=frame_stamps,
-        frame=boxes.frame[order],
-        boxes=boxes.box[order],
-        label=boxes.label[order],
-        scores=boxes.score[order],
-        depths=boxes.depth[order],
-        track_ids=_tracks(settings, boxes)[order],
-        label_names=classes,
-    )
+    b, tracks = boxes.take(order), _tracks(settings, boxes)[order]
+    return Detections(frame_stamps, b.frame, b.box, b.label, b.score, b.depth, tracks, classes)
 
 
 def _tracks(settings: DriveSettings, boxes: Boxes) -> Ints:

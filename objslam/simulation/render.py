@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, InstanceOf, model_validator
 
 from objslam import config
@@ -21,7 +20,7 @@ from objslam.core.geometry import lift_se2, widest_angle
 from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject, label_table
 from objslam.errors import ConfigError
 from objslam.simulation.furniture import Room, furnish_room
-from objslam.simulation.raycast import Cast, Caster, Reals
+from objslam.simulation.raycast import Cast, Caster
 from objslam.simulation.sensor import Sensor, expose, exposures, measure_depth
 from objslam.simulation.settings import CourseSettings, DriveSettings, PoseNoise, Probability, make_camera
 from objslam.simulation.shapes import LABELS
@@ -113,15 +112,6 @@ def true_boxes(caster: Caster, cast: Cast, map_T_camera: Floats, limits: BoxLimi
     return TrueBoxes(objects, box, depth, large & whole & left, cut)
 
 
-def render_frame(
-    caster: Caster, map_T_camera: Floats, sensor: Sensor, gain: Floats, limits: BoxLimits, rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], Reals, TrueBoxes]:
-    """Render a frame from map_T_camera (4, 4). Returns RGB (H, W, 3), measured depth (H, W) in m, and the true boxes."""
-    cast = caster.cast(map_T_camera)
-    rgb = expose(sensor, caster.shade(cast, map_T_camera[:3, 3]), gain, rng)
-    return rgb, measure_depth(sensor, cast.depth, rng), true_boxes(caster, cast, map_T_camera, limits)
-
-
 def render_drive(
     settings: RenderSettings,
     seed: int,
@@ -165,13 +155,15 @@ def render_drive(
 
         def render(i: int) -> TrueBoxes:
             rng = np.random.default_rng(grain_seeds[i])
-            rgb, depth, found = render_frame(caster, map_T_camera[i], settings.sensor, gains[i], settings.limits, rng)
+            cast = caster.cast(map_T_camera[i])
+            rgb = expose(settings.sensor, caster.shade(cast, map_T_camera[i, :3, 3]), gains[i], rng)
+            depth = measure_depth(settings.sensor, cast.depth, rng)
             units = np.clip(depth * settings.camera.depth_scale + 0.5, 0, 65535).astype(np.uint16)
             jpg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])[1]
             png = cv2.imencode(".png", units, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             for file, content in ((rgb_files[i], jpg), (depth_files[i], png)):
                 file.write_bytes(content.tobytes())
-            return found
+            return true_boxes(caster, cast, map_T_camera[i], settings.limits)
 
         boxes = []
         pool = ThreadPoolExecutor(workers or min(os.cpu_count() or 1, 4))

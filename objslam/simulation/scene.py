@@ -18,19 +18,10 @@ from objslam.simulation.settings import DriveSettings
 from objslam.simulation.trajectory import START, Path
 
 EXTENTS = {
-    "cup": (0.09, 0.11),
-    "bottle": (0.08, 0.26),
-    "plant": (0.28, 0.38),
-    "book": (0.16, 0.23),
-    "clock": (0.25, 0.25),
-    "vase": (0.14, 0.24),
-    "backpack": (0.32, 0.42),
-    "teddy bear": (0.26, 0.32),
-    "laptop": (0.33, 0.23),
-    "ball": (0.22, 0.22),
-    "bowl": (0.18, 0.1),
-    "lamp": (0.22, 0.4),
-}
+    "cup": (0.09, 0.11), "bottle": (0.08, 0.26), "plant": (0.28, 0.38), "book": (0.16, 0.23),
+    "clock": (0.25, 0.25), "vase": (0.14, 0.24), "backpack": (0.32, 0.42), "teddy bear": (0.26, 0.32),
+    "laptop": (0.33, 0.23), "ball": (0.22, 0.22), "bowl": (0.18, 0.1), "lamp": (0.22, 0.4),
+}  # fmt: skip
 """The width and height of each class, m. Drives use the classes in this order."""
 OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m.
 WALL = 0.3  # The least distance of random objects from the walls, m.
@@ -143,11 +134,8 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
-    """Return a lower bound (P,), rad, of the widest angle between the directions (V, P, 3) where seen (V, P).
-
-    The first step finds the direction furthest from the first seen direction, the second the direction furthest from that
-    direction. If all directions are in a plane, as those of a planar path, the bound is the widest angle.
-    """
+    """Return a lower bound (P,), rad, of the widest angle between the directions (V, P, 3) where seen (V, P)."""
+    # Each step finds the direction furthest from the last one. For directions in a plane, the result is the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)
     for _ in range(2):

@@ -47,13 +47,9 @@ def timing(stamps: Floats) -> Timing:
     """Compute the timing of stamps (N,), N > 0, in any order."""
     times = np.sort(stamps)
     span = float(times[-1] - times[0])
-    return Timing(
-        count=len(times),
-        start=float(times[0]),
-        end=float(times[-1]),
-        rate=(len(times) - 1) / span if span > 0 else 0.0,
-        longest_gap=float(np.diff(times).max()) if len(times) > 1 else 0.0,
-    )
+    rate = (len(times) - 1) / span if span > 0 else 0.0
+    gap = float(np.diff(times).max()) if len(times) > 1 else 0.0
+    return Timing(len(times), float(times[0]), float(times[-1]), rate, gap)
 
 
 def contents(log: Log) -> Contents:

@@ -139,16 +139,8 @@ def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger
     label_names, label = label_table([_label(s, options.anonymous) for s in subject[good].tolist()])
     count = int(good.sum())
     centre = np.column_stack([bearing_to_pixel(bearing[good]), np.full(count, _HEIGHT / 2)])
-    return Detections(
-        frame_stamps=frame_stamps,
-        frame=frame[good],
-        boxes=np.hstack([centre - _HALF_BOX, centre + _HALF_BOX]),
-        label=label,
-        scores=np.ones(count),
-        depths=depths[good],
-        track_ids=np.full(count, -1),
-        label_names=label_names,
-    )
+    boxes, tracks = np.hstack([centre - _HALF_BOX, centre + _HALF_BOX]), np.full(count, -1)
+    return Detections(frame_stamps, frame[good], boxes, label, np.ones(count), depths[good], tracks, label_names)
 
 
 def _read_truth(folder: Path, prefix: str, anonymous: bool, ledger: Ledger) -> Truth | None:

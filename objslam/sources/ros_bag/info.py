@@ -33,10 +33,10 @@ class TopicInfo:
     type: str
     messages: int
     timing: Timing
-    role: str = ""
-    frame: str = ""
-    detail: str = ""
-    refused: tuple[str, ...] = ()
+    role: str
+    frame: str
+    detail: str
+    refused: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -134,16 +134,9 @@ def _roles(assembly: Assembly) -> dict[str, str]:
 
 def _topic_info(topic: Topic, role: str) -> TopicInfo:
     stamps = topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)
-    return TopicInfo(
-        name=topic.name,
-        type=topic.type,
-        messages=len(topic.logged),
-        timing=timing(stamps / 1e9),
-        role=role,
-        frame=topic.frame,
-        detail=_detail(topic),
-        refused=tuple(f"{count} {reason}" for reason, count in topic.refused.items()),
-    )
+    refused = tuple(f"{count} {reason}" for reason, count in topic.refused.items())
+    times = timing(stamps / 1e9)
+    return TopicInfo(topic.name, topic.type, len(topic.logged), times, role, topic.frame, _detail(topic), refused)
 
 
 def _detail(topic: Topic) -> str:
