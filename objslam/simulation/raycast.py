@@ -79,10 +79,9 @@ class Caster:
         depth = hit["t_hit"].numpy()
         part = hit["geometry_ids"].numpy().astype(np.int64)
         part[~np.isfinite(depth)] = -1
-        normal = hit["primitive_normals"].numpy()
         reach = np.where(np.isfinite(depth), depth, 0.0)[..., None]
         point = rays[..., :3] + reach * rays[..., 3:]
-        return Cast(depth, part, normal, point)
+        return Cast(depth, part, hit["primitive_normals"].numpy(), point)
 
     def owners(self, cast: Cast) -> Ints:
         """Return the object (H, W) at each pixel, -1 for none."""

@@ -147,9 +147,8 @@ def render_drive(
     gains = exposures(settings.sensor, settings.frames, np.random.default_rng(seeds[3]))
     grain_seeds = seeds[3].spawn(settings.frames)
     with beside(out) as work:
-        names = [f"{i:06d}" for i in range(settings.frames)]
-        rgb_files = tuple(work / "rgb" / f"{name}.jpg" for name in names)
-        depth_files = tuple(work / "depth" / f"{name}.png" for name in names)
+        rgb_files = tuple(work / "rgb" / f"{i:06d}.jpg" for i in range(settings.frames))
+        depth_files = tuple(work / "depth" / f"{i:06d}.png" for i in range(settings.frames))
         for files in (rgb_files, depth_files):
             files[0].parent.mkdir()
 

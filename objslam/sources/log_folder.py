@@ -201,8 +201,7 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
     if truth.objects:
         (folder / TRUTH).mkdir(exist_ok=True)
         entries = [{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in truth.objects]
-        content = {"format": FORMAT, "frame": "map", "objects": entries}
-        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        text = json.dumps({"format": FORMAT, "frame": "map", "objects": entries}, indent=1, allow_nan=False) + "\n"
         (folder / TRUTH / TRUTH_OBJECTS).write_text(text, encoding="utf-8")
 
 

@@ -135,8 +135,8 @@ def _roles(assembly: Assembly) -> dict[str, str]:
 def _topic_info(topic: Topic, role: str) -> TopicInfo:
     stamps = topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)
     refused = tuple(f"{count} {reason}" for reason, count in topic.refused.items())
-    times = timing(stamps / 1e9)
-    return TopicInfo(topic.name, topic.type, len(topic.logged), times, role, topic.frame, _detail(topic), refused)
+    when, detail = timing(stamps / 1e9), _detail(topic)
+    return TopicInfo(topic.name, topic.type, len(topic.logged), when, role, topic.frame, detail, refused)
 
 
 def _detail(topic: Topic) -> str:
