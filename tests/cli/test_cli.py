@@ -185,7 +185,7 @@ def test_info_of_a_log_folder(objslam, log_folder, variant):
     for words in ("small: log", "odometry", "detections", "640x480", "nothing is missing for a run"):
         assert words in info.out
     (variant / "detections.jsonl").unlink()
-    assert "no detections; and no images either" in objslam("info", variant).out
+    assert "neither detections nor images" in objslam("info", variant).out
 
 
 def test_config_dump_is_what_config_reads(objslam, tmp_path):
