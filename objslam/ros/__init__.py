@@ -1,4 +1,4 @@
-"""ROS without ROS: files of bags, messages and tf, shared by recorded bags and by live robots.
+"""Read ROS bags, messages and tf without a ROS installation, for recorded bags and for live robots.
 
-Which topic plays which part is decided where a log or a session is made: `sources.ros_bag` and `live.ros`.
+The choice of the topic for each role is in `sources.ros_bag` and `live.ros`.
 """

@@ -1,4 +1,4 @@
-"""Containers of recorded messages: ROS 1 bags, sqlite3 and mcap, whole or damaged, as bytes with topic and stamp.
+"""Read ROS 1 bags, sqlite3 bags and MCAP files, whole or damaged, as serialised messages with topic and timestamp.
 
-What the bytes mean is in `ros.messages`.
+The decoding of the messages is in `ros.messages`.
 """

@@ -1,28 +1,30 @@
-"""ROS 2 bags of the sqlite3 storage, read by rowid; where the database is damaged, page by page."""
+"""ROS 2 bags of the sqlite3 storage, read in rowid order. A damaged database is read page by page."""
 
 from __future__ import annotations
 
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from objslam.errors import LogError
-from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, plain, type_name
+from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, Wanted, plain, type_name
 from objslam.ros.bag.sqlite_pages import missing_pages, rows_of_pages
 
 MAGIC = b"SQLite format 3\0"
 
 
-def read_sqlite(path: Path, report: FileReport, wanted: Callable[[Connection], bool]) -> Messages:
-    """The messages of the wanted topics of a database, in the order of their rowids.
+def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
+    """Yield the messages of the wanted topics of a database, in rowid order.
 
-    Of a file that is cut off or has damaged pages, every row is read that is whole. The write-ahead log or rollback journal
-    of a recorder that was killed is applied to a copy in the folder for temporary files: the file itself is never touched.
-    LogError where there is no table of topics and messages.
+    Every whole row of a damaged file is read. The write-ahead log or rollback journal of a killed recorder is applied to a
+    temporary copy. The file itself is never changed.
+
+    Raises:
+        LogError: the database cannot be read, or has no tables of topics and messages.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)
@@ -32,13 +34,13 @@ def read_sqlite(path: Path, report: FileReport, wanted: Callable[[Connection], b
                 report.messages += 1
                 yield topics[key], stamp, data
             else:
-                report.damage("rows that are no messages", 1)
+                report.damage("rows that are not messages", 1)
 
 
 @contextmanager
 def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
-    """The file, or a copy of it that what the recorder left beside it is applied to, and how to open it."""
-    siblings = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+    """Yield the file or its temporary copy, and the mode in which to open it. Only a killed recorder leaves siblings."""
+    siblings = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
     siblings = [file for file in siblings if file.is_file() and file.stat().st_size]
     if not siblings:
         yield path, "mode=ro&immutable=1"
@@ -63,7 +65,7 @@ def _open(file: Path, mode: str, path: Path) -> Iterator[sqlite3.Connection]:
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
         database.execute("PRAGMA trusted_schema = OFF")
-        database.execute("PRAGMA writable_schema = ON")  # else a file that is shorter than it says is not opened at all
+        database.execute("PRAGMA writable_schema = ON")  # Needed to open a truncated file.
         if mode == "mode=rw":
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         yield database
@@ -75,7 +77,7 @@ def _open(file: Path, mode: str, path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connection]:
-    # rootpage > 0: a view or a virtual table could make up rows without end
+    # Views and virtual tables (rootpage 0) are excluded, because they can generate endless rows.
     tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}
     if not {"topics", "messages"} <= tables:
         raise LogError("not a ROS 2 bag: the database has no tables of topics and messages", where=str(path))
@@ -93,11 +95,11 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
 def _rows(
     database: sqlite3.Connection, file: Path, topics: frozenset[int], report: FileReport
 ) -> Iterator[tuple[int, int, Any, Any]]:
-    """Rows of the topics in the order of their rowids; from the first that the database fails on, page by page."""
+    """Yield the rows of the topics in rowid order. After a failure of the database, the rest is read page by page."""
     marks = ", ".join("?" * len(topics))
     last = -1
     pages, missing = missing_pages(file)
-    if missing:  # the database would make zeros of the page that the cut goes through
+    if missing:  # SQLite would fill the cut page with zeros.
         report.damage(f"cut off at byte {file.stat().st_size}, {missing} of {pages + missing} pages are missing")
     else:
         try:

@@ -1,4 +1,4 @@
-"""ROS messages by type: bytes to fields, and fields to poses, boxes, cameras and images.
+"""Decode ROS messages and convert them to poses, boxes, cameras and images.
 
-Which topics to read is not decided here; transforms over time are in `ros.tf`.
+The choice of topics is in the rooms above, and transforms over time are in `ros.tf`.
 """

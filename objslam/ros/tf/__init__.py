@@ -1,4 +1,4 @@
-"""Transforms between named frames over time: a tree of a whole recording, and a buffer of what has come so far.
+"""Look up transforms between named frames over time, in a tree for a recording and in a buffer for a live session.
 
-The messages that carry them are decoded in `ros.messages`.
+The decoding of transform messages is in `ros.messages`.
 """
