@@ -1,4 +1,4 @@
-"""Files, one module a format: each reads or writes one kind of file and says what is wrong with it, by line.
+"""Read and write files with one module per format, and report errors with file and line.
 
-What a folder of such files means is not decided here: logs are in `sources`, results in `results` and `output`.
+The meaning of a folder of files is defined in other rooms: logs in `sources`, results in `results` and `output`.
 """

@@ -1,4 +1,4 @@
-"""Surfaces as PLY files (binary, little endian), for MeshLab, CloudCompare, Blender and Open3D."""
+"""Write surfaces as PLY files (binary, little endian) for MeshLab, CloudCompare, Blender and Open3D."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from objslam.core.types import Surface
 
 
 def write_mesh(surface: Surface, file: Path) -> None:
-    """Write vertices (m) with their colours, and triangles; OSError when the file cannot be written."""
+    """Write vertices (m), colours and triangles. Raises OSError if the file cannot be written."""
     _write(surface, file, normals=False, triangles=True)
 
 
 def write_cloud(surface: Surface, file: Path) -> None:
-    """Write the vertices alone, with normals and colours; OSError when the file cannot be written."""
+    """Write vertices (m), normals and colours without triangles. Raises OSError if the file cannot be written."""
     _write(surface, file, normals=True, triangles=False)
 
 

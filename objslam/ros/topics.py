@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from os.path import commonprefix
+from itertools import takewhile
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError
@@ -61,7 +61,8 @@ def is_rectified(name: str) -> bool:
 
 def closeness(a: str, b: str) -> int:
     """Return the number of leading name parts that two topics share."""
-    return len(commonprefix([a.strip("/").split("/"), b.strip("/").split("/")]))
+    pairs = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def is_named(camera: str, frame: str, topic: str) -> bool:

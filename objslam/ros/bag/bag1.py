@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from objslam.ros.bag.decompress import CorruptDataError, unpack
-from objslam.ros.bag.records import MAX_RECORD, Connection, FileReport, Messages, Reading, Wanted, plain, type_name
+from objslam.ros.bag.records import MAX_RECORD, FileReport, Messages, Reading, Wanted, make_connection
 
 MAGIC = b"#ROSBAG V2.0\n"
 _OPS = _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
@@ -177,7 +177,7 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
         reading.report.damage("a connection whose description is broken", 0)
         return
     name, definition = (details.get(key, b"").decode("utf-8", "replace") for key in (b"type", b"message_definition"))
-    connection, key = Connection(plain(topic), type_name(name), "ros1", definition), _number(fields, b"conn")
+    connection, key = make_connection(topic, name, "ros1", definition, "msg"), _number(fields, b"conn")
     if reading.connections.get(key) != connection:  # An equal connection keeps its identity, which readers use as a key.
         reading.connections[key] = connection
 

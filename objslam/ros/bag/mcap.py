@@ -16,7 +16,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 from objslam.ros.bag.decompress import CorruptDataError, unpack
-from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, Reading, Wanted, plain, type_name
+from objslam.ros.bag.records import (
+    LANGUAGES,
+    MAX_RECORD,
+    Connection,
+    FileReport,
+    Messages,
+    Reading,
+    Wanted,
+    plain,
+    type_name,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _STATISTICS, _DATA_END, _FOOTER = 3, 4, 5, 6, 7, 11, 15, 2
@@ -27,8 +37,7 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _CHUNK_START = re.compile(rb"\x06.{5}\0\0\0.{21}\0\0\0.{4}(\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd).{5}\0\0\0", re.DOTALL)
-"""The pattern of a chunk record: length, two timestamps, unpacked size, CRC, compression, packed size. Sizes are below 2^40."""
-
+"""A chunk record has length, two timestamps, unpacked size, CRC, compression and packed size. Sizes are below 2^40."""
 _BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
 _LATEST = 2**63 - 1  # The largest recording time that a signed 64-bit integer holds, ns.
 
@@ -131,7 +140,7 @@ def _record(op: int, data: bytes, reading: _Reading) -> Messages:
             key, schema = struct.unpack_from("<HH", data)
             topic, encoding = _strings(data, 4, 2)
             name, language, text = reading.schemas.get(schema, ("", "", ""))
-            channel = Connection(plain(topic), type_name(name), encoding, text if language else "", language)
+            channel = make_connection(topic, name, encoding, text, language)
             if key not in reading.connections or (name and reading.connections[key] != channel):
                 reading.connections[key] = channel
         elif op == _MESSAGE:

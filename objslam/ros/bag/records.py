@@ -116,3 +116,8 @@ def type_name(name: str) -> str:
     """
     match = _TYPE.fullmatch(name)
     return f"{match[1]}/msg/{match[2]}" if match else plain(name)
+
+
+def make_connection(topic: str, type_: str, encoding: str, definition: str, language: str) -> Connection:
+    """Return a connection with printable names. A definition in an unknown language ("") is dropped."""
+    return Connection(plain(topic), type_name(type_), encoding, definition if language else "", language)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from objslam.errors import LogError
-from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, Wanted, plain, type_name
+from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, Wanted, make_connection
 from objslam.ros.bag.sqlite_pages import missing_pages, rows_of_pages
 
 MAGIC = b"SQLite format 3\0"
@@ -88,7 +88,7 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
     topics = {}
     for key, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
         language, text = definitions.get(kind, ("", ""))
-        topics[key] = Connection(plain(str(name)), type_name(str(kind)), str(encoding), text if language else "", language)
+        topics[key] = make_connection(str(name), str(kind), str(encoding), text, language)
     return topics
 
 

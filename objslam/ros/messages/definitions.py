@@ -17,7 +17,7 @@ _TYPES = {
     "geometry_msgs/Pose2D": "float64 x\nfloat64 y\nfloat64 theta\n",
     "sensor_msgs/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
     "uint32 step\nuint8[] data\n",
-    "vision_msgs/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    "vision_msgs/ObjectHypothesisWithPose": "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
     "vision_msgs/ObjectHypothesis": "string class_id\nfloat64 score\n",
     "vision_msgs/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
     "vision_msgs/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",

@@ -39,7 +39,7 @@ def find_boxes(type_: str, message: Any) -> Iterator[Found]:
 
 
 def track_number(name: str, tracks: dict[str, int]) -> int:
-    """Return the track id of a track name: -1 for "", the number that the name states, or a new number stored in `tracks`."""
+    """Return the track id of a track name: -1 for "", the number in the name, or a new number stored in `tracks`."""
     if not name:
         return -1
     if name.isascii() and name.isdigit() and len(name) < 18:
