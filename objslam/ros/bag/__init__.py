@@ -1,4 +1,1 @@
-"""Read ROS 1 bags, sqlite3 bags and MCAP files, whole or damaged, as serialised messages with topic and timestamp.
-
-The decoding of the messages is in `ros.messages`.
-"""
+"""Read ROS 1 bags, sqlite3 bags and MCAP files, whole or damaged. `ros.messages` decodes their serialised messages."""

@@ -43,10 +43,7 @@ class _Reading(Reading):
 
 
 def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the messages of the wanted connections of a bag, in file order.
-
-    The bag may be unclosed, cut off or damaged. `report` lists the missing parts.
-    """
+    """Yield the wanted messages of a bag, even damaged or unclosed, in file order. `report` lists the missing parts."""
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
         reading = _Reading(report, wanted)

@@ -18,13 +18,10 @@ class CorruptDataError(ValueError):
 
 
 def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
-    """Return the unpacked data.
+    """Return the data unpacked by `method`, which is "" or "none", "bz2", "lz4" (frame format) or "zstd".
 
-    Args:
-        method: "" or "none", "bz2", "lz4" (frame format) or "zstd".
-        cut: whether the data may end early. The result is then the part that can be unpacked.
-    Raises:
-        CorruptDataError: the data are broken, the result exceeds `MAX_RECORD` bytes, or the method is unknown.
+    With `cut`, the data may end early, and the readable part is returned. Raises CorruptDataError if the data are broken,
+    the result exceeds `MAX_RECORD` bytes, or the method is unknown.
     """
     if method in ("", "none"):
         return data

@@ -16,17 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from objslam.ros.bag.decompress import CorruptDataError, unpack
-from objslam.ros.bag.records import (
-    LANGUAGES,
-    MAX_RECORD,
-    Connection,
-    FileReport,
-    Messages,
-    Reading,
-    Wanted,
-    plain,
-    type_name,
-)
+from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, FileReport, Messages, Reading, Wanted, make_connection
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _STATISTICS, _DATA_END, _FOOTER = 3, 4, 5, 6, 7, 11, 15, 2
@@ -82,7 +72,11 @@ def _walk(file: BinaryIO, at: int, end: int, reading: _Reading) -> Messages:
                 reading.end_chunk()
                 report.damage(f"cut off in the chunk at byte {at}")
                 file.seek(start)
-                yield from _cut_chunk(file.read(min(end - start, MAX_RECORD)), reading)
+                try:
+                    records = _unpack_chunk(file.read(min(end - start, MAX_RECORD)), cut=True)
+                    yield from _records(records, reading)
+                except CorruptDataError as damaged:
+                    report.damage(f"nothing of the last chunk can be read: {damaged}")
                 return
             break
         at = start + size
@@ -161,18 +155,16 @@ def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
         at += size
 
 
-def _chunk_parts(data: bytes) -> tuple[int, int, str, int]:
-    """Return unpacked size, CRC and compression of a chunk, and the byte where its records start."""
+def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
+    """Return the records of a chunk, or with `cut` the readable part of the records."""
     try:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)
-        return size, crc, method, _CHUNK_HEAD.size + 4 + len(method.encode()) + 8
     except struct.error as error:
         raise CorruptDataError("it has no head") from error
-
-
-def _unpack_chunk(data: bytes) -> bytes:
-    size, crc, method, start = _chunk_parts(data)
+    start = _CHUNK_HEAD.size + 4 + len(method.encode()) + 8
+    if cut:
+        return unpack(data[start:], method, cut=True)
     end = start + int.from_bytes(data[start - 8 : start], "little")
     if end > len(data):
         raise CorruptDataError("its records are longer than the chunk")
@@ -182,16 +174,6 @@ def _unpack_chunk(data: bytes) -> bytes:
     if crc and zlib.crc32(records) != crc:
         raise CorruptDataError("its CRC is wrong")
     return records
-
-
-def _cut_chunk(data: bytes, reading: _Reading) -> Messages:
-    try:
-        _, _, method, start = _chunk_parts(data)
-        records = unpack(data[start:], method, cut=True)
-    except CorruptDataError as damaged:
-        reading.report.damage(f"nothing of the last chunk can be read: {damaged}")
-        return
-    yield from _records(records, reading)
 
 
 def _find_chunk(file: BinaryIO, at: int, end: int) -> int | None:

@@ -67,9 +67,7 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
 
     The metadata.yaml of a folder lists its files. Listed files that are missing or outside the folder are counted as drops.
     Without metadata.yaml, which a killed recorder does not write, the files of the folder may only differ in their number.
-
-    Raises:
-        LogError: no recording or several recordings are found.
+    Raises LogError for no recording or several recordings.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -92,10 +90,7 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
 def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport]) -> Messages:
     """Yield the messages of the wanted topics, file by file, and append a report on each file to `reports`.
 
-    An unreadable file is reported and skipped.
-
-    Raises:
-        LogError: no file can be read.
+    An unreadable file is reported and skipped. Raises LogError if no file can be read.
     """
     refused: list[LogError] = []
     for file in recording.files:

@@ -6,12 +6,8 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-MAX_RECORD = 256 << 20
-"""The size limit of a loaded record, chunk or message, packed or unpacked, bytes. It bounds the memory."""
-
-LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}
-"""The language of a message definition for each encoding name that bags use."""
-
+MAX_RECORD = 256 << 20  # The size limit of a record, chunk or message, packed or unpacked, bytes. It bounds the memory.
+LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}  # The definition language by its name in bags.
 MAX_NAME = 256  # The length limit of a topic or frame name, characters. It keeps messages readable.
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
@@ -110,10 +106,7 @@ def frame_name(frame_id: str) -> str:
 
 
 def type_name(name: str) -> str:
-    """Return a message type in ROS 2 form, such as nav_msgs/msg/Odometry for nav_msgs/Odometry.
-
-    A text that is not a type name is returned as `plain` text.
-    """
+    """Return a message type in ROS 2 form, such as nav_msgs/msg/Odometry. Other text is returned as `plain` text."""
     match = _TYPE.fullmatch(name)
     return f"{match[1]}/msg/{match[2]}" if match else plain(name)
 

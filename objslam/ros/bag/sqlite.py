@@ -21,10 +21,7 @@ def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
     """Yield the messages of the wanted topics of a database, in rowid order.
 
     Every whole row of a damaged file is read. The write-ahead log or rollback journal of a killed recorder is applied to a
-    temporary copy. The file itself is never changed.
-
-    Raises:
-        LogError: the database cannot be read, or has no tables of topics and messages.
+    temporary copy. The file itself is never changed. Raises LogError for other databases.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)

@@ -41,10 +41,8 @@ def missing_pages(path: Path) -> tuple[int, int]:
 def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
     """Yield the whole rows with rowids above `after` on all leaf pages of a file, in rowid order.
 
-    A leaf page does not name its table. A row therefore counts as a message if its columns have the right types and its
-    topic is in `topics`.
-
-    columns: the column numbers of topic id, time and message.
+    columns: the column numbers of topic id, time and message. A leaf page does not name its table. A row therefore counts
+    as a message if these columns have the right types and its topic is in `topics`.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         size = _page_size(data[:100])
@@ -95,7 +93,11 @@ def _read_row(
     size, at = _varint(data, at)
     _, at = _varint(data, at)  # The rowid.
     usable = page - data[20]
-    local = _local_size(size, usable)
+    local = size  # The bytes of the payload in the cell itself. The rest is on overflow pages.
+    if size > usable - 35:
+        least = (usable - 12) * 32 // 255 - 23
+        local = least + (size - least) % (usable - 4)
+        local = local if local <= usable - 35 else least
     if not 4 <= size <= MAX_RECORD or at + local > len(data):
         raise _CellError
     head, start = _varint(data, at)
@@ -119,15 +121,6 @@ def _read_row(
         return topic, stamp, b""
     payload = data[at : at + local] if local == size else _with_overflow(data, at, local, size, page, usable)
     return topic, stamp, payload[offsets[columns[2]] : offsets[columns[2] + 1]]
-
-
-def _local_size(size: int, usable: int) -> int:
-    """Return how many bytes of a payload are in the cell itself. The rest is on overflow pages."""
-    if size <= usable - 35:
-        return size
-    least = (usable - 12) * 32 // 255 - 23
-    local = least + (size - least) % (usable - 4)
-    return local if local <= usable - 35 else least
 
 
 def _column_size(kind: int) -> int:

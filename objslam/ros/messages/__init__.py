@@ -1,4 +1,1 @@
-"""Decode ROS messages and convert them to poses, boxes, cameras and images.
-
-The choice of topics is in the rooms above, and transforms over time are in `ros.tf`.
-"""
+"""Decode ROS messages and convert them to poses, boxes, cameras and images. Transforms over time are in `ros.tf`."""

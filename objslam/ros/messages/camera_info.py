@@ -28,19 +28,23 @@ _HINT = "--camera-info FILE can give the calibration"
 
 
 def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera, Floats]:
-    """Return the camera of a sensor_msgs/CameraInfo of ROS 1 or 2, and frame_T_camera (4, 4).
+    """Return the camera of a sensor_msgs/CameraInfo of ROS 1 or 2, and frame_T_camera (4, 4) in the header frame.
 
-    frame is the header frame, which is rectified. The camera frame of raw images is rotated against it by R, as in
-    image_geometry. Binning and region of interest are applied. Raises LogError if the camera is not calibrated or its
-    distortion model is unknown.
-
-    rectified: whether the images are rectified. Then the left 3x3 part of P is the camera matrix, without distortion.
-    Otherwise, K and D apply.
+    If `rectified`, the left 3x3 part of P is the camera matrix, without distortion. Otherwise, K and D apply, and the camera
+    is rotated by R against the header frame, which is rectified, as in image_geometry. Binning and region of interest are
+    applied. Raises LogError if the camera is not calibrated or its distortion model is unknown.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
     if rectified and not values.any() and not _values(info, "D").any():  # P is unset, and nothing is to rectify.
         values = _values(info, "K")
-    width, height, matrix = _image(info, values)
+    across, down = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    region = info.roi  # K and P are for the full image before region of interest and binning.
+    width, height = int(region.width or info.width) // across, int(region.height or info.height) // down
+    matrix = values.reshape(3, 3).copy()
+    matrix[0, 2] -= region.x_offset
+    matrix[1, 2] -= region.y_offset
+    matrix[0] /= across
+    matrix[1] /= down
     sane = (np.abs(matrix) < _MAX_FOCAL).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
     if not (sane and 0 < width < _MAX_PIXELS > height > 0):
         which = "P" if rectified else "K"
@@ -68,19 +72,6 @@ def camera_names(frames: Iterable[str]) -> list[str]:
 
 def _values(info: Any, name: str) -> Floats:
     return np.array(getattr(info, name if hasattr(info, name) else name.lower()), dtype=np.float64)
-
-
-def _image(info: Any, values: Floats) -> tuple[int, int, Floats]:
-    """Return width, height and camera matrix after region of interest and binning. K and P are for the full image."""
-    across, down = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
-    region = info.roi
-    width, height = int(region.width or info.width) // across, int(region.height or info.height) // down
-    matrix = values.reshape(3, 3).copy()
-    matrix[0, 2] -= region.x_offset
-    matrix[1, 2] -= region.y_offset
-    matrix[0] /= across
-    matrix[1] /= down
-    return width, height, matrix
 
 
 def _distortion(info: Any, topic: str) -> tuple[DistortionModel, Floats]:

@@ -85,10 +85,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 @lru_cache(maxsize=256)
 def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
-    """Return a type store for each known layout of a message type. The cache lets the files of a recording share them.
-
-    Raises DecodeError if no definition can be used.
-    """
+    """Return a cached type store for each known layout of a type. Raises DecodeError if no definition can be used."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
     texts: tuple[str, ...] = (definition,) if definition else definitions.KNOWN.get(name, ())

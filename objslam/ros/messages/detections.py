@@ -14,9 +14,7 @@ from objslam.core.geometry import pose_from_quaternion
 from objslam.core.types import MAX_BOXES as MAX_BOXES
 from objslam.ros.messages.topic_types import DETECTIONS
 
-WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)
-"""The errors that `find_boxes` raises for a message whose layout differs from its type."""
-
+WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)  # The errors of `find_boxes` for a wrong layout.
 _UNKNOWN = [math.nan] * 4
 
 
@@ -90,18 +88,16 @@ def tag_boxes(message: Any) -> Iterator[Found]:
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):
-            yield Found(_box_around(_corners(tag.corners)), f"tag_{int(tag.id)}", 1.0)
+            yield Found(_box_around(tag.corners), f"tag_{int(tag.id)}", 1.0)
         elif len(tag.id) == 1:
             yield Found(_UNKNOWN, f"tag_{int(tag.id[0])}", 1.0, points=_tag_points(tag.pose.pose.pose, float(tag.size[0])))
 
 
-def _corners(corners: Any) -> list[tuple[float, float]]:
-    if hasattr(corners[0], "x"):
-        return [(corner.x, corner.y) for corner in corners]
-    return [(float(corners[i]), float(corners[i + 1])) for i in range(0, 8, 2)]
-
-
-def _box_around(corners: list[tuple[float, float]]) -> list[float]:
+def _box_around(tag_corners: Any) -> list[float]:
+    if hasattr(tag_corners[0], "x"):
+        corners = [(corner.x, corner.y) for corner in tag_corners]
+    else:
+        corners = [(float(tag_corners[i]), float(tag_corners[i + 1])) for i in range(0, 8, 2)]
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
     ux, uy, vx, vy = cx - ax, cy - ay, dx - bx, dy - by
     cross = ux * vy - uy * vx

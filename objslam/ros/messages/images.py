@@ -30,10 +30,7 @@ _DEPTH_HEADER = 12  # The size of the header before the PNG in a compressed dept
 
 
 def colour_image(message: Any) -> NDArray[Any]:
-    """Return the pixels (H, W, 3), uint8, BGR, of a sensor_msgs/Image or CompressedImage.
-
-    Raises DecodeError if the message is malformed or contains depth.
-    """
+    """Return the pixels (H, W, 3), uint8, BGR, of an image message. Raises DecodeError for malformed data or depth."""
     if (packing := _packing(message)) is not None:
         if "compresseddepth" in packing:
             raise DecodeError(f"not a colour image but depth of the format {message.format[:40]!r}")
@@ -45,10 +42,7 @@ def colour_image(message: Any) -> NDArray[Any]:
 
 
 def depth_image(message: Any) -> NDArray[Any]:
-    """Return the depth (H, W), uint16, of a sensor_msgs/Image or CompressedImage.
-
-    The unit is 1 / `DEPTH_SCALE` m, and 0 means unknown. Raises DecodeError if the message is not a depth image.
-    """
+    """Return the depth (H, W), uint16, 1 / `DEPTH_SCALE` m, 0 if unknown. Raises DecodeError for other messages."""
     if (packing := _packing(message)) is None:
         return _depth_units(_pixels(message)[0])
     if "compresseddepth" in packing:
@@ -57,10 +51,9 @@ def depth_image(message: Any) -> NDArray[Any]:
 
 
 def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
-    """Return the file content and the file name suffix for a sensor_msgs/Image or CompressedImage.
+    """Return file content and file suffix of an image message. Raises DecodeError if the message is malformed.
 
-    JPEG and PNG data are not changed. Other images become PNG. Depth becomes a PNG of the array of `depth_image`. Raises
-    DecodeError if the message is malformed.
+    JPEG and PNG data are not changed. Other images become PNG. Depth becomes a PNG of the array of `depth_image`.
     """
     packing = _packing(message)
     if depth or "compresseddepth" in (packing or ""):

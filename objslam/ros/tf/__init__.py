@@ -1,4 +1,1 @@
-"""Look up transforms between named frames over time, in a tree for a recording and in a buffer for a live session.
-
-The decoding of transform messages is in `ros.messages`.
-"""
+"""Look up transforms between frames of a recording or a live session. `ros.messages` decodes the transform messages."""
