@@ -21,15 +21,11 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
 
 @dataclass(frozen=True)
 class FileSet:
-    """The names of files that are replaced together.
+    """The names of files that are replaced together."""
 
-    seal: the file that is deleted first and written last. others: all other names, including optional files. pattern: a
-    glob pattern for files whose names vary.
-    """
-
-    seal: str
-    others: tuple[str, ...]
-    pattern: str
+    seal: str  # The file that is deleted first and written last.
+    others: tuple[str, ...]  # All other names, including optional files.
+    pattern: str  # A glob pattern for files whose names vary.
 
     def names(self, folder: Path) -> tuple[str, ...]:
         """Return all names of the set, with the files in the folder that match the pattern. The seal is first."""
@@ -47,12 +43,10 @@ def try_folder(folder: Path, files: FileSet) -> None:
 def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Path], object]]) -> tuple[str, ...]:
     """Replace a set of files in a folder, and return the names of the deleted files without replacement.
 
-    New files are first written to a staging folder. Then all files of the old set are deleted. Then the new files are
-    renamed, the seal last. A killed process never leaves a half-written file or a mix of two sets. The seal exists only in
-    a complete set. Other files in the folder are not changed. Raises OutputError for a disk error, or if another run is
-    writing to the folder.
-
-    writers: the function that writes each file, by file name. Each name must be a name of the set.
+    `writers` has the function that writes each file, by file name. New files are first written to a staging folder. Then
+    all files of the old set are deleted. Then the new files are renamed, the seal last. A killed process therefore never
+    leaves a half-written file, a mix of two sets, or a seal in an incomplete set. Other files in the folder are not changed.
+    Raises OutputError for a disk error, or if another run is writing to the folder.
     """
     with disk_errors(folder), _staged(folder, files) as staging:
         for name, write in writers.items():
@@ -112,7 +106,9 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise OutputError("another run is writing here", where=str(folder), hint="name another with -o") from error
+            raise OutputError(
+                "another run is writing here", where=str(folder), hint="name another folder with -o"
+            ) from error
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 raise

@@ -43,10 +43,7 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """Return the detections without late frames and invalid boxes, and count the drops.
-
-        A frame is late if its timestamp repeats or goes back. A depth that is not above zero is counted and becomes unknown.
-        """
+        """Return the valid detections. Late frames, invalid boxes and depths that are not above zero are counted."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)

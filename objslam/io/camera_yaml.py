@@ -1,7 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes instead of Python objects. The nodes keep line numbers, and numbers such as 1e-05, which are text
-in YAML 1.1, stay numbers.
+The reader uses YAML nodes, which keep line numbers. Numbers such as 1e-05, which YAML 1.1 reads as text, stay numbers.
 """
 
 from __future__ import annotations
@@ -39,8 +38,6 @@ def read_camera(
 ) -> Camera:
     """Read a camera file. Raises LogError with the line of an invalid value.
 
-    camera_matrix and distortion_coefficients may be ROS mappings (rows, cols, data), flat lists or nested lists.
-
     name: the camera name. The default is camera_name in the file, or "camera". place_needed: whether base_T_camera is
     required. Otherwise, the default is the identity. depth_scale: the default of depth_scale in the file, units per metre.
     """
@@ -48,10 +45,7 @@ def read_camera(
 
 
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
-    """Read a file with one camera as for `read_camera`, or with several cameras by name under the key `cameras`.
-
-    The cameras may lack base_T_camera. Raises LogError with the line of an invalid value.
-    """
+    """Read one camera, or several cameras by name under the key `cameras`. Raises LogError with the line of an error."""
     top = _load(path, read_bytes(path), "the file")
     if _CAMERAS not in top:
         return (_read(path, top, ledger),)

@@ -24,8 +24,7 @@ class Malformed(ValueError):
 def read_detections(path: Path, ledger: Ledger) -> Detections:
     """Read a detections file: pixels of the raw image, timestamps in s, depths z along the optical axis in m.
 
-    Malformed lines, frames whose timestamp repeats or goes back, and invalid boxes are dropped and counted. The result is
-    `whole` if all frames are whole. Raises LogError if no frame is valid.
+    Malformed lines, late frames and invalid boxes are dropped and counted. Raises LogError if no frame is valid.
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)

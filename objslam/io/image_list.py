@@ -16,8 +16,7 @@ from objslam.io.text import drop_rows, in_order, parse_numbers, read_lines
 def read_images(path: Path, ledger: Ledger) -> Images:
     """Read an image list without opening the images. Raises LogError if no line is valid.
 
-    Malformed lines, timestamps that repeat or go back, missing files, and files outside the folder of the list (absolute
-    path, '..' or symbolic link) are dropped and counted.
+    Malformed lines, late timestamps, missing files and files outside the folder of the list are dropped and counted.
     """
     inside = Inside(path.parent)
     name = path.name

@@ -12,10 +12,7 @@ _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Return the stated width and height, px, of a PNG, JPEG, TIFF, WebP, GIF or BMP file, None for other formats.
-
-    Raises ValueError if the header is damaged or cut off.
-    """
+    """Return stated width and height, px, of an image file, None for an unknown format. Raises ValueError for damage."""
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:
@@ -26,7 +23,6 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
-    """Unpack two numbers."""
     first, second = struct.unpack_from(form, data, at)
     return first, second
 

@@ -1,4 +1,4 @@
-"""Decode compressed images (PNG, JPEG, TIFF, ...) to pixels, except images of excessive size.
+"""Decode compressed images (PNG, JPEG, TIFF, ...) to pixels, except images with more than `MAX_PIXELS` pixels.
 
 A PNG, JPEG or GIF file of some kB can state a size of gigabytes. The stated size is therefore checked first.
 """
@@ -16,20 +16,14 @@ MAX_PIXELS = 1 << 27  # The limit of pixels per image, more than any robot camer
 
 
 def decode_colour(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the pixels (H, W, 3), uint8, BGR, of an image file without EXIF rotation.
-
-    The result is None for data that are not an image, are damaged, or have more than `MAX_PIXELS` pixels.
-    """
+    """Return the pixels (H, W, 3), uint8, BGR, of an image file without EXIF rotation, None if it cannot be decoded."""
     import cv2
 
     return _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def decode_depth(data: bytes) -> NDArray[Any] | None:
-    """Return the pixels (H, W), or (H, W, C) with colours, of a depth image in units and type of the file.
-
-    The result is None for data that are not an image, are damaged, or have more than `MAX_PIXELS` pixels.
-    """
+    """Return the pixels (H, W) or (H, W, C) of a depth image in its own units and type, None if it cannot be decoded."""
     import cv2
 
     return _decode(data, cv2.IMREAD_UNCHANGED)

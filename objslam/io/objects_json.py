@@ -53,8 +53,7 @@ def parse_objects(data: dict[str, Any]) -> ObjectMap:
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
     """Read a ground truth file, an objects.json with at least id, label and position (m, in map) of each object.
 
-    The map of another run is also valid, without its unresolved objects, because their position is unknown. A malformed
-    file raises `error` with the file and the object.
+    Unresolved objects in the map of a run are skipped. A malformed file raises `error` with the file and the object.
     """
     try:
         data = _load(file)

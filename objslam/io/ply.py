@@ -11,17 +11,17 @@ from objslam.core.types import Surface
 
 def write_mesh(surface: Surface, file: Path) -> None:
     """Write vertices (m), colours and triangles. Raises OSError if the file cannot be written."""
-    _write(surface, file, normals=False, triangles=True)
+    _write(surface, file, triangles=True)
 
 
 def write_cloud(surface: Surface, file: Path) -> None:
     """Write vertices (m), normals and colours without triangles. Raises OSError if the file cannot be written."""
-    _write(surface, file, normals=True, triangles=False)
+    _write(surface, file, triangles=False)
 
 
-def _write(surface: Surface, file: Path, *, normals: bool, triangles: bool) -> None:
+def _write(surface: Surface, file: Path, *, triangles: bool) -> None:
     columns = {"x y z": surface.vertices.astype("<f4")}
-    if normals:
+    if not triangles:
         columns["nx ny nz"] = surface.normals.astype("<f4")
     if surface.colours is not None:
         columns["red green blue"] = surface.colours

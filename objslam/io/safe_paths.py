@@ -16,25 +16,23 @@ class Inside:
 
     def reason_against(self, path: Path) -> str | None:
         """Return the reason to reject a path below the folder, None if the path is valid."""
-        if not self._folder_inside(str(path.parent)):
+        folder = str(path.parent)
+        if folder not in self._folders:
+            self._folders[folder] = self._contains(folder)
+        if not self._folders[folder]:
             return "leaves the folder"
         try:
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode):
-                if not self._within(os.path.realpath(path)):
+                if not self._contains(path):
                     return "leaves the folder"
                 mode = path.stat().st_mode
         except (OSError, ValueError):  # A path with a NUL character raises ValueError.
             return "is missing"
         return None if stat.S_ISREG(mode) else "is not a regular file"
 
-    def _folder_inside(self, folder: str) -> bool:
-        if folder not in self._folders:
-            try:
-                self._folders[folder] = self._within(os.path.realpath(folder))
-            except (OSError, ValueError):
-                self._folders[folder] = False
-        return self._folders[folder]
-
-    def _within(self, real: str) -> bool:
-        return os.path.commonpath([self._root, real]) == self._root
+    def _contains(self, path: str | Path) -> bool:
+        try:
+            return os.path.commonpath([self._root, os.path.realpath(path)]) == self._root
+        except (OSError, ValueError):
+            return False

@@ -24,15 +24,11 @@ _MAX_UNPACKED = 1 << 30  # The size limit of an unpacked file, bytes, enough for
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers of a text file.
+    """Numbers of a text file."""
 
-    values: (N, C), finite. lines: (N,) line numbers, from 1. rows: (N,) row numbers, from 0. Malformed rows count in the
-    row numbers, so that equal rows of two files have equal numbers.
-    """
-
-    values: Floats
-    lines: Ints
-    rows: Ints
+    values: Floats  # (N, C), finite.
+    lines: Ints  # (N,) line numbers, from 1.
+    rows: Ints  # (N,) row numbers, from 0. Dropped rows count too, so that rows of several files can be matched by number.
 
 
 @contextmanager
@@ -103,7 +99,7 @@ def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
         values.append(numbers)
         places.append((line, row))
     table = Table(np.array(values).reshape(-1, columns), *np.array(places, dtype=np.int64).reshape(-1, 2).T)
-    finite = np.isfinite(table.values).all(axis=1)
+    finite = np.asarray(np.isfinite(table.values).all(axis=1))
     table = select(table, finite, f"{what} line with a value that is not finite", path, ledger)
     if not len(table.lines):
         state = f"none of its {len(numbered)} lines is usable" if numbered else "nothing in it"
@@ -127,7 +123,7 @@ def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) 
 
 def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
     """Count the rows that `bad` (N,) marks as drops for `reason`. `places` has the place of each row."""
-    rows = np.flatnonzero(bad)
+    rows = np.flatnonzero(bad).tolist()
     count_drops(reason, len(rows), (places[i] for i in rows), ledger)
 
 

@@ -18,8 +18,7 @@ _HEADER = "# stamp tx ty tz qx qy qz qw\n"
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
     """Read a trajectory file, also with suffix .gz, with timestamps in s, translations in m and quaternions x y z w.
 
-    Malformed lines, zero quaternions, and timestamps that repeat or go back are dropped and counted. Other quaternions are
-    normalised. Raises LogError if no pose is valid.
+    Malformed lines, zero quaternions and late timestamps are dropped and counted. Raises LogError if no pose is valid.
     """
     return to_trajectory(read_pose_table(path, ledger))
 

@@ -9,9 +9,7 @@ from itertools import takewhile
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError
 
-ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")
-"""The roles of topics in a bag."""
-
+ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
 TF, NONE = "tf", "none"  # The words in place of a topic: transforms supply the role, or nothing does.
 FROM_TF = ("odometry", "localization")  # The roles that transforms can supply.
 LISTED = 8  # The limit of topics listed in a message. It keeps the message readable.
@@ -29,10 +27,9 @@ class Choices:
 
 
 def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
-    """Parse the values of --topic. Raises ConfigError if a value is malformed or its role is unknown.
+    """Parse the values "role=/topic" of --topic, for a bag also "camera.role=/topic". Raises ConfigError for other values.
 
-    texts: each "role=/topic", or "camera.role=/topic" for a bag. live: whether the topics are of a live robot. A missing
-    "/" at the start of a live topic is added.
+    With `live`, a missing "/" at the start of a topic is added.
     """
     choices, roles = Choices(), (*ROLES, "tf", "tf_static") if live else ROLES
     for text in texts:

@@ -181,9 +181,8 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
 
 def _read_index(file: BinaryIO, end: int, reading: _Reading) -> None:
     """Read the connections and the expected number of messages from the index at the end of a closed bag."""
-    at = len(MAGIC)
-    file.seek(at)
-    record = _read_header(file, at, end)
+    file.seek(len(MAGIC))
+    record = _read_header(file, len(MAGIC), end)
     if record is None or record[0] != _BAG_HEADER:
         reading.report.damage("no bag header", 0)
         return

@@ -20,8 +20,7 @@ class CorruptDataError(ValueError):
 def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
     """Return the data unpacked by `method`, which is "" or "none", "bz2", "lz4" (frame format) or "zstd".
 
-    With `cut`, the data may end early, and the readable part is returned. Raises CorruptDataError if the data are broken,
-    the result exceeds `MAX_RECORD` bytes, or the method is unknown.
+    With `cut`, the readable part is enough. Raises CorruptDataError for broken data, an unknown method or excessive size.
     """
     if method in ("", "none"):
         return data

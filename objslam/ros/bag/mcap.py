@@ -1,7 +1,6 @@
 """MCAP files, read record by record from the front, so that neither index nor footer is needed.
 
-The format is documented at https://mcap.dev/spec. The summary at the end only supplies channels whose first description is
-lost and the expected number of messages.
+See https://mcap.dev/spec. The summary only supplies the message count and channels whose first description is lost.
 """
 
 from __future__ import annotations
@@ -40,10 +39,9 @@ class _Reading(Reading):
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the messages of the wanted channels of an MCAP file, in file order.
+    """Yield the wanted messages of an MCAP file, even damaged or unclosed, in file order. `report` lists missing parts.
 
-    The file may be unclosed, cut off or damaged. The last chunk of a cut-off file is read as far as it can be unpacked. A
-    chunk with a wrong CRC is skipped. `report` lists the missing parts.
+    A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC is skipped.
     """
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size

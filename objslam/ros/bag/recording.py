@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -130,11 +130,9 @@ def _bag_file(path: Path) -> BagFile | None:
         return BagFile(path, suffix, packed)
     if packed or suffix in (".db3-wal", ".db3-shm"):
         return None
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError:
-        return None
+    head = b""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(16)
     return next((BagFile(path, kind, False) for kind, (_, magic, _) in _FORMATS.items() if head.startswith(magic)), None)
 
 

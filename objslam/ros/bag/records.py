@@ -14,40 +14,30 @@ _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.AS
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic as one file describes it.
-
-    type: the message type in ROS 2 form, package/msg/Name. encoding: "ros1", "cdr", or another name from the file.
-    definition: the text of the message type in `language`, "msg" or "idl". It is empty if the file does not contain it.
-    """
+    """A topic as one file describes it."""
 
     topic: str
-    type: str
-    encoding: str
-    definition: str = ""
-    language: str = "msg"
+    type: str  # The message type in ROS 2 form, package/msg/Name.
+    encoding: str  # The encoding of messages: "ros1", "cdr", or another name from the file.
+    definition: str = ""  # The text of the message type, empty if the file does not contain it.
+    language: str = "msg"  # The language of the definition, "msg" or "idl".
 
 
 Messages = Iterator[tuple[Connection, int, bytes]]
 """Each message is a tuple of its connection, its recording time (ns) and the serialised bytes."""
-Wanted = Callable[[Connection], bool]
-"""The function returns whether the caller wants the messages of a connection."""
+Wanted = Callable[[Connection], bool]  # The function returns whether the caller wants the messages of a connection.
 
 
 @dataclass
 class FileReport:
-    """The result of reading one file.
-
-    messages: the number of messages read. lost: the number of messages known to be lost. expected: the message count that
-    the file states, None if unknown. complete: False if an unknown number of messages is lost. problems: one text per
-    kind of damage.
-    """
+    """The result of reading one file."""
 
     file: str
-    messages: int = 0
-    lost: int = 0
-    expected: int | None = None
-    complete: bool = True
-    problems: list[str] = field(default_factory=list)
+    messages: int = 0  # The number of messages read.
+    lost: int = 0  # The number of messages known to be lost.
+    expected: int | None = None  # The message count that the file states, None if unknown.
+    complete: bool = True  # False if an unknown number of messages is lost.
+    problems: list[str] = field(default_factory=list)  # One text per kind of damage.
 
     def damage(self, problem: str, lost: int | None = None) -> None:
         """Add a damaged place. `lost` is the number of messages lost there, None if unknown."""

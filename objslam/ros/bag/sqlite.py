@@ -6,7 +6,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,9 @@ MAGIC = b"SQLite format 3\0"
 
 
 def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the messages of the wanted topics of a database, in rowid order.
+    """Yield the messages of the wanted topics in rowid order. Raises LogError if the file is no database of messages.
 
-    Every whole row of a damaged file is read. The write-ahead log or rollback journal of a killed recorder is applied to a
-    temporary copy. The file itself is never changed. Raises LogError for other databases.
+    All whole rows of a damaged file are read. The journal of a killed recorder is applied to a temporary copy of the file.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)
@@ -37,8 +36,8 @@ def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 @contextmanager
 def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
     """Yield the file or its temporary copy, and the mode in which to open it. Only a killed recorder leaves siblings."""
-    siblings = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
-    siblings = [file for file in siblings if file.is_file() and file.stat().st_size]
+    names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
+    siblings = [file for file in names if file.is_file() and file.stat().st_size]
     if not siblings:
         yield path, "mode=ro&immutable=1"
         return
@@ -56,21 +55,17 @@ def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
 
 @contextmanager
 def _open(file: Path, mode: str, path: Path) -> Iterator[sqlite3.Connection]:
-    database = None
     try:
-        database = sqlite3.connect(f"{file.resolve().as_uri()}?{mode}", uri=True, isolation_level=None)
-        database.text_factory = lambda text: text.decode("utf-8", "replace")
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
-        database.execute("PRAGMA trusted_schema = OFF")
-        database.execute("PRAGMA writable_schema = ON")  # Needed to open a truncated file.
-        if mode == "mode=rw":
-            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        yield database
+        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{mode}", uri=True, isolation_level=None)) as database:
+            database.text_factory = lambda text: text.decode("utf-8", "replace")
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
+            database.execute("PRAGMA trusted_schema = OFF")
+            database.execute("PRAGMA writable_schema = ON")  # Needed to open a truncated file.
+            if mode == "mode=rw":
+                database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            yield database
     except sqlite3.Error as error:
         raise LogError(f"not a database that can be read: {error}", where=str(path)) from error
-    finally:
-        if database is not None:
-            database.close()
 
 
 def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connection]:

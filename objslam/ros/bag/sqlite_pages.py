@@ -15,9 +15,7 @@ import numpy as np
 
 from objslam.ros.bag.records import MAX_RECORD
 
-Row = tuple[int, int, int, bytes]
-"""Each row is a tuple of rowid, topic id, recording time (ns) and message."""
-
+Row = tuple[int, int, int, bytes]  # Each row is a tuple of rowid, topic id, recording time (ns) and message.
 _LEAF = 13  # The type byte of a table leaf page.
 _INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # The size of an integer by its serial type, bytes.
 _MAX_COLUMNS = 32  # The column limit of a messages table. A cell with more columns is not a message.
@@ -41,8 +39,7 @@ def missing_pages(path: Path) -> tuple[int, int]:
 def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
     """Yield the whole rows with rowids above `after` on all leaf pages of a file, in rowid order.
 
-    columns: the column numbers of topic id, time and message. A leaf page does not name its table. A row therefore counts
-    as a message if these columns have the right types and its topic is in `topics`.
+    A leaf page does not name its table. A row counts if its `columns` (topic id, time, message) and its topic are valid.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         size = _page_size(data[:100])
@@ -110,7 +107,8 @@ def _read_row(
         kinds.append(kind)
     if max(columns) >= len(kinds):
         raise _CellError
-    offsets = np.cumsum([head] + [_column_size(kind) for kind in kinds]).tolist()
+    sizes = [(kind - 12) // 2 if kind >= 12 else 8 if kind == 7 else _INTEGERS.get(kind, 0) for kind in kinds]
+    offsets = np.cumsum([head, *sizes]).tolist()
     if offsets[-1] != size:
         raise _CellError
     topic, stamp = (_integer(data, kinds[c], at + offsets[c], at + local) for c in columns[:2])
@@ -121,10 +119,6 @@ def _read_row(
         return topic, stamp, b""
     payload = data[at : at + local] if local == size else _with_overflow(data, at, local, size, page, usable)
     return topic, stamp, payload[offsets[columns[2]] : offsets[columns[2] + 1]]
-
-
-def _column_size(kind: int) -> int:
-    return (kind - 12) // 2 if kind >= 12 else 8 if kind == 7 else _INTEGERS.get(kind, 0)
 
 
 def _integer(data: mmap.mmap, kind: int, at: int, end: int) -> int:

@@ -11,13 +11,11 @@ from objslam.ros.bag.records import Connection
 from objslam.ros.messages import definitions
 
 if TYPE_CHECKING:
-    from rosbags.interfaces.typing import Typesdict
     from rosbags.typesys.store import Typestore
 
 _MAX_DEFINITION = 1 << 18  # The length limit of a definition, characters. It bounds the time of parsing.
 _MAX_TYPES, _MAX_FIELDS, _MAX_ELEMENTS = 200, 2000, 50_000
 """The limits of types, fields and array elements of a definition. They bound the size of the generated code."""
-
 _WRONG = (ValueError, LookupError, ArithmeticError, AssertionError, RecursionError, TypeError, AttributeError, struct.error)
 """The errors that the type library raises for malformed definitions and messages, besides its own errors."""
 
@@ -29,12 +27,11 @@ class DecodeError(ValueError):
 def read_head(data: bytes, encoding: str) -> tuple[int, str, int]:
     """Return timestamp (ns) and frame_id of a message that starts with a std_msgs/Header, and the next u32 number.
 
-    The number is the length of the array in an array message. It is 0 if the message ends before. Timestamp and frame_id
-    are at the same bytes in ROS 1 and CDR messages. Raises DecodeError if the message is shorter than its header.
+    The number is an array length, or 0 at the end of the message. Raises DecodeError if the header is cut off.
     """
     order = ">" if encoding == "cdr" and data[1:2] == b"\0" else "<"
     try:
-        seconds, nanoseconds, size = struct.unpack_from(order + "III", data, 4)
+        seconds, nanoseconds, size = struct.unpack_from(order + "III", data, 4)  # ROS 1 and CDR use the same bytes.
     except struct.error as error:
         raise DecodeError("shorter than a header") from error
     end = 16 + size
@@ -57,8 +54,7 @@ def read_length(data: bytes, encoding: str) -> int:
 def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
     """Return a function that decodes the messages of a connection and raises DecodeError for malformed messages.
 
-    The definition is from the file, or a known one if the file has none. With several known layouts of a type, the function
-    first tries the layout of the previous message. Raises DecodeError if no definition can be used.
+    Without a definition in the file, known definitions are tried. Raises DecodeError if no definition can be used.
     """
     name, encoding = connection.type, connection.encoding
     if encoding not in ("ros1", "cdr"):
@@ -86,6 +82,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 @lru_cache(maxsize=256)
 def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
     """Return a cached type store for each known layout of a type. Raises DecodeError if no definition can be used."""
+    from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
     texts: tuple[str, ...] = (definition,) if definition else definitions.KNOWN.get(name, ())
@@ -100,7 +97,10 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> tupl
             raise DecodeError("its definition is larger than any definition")
         try:
             types = get_types_from_idl(text) if language == "idl" else get_types_from_msg(text, name)
-            _check(types)
+            fields = [description for _, members in types.values() for _, description in members]
+            elements = sum(int(description[1][1]) for description in fields if description[0] == Nodetype.ARRAY)
+            if len(types) > _MAX_TYPES or len(fields) > _MAX_FIELDS or elements > _MAX_ELEMENTS:
+                raise ValueError("it is too large")
             store = get_typestore(Stores.EMPTY)
             store.register(types)
             store.get_msgdef(name)
@@ -109,13 +109,3 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> tupl
             raise DecodeError(f"its definition cannot be used ({reason})") from error
         stores.append(store)
     return tuple(stores)
-
-
-def _check(types: Typesdict) -> None:
-    """Reject oversized definitions. The type library generates a line of code per field and array element."""
-    from rosbags.interfaces import Nodetype
-
-    fields = [description for _, members in types.values() for _, description in members]
-    elements = sum(int(description[1][1]) for description in fields if description[0] == Nodetype.ARRAY)
-    if len(types) > _MAX_TYPES or len(fields) > _MAX_FIELDS or elements > _MAX_ELEMENTS:
-        raise ValueError("it is too large")

@@ -1,7 +1,6 @@
 """Message definitions that bags before ROS 2 Iron do not contain and that the type library does not know.
 
-The definitions follow the documentation of the packages. vision_msgs 3.x and 4.x have equal bytes. vision_msgs 2.x (Foxy)
-has additional image and tracking fields. ROS 1 bags always contain their definitions.
+The source is the documentation of the packages. vision_msgs 3.x and 4.x have equal bytes, and 2.x (Foxy) has more fields.
 """
 
 from __future__ import annotations

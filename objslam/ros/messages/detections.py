@@ -19,16 +19,13 @@ _UNKNOWN = [math.nan] * 4
 
 
 class Found(NamedTuple):
-    """One detection: box x1, y1, x2, y2 in px, label, score, and track name. Label and track may be empty.
+    """One detection."""
 
-    points: (5, 3), m, in the camera frame, the centre and corners of a tag without image corners. The box is then unknown.
-    """
-
-    box: list[float]
-    label: str
+    box: list[float]  # x1, y1, x2, y2, px, or NaN if only `points` is known.
+    label: str  # The label may be empty.
     score: float
-    track: str = ""
-    points: Floats | None = None
+    track: str = ""  # The track name may be empty.
+    points: Floats | None = None  # (5, 3) m, in the camera frame, centre and corners of a tag without image corners.
 
 
 def find_boxes(type_: str, message: Any) -> Iterator[Found]:
@@ -46,10 +43,7 @@ def track_number(name: str, tracks: dict[str, int]) -> int:
 
 
 def boxes_of_points(camera: Camera, points: Floats) -> Floats:
-    """Return boxes (M, 4), px of the raw image, around the points (M, 5, 3) of tags.
-
-    A box is centred on the projected tag centre. It is NaN if a point is outside the field of view of the lens.
-    """
+    """Return boxes (M, 4), raw px, centred on the first of tag points (M, 5, 3). Boxes outside the lens field are NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
@@ -83,8 +77,8 @@ def vision_boxes(message: Any) -> Iterator[Found]:
 def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
-    The box centre is the intersection of the tag diagonals, which is the projection of the tag centre. The box extends to
-    the furthest corner. Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
+    The box centre is the intersection of the tag diagonals, the projected tag centre. The box extends to the furthest corner.
+    Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):

@@ -12,9 +12,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion
 
-_MAX_VALUES = np.array([1e9] * 3 + [1e3] * 4)
-"""The limits of x, y, z (m) and qx, qy, qz, qw of a pose. A message with larger values counts as damaged."""
-
+_MAX_VALUES = np.array([1e9] * 3 + [1e3] * 4)  # The limits of x, y, z (m) and quaternion. Larger values count as damage.
 _SHORT = 1e-6  # The length limit below which a quaternion counts as zero. A valid quaternion has length 1.
 
 

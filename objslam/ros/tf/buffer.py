@@ -73,24 +73,20 @@ class _Edge:
 class TfBuffer:
     """The latest transforms of all frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame keeps its first parent until no transform from the first parent arrives for `MAX_GAP` s. A static transform
-    never replaces a moving transform.
+    A frame keeps its parent unless the parent is silent for `MAX_GAP` s. A static transform never replaces a moving one.
     """
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transform: Any, received: float, static: bool) -> str:
-        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is invalid.
-
-        received: the time, s, that replaces an unset timestamp.
-        """
+        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is invalid."""
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
         if pose is None:
             raise ValueError("transform that is no pose (not finite, or a zero quaternion)")
         time = transform.header.stamp
-        stamp = time.sec + time.nanosec * 1e-9 or received
+        stamp = time.sec + time.nanosec * 1e-9 or received  # The arrival time (s) replaces an unset timestamp.
         edge = self._edges.get(child)
         if edge is None and len(self._edges) >= MAX_TRANSFORMS:
             raise ValueError(f"transform beyond the first {MAX_TRANSFORMS} frames")

@@ -19,7 +19,6 @@ _WORLDS = {"map", "world"}
 
 
 def _leaf(frame: str) -> str:
-    """Return a frame name without its namespace."""
     return frame.rpartition("/")[2]
 
 

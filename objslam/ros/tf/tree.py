@@ -63,8 +63,8 @@ class _Edge:
 class TfTree:
     """The tree of frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame with several parents keeps the parent of most transforms, with a warning. Of transforms with equal timestamps,
-    the last is used. Methods raise LogError if two frames are not connected or the tree has a cycle.
+    A frame with several parents keeps the parent of most transforms. The last of transforms with equal timestamps is used.
+    Methods raise LogError if two frames are not connected or the tree has a cycle.
     """
 
     def __init__(self, rows: TfRows, ledger: Ledger) -> None:

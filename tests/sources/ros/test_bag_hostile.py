@@ -179,7 +179,7 @@ def test_rows_that_are_no_messages(tmp_path, makers):
     database.close()
     count, lines = _reports(folder / "drive.db3")
     assert count == 5
-    assert "rows that are no messages" in lines
+    assert "rows that are not messages" in lines
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
