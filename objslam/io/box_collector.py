@@ -64,7 +64,6 @@ class BoxCollector:
         wrong = ~np.isnan(depths) & ~((depths > 0) & np.isfinite(depths))
         drop_rows("depth of a box that is not above zero (taken as unknown)", good & wrong, self.box_places, ledger)
         depths[wrong] = np.nan
-
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(
             frame_stamps=stamps[forward],

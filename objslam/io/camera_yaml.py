@@ -98,9 +98,8 @@ def write_camera(camera: Camera, path: Path) -> None:
         "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": camera.distortion.tolist()},
         "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
         "depth_scale": float(camera.depth_scale),
+        **({} if camera.sees_size else {"sees_size": False}),
     }
-    if not camera.sees_size:
-        data["sees_size"] = False
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
     path.write_text(text, encoding="utf-8")
 

@@ -17,7 +17,6 @@ from objslam.core.types import TruthObject
 from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/1"  # The value of the key "format", which is the file type and its version.
-
 _T = TypeVar("_T")
 
 

@@ -29,9 +29,7 @@ _Fields = dict[bytes, bytes]
 
 @dataclass
 class _Reading(Reading):
-    """The state while a bag is read. `chunk_at` is the byte where the current chunk starts."""
-
-    chunk_at: int = 0
+    chunk_at: int = 0  # The byte where the current chunk starts.
 
     def next_chunk(self, at: int) -> None:
         """Report the damage of the current chunk and start the chunk at byte `at`."""
@@ -160,8 +158,7 @@ def _find_record(stream: BinaryIO, at: int, end: int) -> int | None:
             for start in range(match.start() - 4, max(match.start() - _MAX_SEARCHED_HEADER, -1), -1):
                 (size,) = _U32.unpack_from(block, start)
                 if match.end() - start - 4 <= size <= _MAX_SEARCHED_HEADER and start + 4 + size <= len(block):
-                    fields = _parse_fields(block[start + 4 : start + 4 + size])
-                    if fields is not None and b"op" in fields:
+                    if b"op" in (_parse_fields(block[start + 4 : start + 4 + size]) or {}):
                         return at + start
         at += _BLOCK
     return None

@@ -33,9 +33,7 @@ _LATEST = 2**63 - 1  # The largest recording time that a signed 64-bit integer h
 
 @dataclass
 class _Reading(Reading):
-    """The state while a file is read. `schemas` has name, language and definition by schema number."""
-
-    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)
+    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)  # Name, language and definition by number.
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:

@@ -57,9 +57,7 @@ class Recording:
 
 def is_bag(path: Path) -> bool:
     """Return whether the path is a bag file, or a folder that contains a bag file."""
-    if path.is_dir():
-        return any(_bag_file(file) for file in path.iterdir())
-    return _bag_file(path) is not None
+    return any(_bag_file(file) for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:

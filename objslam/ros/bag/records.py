@@ -23,8 +23,7 @@ class Connection:
     language: str = "msg"  # The language of the definition, "msg" or "idl".
 
 
-Messages = Iterator[tuple[Connection, int, bytes]]
-"""Each message is a tuple of its connection, its recording time (ns) and the serialised bytes."""
+Messages = Iterator[tuple[Connection, int, bytes]]  # Each tuple has connection, recording time (ns) and message bytes.
 Wanted = Callable[[Connection], bool]  # The function returns whether the caller wants the messages of a connection.
 
 
@@ -59,10 +58,8 @@ class FileReport:
         if not self.problems and not self.lost:
             return []
         known = f"at least {self.lost}" if self.lost else "an unknown number"
-        lost = f"{self.lost if self.complete else known} lost"
-        return [
-            f"{self.file}: damaged, {self.messages} messages read, {lost}: {'; '.join(self.problems) or 'no reason seen'}"
-        ]
+        why = "; ".join(self.problems) or "no reason seen"
+        return [f"{self.file}: damaged, {self.messages} messages read, {self.lost if self.complete else known} lost: {why}"]
 
 
 @dataclass

@@ -55,8 +55,8 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
     rotation = _values(info, "R").reshape(3, 3)
     turned = (np.abs(rotation) < 1.01).all() and np.linalg.det(rotation) > 0
     turned = turned and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
-    frame_T_camera = make_pose(rotation if turned else np.eye(3), np.zeros(3))
-    return Camera(name, width, height, matrix, model, distortion), frame_T_camera
+    camera = Camera(name, width, height, matrix, model, distortion)
+    return camera, make_pose(rotation if turned else np.eye(3), np.zeros(3))
 
 
 def camera_names(frames: Iterable[str]) -> list[str]:

@@ -44,7 +44,6 @@ def _array(element: str, fields: str, types: dict[str, str] = _TYPES) -> str:
 
 VISION_MSGS_3D = _array("vision_msgs/Detection3D", _RESULTS + "BoundingBox3D bbox\nstring id\n")
 """The definition of Detection3DArray in vision_msgs 4.x, which the export of maps writes."""
-
 KNOWN: dict[str, tuple[str, ...]] = {
     "vision_msgs/msg/Detection2DArray": (
         _array("vision_msgs/Detection2D", _RESULTS + "BoundingBox2D bbox\nstring id\n"),

@@ -77,7 +77,7 @@ def vision_boxes(message: Any) -> Iterator[Found]:
 def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
-    The box centre is the intersection of the tag diagonals, the projected tag centre. The box extends to the furthest corner.
+    The box centre is the intersection of the tag diagonals. The box extends to the furthest corner.
     Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:

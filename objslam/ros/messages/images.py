@@ -78,7 +78,6 @@ def _packing(message: Any) -> str | None:
 
 
 def _colours(message: Any) -> NDArray[Any]:
-    """Return the pixels of a sensor_msgs/Image, grey or BGR, with 8 or 16 bits."""
     image, conversion = _pixels(message)
     if image.dtype == np.float32:
         raise DecodeError("its pixels are floats, which a colour image cannot have")
