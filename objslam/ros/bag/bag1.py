@@ -157,9 +157,9 @@ def _find_record(stream: BinaryIO, at: int, end: int) -> int | None:
         for match in _OP_FIELD.finditer(block):
             for start in range(match.start() - 4, max(match.start() - _MAX_SEARCHED_HEADER, -1), -1):
                 (size,) = _U32.unpack_from(block, start)
-                if match.end() - start - 4 <= size <= _MAX_SEARCHED_HEADER and start + 4 + size <= len(block):
-                    if b"op" in (_parse_fields(block[start + 4 : start + 4 + size]) or {}):
-                        return at + start
+                fits = match.end() - start - 4 <= size <= _MAX_SEARCHED_HEADER and start + 4 + size <= len(block)
+                if fits and b"op" in (_parse_fields(block[start + 4 : start + 4 + size]) or {}):
+                    return at + start
         at += _BLOCK
     return None
 
