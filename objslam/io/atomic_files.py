@@ -112,7 +112,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 raise
-        if staging.exists():  # A killed run left it, because the lock is free.
+        if staging.exists():  # A killed run left the folder, because the lock is free.
             if is_cut_short(folder, files):
                 for name in files.names(folder):
                     (folder / name).unlink(missing_ok=True)

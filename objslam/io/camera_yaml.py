@@ -21,7 +21,7 @@ from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
 _CAMERAS = "cameras"
-_MAX_SIDE = 1 << 16  # The limit of width and height, px.
+_MAX_SIDE = 1 << 16  # The limit of width and height, px. A larger image counts as an error in the file.
 _Mapping = dict[str, yaml.Node]
 
 
@@ -132,7 +132,7 @@ def _mapping(path: Path, node: yaml.Node, what: str) -> _Mapping:
     result: _Mapping = {}
     for key, value in node.value:
         if not isinstance(key, yaml.ScalarNode) or key.value in result:
-            raise _error(path, key, f"a key of {what} is there twice, or is not a word")
+            raise _error(path, key, f"a key of {what} occurs twice or is not a word")
         result[key.value] = value
     return result
 

@@ -119,7 +119,7 @@ def read_numbers(value: Any, name: str) -> list[float]:
     try:
         return [float(item) for item in value]
     except OverflowError as error:
-        raise Malformed(f"{name} holds an integer beyond every float") from error
+        raise Malformed(f"{name} holds an integer beyond the range of floats") from error
 
 
 def _depth(value: Any) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from objslam.io.image_size import stated_size
 
-MAX_PIXELS = 1 << 27  # The limit of pixels per image, more than any robot camera has. It bounds the memory.
+MAX_PIXELS = 1 << 27  # The limit of pixels per image, more than any robot camera has. The limit bounds memory.
 
 
 def decode_colour(data: bytes) -> NDArray[np.uint8] | None:

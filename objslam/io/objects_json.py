@@ -104,7 +104,7 @@ def _load(file: Path) -> dict[str, Any]:
     except OSError as error:
         raise _Malformed(f"cannot read the objects: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise _Malformed(f"not text in UTF-8 (byte {error.start})") from error
+        raise _Malformed(f"not UTF-8 text (byte {error.start})") from error
     except json.JSONDecodeError as error:
         raise _Malformed(f"not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
     except (ValueError, RecursionError) as error:  # An integer has thousands of digits, or brackets are deeply nested.
@@ -123,7 +123,7 @@ def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[
                 raise _Malformed("not a mapping")
             number = _integer(entry, "id")
             if number in seen:
-                raise _Malformed(f"id {number} is there twice")
+                raise _Malformed(f"id {number} occurs twice")
             seen.add(number)
             parsed.append(parse(entry))
         except _Malformed as malformed:

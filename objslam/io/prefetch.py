@@ -9,7 +9,7 @@ from typing import TypeVar
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
-_THREADS = 2  # The number of threads. One is too few, because decoding a PNG takes longer than a network on a GPU.
+_THREADS = 2  # The number of threads. A single thread decodes PNG images slower than a network on a GPU runs.
 
 
 def ahead(work: Callable[[_In], _Out], items: Iterable[_In], depth: int) -> Iterator[_Out]:

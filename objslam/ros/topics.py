@@ -12,7 +12,7 @@ from objslam.errors import ConfigError
 ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
 TF, NONE = "tf", "none"  # The words in place of a topic: transforms supply the role, or nothing does.
 FROM_TF = ("odometry", "localization")  # The roles that transforms can supply.
-LISTED = 8  # The limit of topics listed in a message. It keeps the message readable.
+LISTED = 8  # The limit of topics listed in a message. The limit keeps the message readable.
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ _FORMATS = {
     ".db3": ("ROS 2 sqlite3", sqlite.MAGIC, sqlite.read_sqlite),
 }
 _METADATA = "metadata.yaml"
-_MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. It bounds the memory.
-_MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. It bounds the disk space.
+_MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
+_MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
 _MAX_RATIO = 1000  # The limit of the ratio of unpacked to packed file size. No recording compresses further.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 

@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-MAX_RECORD = 256 << 20  # The size limit of a record, chunk or message, packed or unpacked, bytes. It bounds the memory.
+MAX_RECORD = 256 << 20  # The size limit of a record, chunk or message, packed or unpacked, bytes. The limit bounds memory.
 LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}  # The definition language by its name in bags.
-MAX_NAME = 256  # The length limit of a topic or frame name, characters. It keeps messages readable.
+MAX_NAME = 256  # The length limit of a topic or frame name, characters. The limit keeps messages readable.
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
 

@@ -108,4 +108,4 @@ def _rows(
         yield row
         last, found = row[0], found + 1
     if last - first > found:
-        report.damage("rows between others are gone", last - first - found)
+        report.damage("rows between other rows are missing", last - first - found)

@@ -13,9 +13,9 @@ from objslam.ros.messages import definitions
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_MAX_DEFINITION = 1 << 18  # The length limit of a definition, characters. It bounds the time of parsing.
+_MAX_DEFINITION = 1 << 18  # The length limit of a definition, characters. The limit bounds the parsing time.
 _MAX_TYPES, _MAX_FIELDS, _MAX_ELEMENTS = 200, 2000, 50_000
-"""The limits of types, fields and array elements of a definition. They bound the size of the generated code."""
+"""The limits of types, fields and array elements of a definition. The limits bound the size of the generated code."""
 _WRONG = (ValueError, LookupError, ArithmeticError, AssertionError, RecursionError, TypeError, AttributeError, struct.error)
 """The errors that the type library raises for malformed definitions and messages, besides its own errors."""
 
@@ -89,12 +89,12 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> tupl
     if not texts:
         known = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
         if name not in known.fielddefs:
-            raise DecodeError("the bag does not bring the type's definition")
+            raise DecodeError("the bag lacks the definition of the type")
         return (known,)
     stores = []
     for text in texts:
         if len(text) > _MAX_DEFINITION:
-            raise DecodeError("its definition is larger than any definition")
+            raise DecodeError("its definition is too long")
         try:
             types = get_types_from_idl(text) if language == "idl" else get_types_from_msg(text, name)
             fields = [description for _, members in types.values() for _, description in members]

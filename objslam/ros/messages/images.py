@@ -95,7 +95,7 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str | None]:
     step = int(message.step) or row
     sane = 0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE and step >= row
     if not sane or len(message.data) < step * (height - 1) + row:
-        raise DecodeError(f"it says {width} x {height} pixels and has {len(message.data)} bytes")
+        raise DecodeError(f"its {len(message.data)} bytes do not fit its size of {width} x {height} pixels")
     rows = np.lib.stride_tricks.as_strided(np.asarray(message.data, dtype=np.uint8), (height, row), (step, 1))
     image: NDArray[Any] = np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
     image = image.astype(dtype).reshape(height, width, channels) if channels > 1 else image.astype(dtype)

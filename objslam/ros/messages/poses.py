@@ -39,7 +39,7 @@ class PoseRows:
         good = _are_poses(values)
         stamps = choose_times(self.stamps, self.logged) / 1e9
         where = None if good.all() else f"stamp {stamps[~good][0]:.3f}"
-        ledger.drop(f"{what} whose pose is none (not finite, or a zero quaternion)", int((~good).sum()), where)
+        ledger.drop(f"{what} whose pose is invalid (not finite, or a zero quaternion)", int((~good).sum()), where)
         return stamps[good], pose_from_quaternion(values[good, :3], values[good, 3:])
 
 

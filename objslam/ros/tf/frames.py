@@ -11,8 +11,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.ros.bag.records import frame_name
 
-MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. It bounds the memory.
-MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. It equals the default buffer length of tf2.
+MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. The limit bounds memory.
+MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. tf2 has the same default buffer length.
 _STILL = 1e-9  # The largest change of a pose element of a static frame, far below the resolution of any sensor.
 BASES = ("base_footprint", "base_link")  # The base frames of a robot (REP 105) without namespaces, by priority.
 _WORLDS = {"map", "world"}

@@ -17,7 +17,7 @@ from objslam.errors import LogError
 from objslam.ros.messages.poses import PoseRows
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
 
-_NAMED = 6  # The limit of frames listed in a message. It keeps the message readable.
+_NAMED = 6  # The limit of frames listed in a message. The limit keeps the message readable.
 
 
 @dataclass
