@@ -332,7 +332,7 @@ def test_a_calibration_file_without_a_place_leaves_that_to_tf(makers, tmp_path):
         ("/odom", "neither odometry nor localisation"),
         ("/front/camera_info", "no CameraInfo belongs to this camera"),
         ("/front/detections", "no camera: the recording has no images and no detections"),
-        ("/tf_static", r"'base_link' is in no transform; 'front_optical_frame' is in no transform.*was /tf_static recorded"),
+        ("/tf_static", r"'base_link' is in no transform; 'front_optical_frame' is in no transform.*record /tf_static"),
     ],
 )
 def test_what_is_missing_is_named(bag, tmp_path, without, message):
