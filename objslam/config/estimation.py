@@ -6,71 +6,71 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from objslam.config.section import Device, NotNegative, Positive, Section
+from objslam.config.section import Count, Device, NotNegative, Positive, Section, Share
 
 Loss = Literal["l1", "huber", "cauchy", "gnc"]
 
 
 class AssociationSettings(Section):
-    """Which ray belongs to which object."""
+    """Configure how rays are associated with objects."""
 
     method: Literal["auto", "global", "by_label"] = "auto"
-    """by_label: every label is one object. global: several objects may share a label. auto: by_label where no frame has two
-    boxes of one label and hardly a ray disagrees with the one object, else global."""
+    """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label if
+    no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """points from pairs of rays that are tried at a time for each label; more finds rare objects and takes longer."""
+    """Number of points from ray pairs tested per label in one pass. A larger value finds rarer objects and takes longer."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
-    """share of an object's own boxes that pass the gate on how far a ray misses it; larger lets in more wrong boxes."""
-    min_existence: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """probability of existence, from where an object was detected and where not, below which it is dropped."""
+    """Share of an object's own boxes that pass the gate on the residual of a ray. A larger value accepts more wrong boxes."""
+    min_existence: Share = 0.5
+    """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
     min_rays: Annotated[int, Field(ge=2)] = 3
-    """rays that an object has at the least; two rays of different things often meet. While poses are not settled yet, one or
-    two more are asked for. Larger finds fewer and surer objects."""
+    """Minimum number of rays of an object, because two rays of different things often intersect. One or two more rays are
+    needed while the poses have not converged. A larger value finds fewer and more certain objects."""
     duplicate_distance: Positive = 1.0
-    """m; two objects of a label that are further apart are never one. Larger lets a drifted path merge more."""
+    """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
     loop_evidence: Positive = 7.0
-    """log odds that landmarks here are those of a place seen before, below which no loop is closed. Larger closes fewer."""
+    """Minimum log odds that current landmarks match those of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """log odds of that place over the best other one, below which no loop is closed. Larger tells lookalikes apart."""
+    """Minimum lead in log odds of the best place over the second best to close a loop. A larger value separates similar places."""
     fuse_labels: bool = True
-    """objects of different labels that are one thing become one object with several labels."""
+    """Merge objects of different labels that are the same thing into one object with several labels."""
 
 
 class Triangulation(Section):
-    """Objects from rays with known poses."""
+    """Configure the triangulation of objects from rays with known poses."""
 
     device: Device = "auto"
     consensus: bool = True
-    """start from the best agreement of ray pairs, so that outliers do not move an object."""
-    hypotheses: Annotated[int, Field(ge=1)] = 256
-    """ray pairs tried for each object."""
+    """Start from the point with the largest consensus of ray pairs, so that outliers do not shift an object."""
+    hypotheses: Count = 256
+    """Number of ray pairs tested per object."""
     min_parallax_deg: NotNegative = 3.0
-    """an object whose rays span less is unresolved."""
+    """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
     max_rel_sigma: Positive = 0.5
-    """an object whose position is less certain than this share of its distance is unresolved."""
+    """Maximum standard deviation of a position as a share of the distance. A less certain object is unresolved."""
 
 
 class Fixed(Section):
-    """Objects with the poses as they are."""
+    """Configure the estimation of objects with fixed poses."""
 
     loss: Loss = "l1"
 
 
 class Joint(Section):
-    """Poses and objects together."""
+    """Configure the joint estimation of poses and objects."""
 
     loss: Loss = "huber"
     factor: Literal["bearing", "point_to_line"] = "bearing"
-    """point_to_line is Eq. 1; with free poses it shrinks the map, since a smaller world has smaller distances."""
+    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because distances shrink with the scale."""
     min_parallax_deg: NotNegative = 8.0
-    """a landmark enters the growing graph once its rays span this much."""
+    """Minimum parallax in degrees between its rays before a landmark enters the growing graph."""
     prior_sigma: Positive = 20.0
-    """m; a weak prior on each landmark that keeps the graph determined."""
+    """Standard deviation in m of a weak prior on each landmark. The prior keeps the graph determined."""
     grow_step: Annotated[int, Field(ge=2)] = 60
-    """keyframes added at a time when there is odometry alone."""
-    explore_step: Annotated[int, Field(ge=1)] = 10
-    """keyframes added at a time while it is not known which ray belongs to which object; places are recognised from
-    predictions, which are good over a short way only."""
-    max_rounds: Annotated[int, Field(ge=1)] = 6
-    """rounds of association and solve at the most; they end earlier when no ray changes its object."""
-    max_iterations: Annotated[int, Field(ge=1)] = 100
+    """Number of keyframes added per step if the log has odometry only."""
+    explore_step: Count = 10
+    """Number of keyframes added per step while the association is unknown. Places are recognised from predicted poses, and
+    predictions are accurate over short distances only."""
+    max_rounds: Count = 6
+    """Maximum number of rounds of association and solving. The rounds stop early if no ray changes its object."""
+    max_iterations: Count = 100

@@ -1,4 +1,4 @@
-"""The settings of what is measured: poses, bearings, depths, odometry, localisation."""
+"""The settings of the measurements: poses, bearings, depths, odometry, localisation."""
 
 from __future__ import annotations
 
@@ -6,80 +6,83 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from objslam.config.section import NotNegative, Positive, Section
+from objslam.config.section import Finite, NotNegative, Positive, Section
 
 
 class Poses(Section):
-    """How poses are read off the log."""
+    """Configure which poses of a log are used."""
 
     use: Literal["auto", "odometry", "localization"] = "auto"
-    """which poses of a log that has both: auto takes the localisation, and in joint mode the odometry between its poses."""
+    """Poses to use if a log has odometry and localisation. auto uses the localisation. In joint mode, auto also uses the
+    odometry between the localised poses."""
     max_gap: Positive = 1.1
-    """s; a frame in a longer gap of the path is dropped and counted."""
+    """Maximum gap of the path in s. A frame in a longer gap is dropped and counted."""
 
 
 class RayNoise(Section):
-    """From boxes to rays."""
+    """Configure how boxes become rays."""
 
     pixel_sigma: Positive = 3.0
-    """px; one standard deviation of a box centre, per axis."""
+    """Standard deviation of a box centre per axis in px."""
     box_sigma: NotNegative = 0.05
-    """share of a box's size (geometric mean of width and height) that is added, in squares, to the noise of its centre."""
+    """Standard deviation of a box centre as a share of the box size, which is the geometric mean of width and height. It is
+    added in quadrature to pixel_sigma."""
     min_score: NotNegative = 0.0
-    """boxes with a lower score are dropped and counted."""
-    border: Annotated[float, Field(allow_inf_nan=False)] = 1.0
-    """px; a box that comes this close to the image's edge is cut off there, its centre is not the object's: dropped and
-    counted. A negative number keeps such boxes."""
+    """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
+    border: Finite = 1.0
+    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object, so
+    the box is dropped and counted. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
-    """share of a box's own width or height that counts as close to the edge as well: detectors let cut boxes end short of
-    it."""
+    """Distance from the image edge as a share of the box width or height within which a box also counts as cut off. Detectors
+    often end a cut box short of the edge."""
 
 
 class Depth(Section):
-    """The optional depth at a box, used as a range along its ray."""
+    """Configure the depth at a box. The depth is optional and is used as a range along the ray of the box."""
 
     use: bool = True
     sigma: Positive = 0.03
-    """m; the part of the noise that does not depend on the distance."""
+    """Constant part of the range noise in m."""
     sigma_per_m: NotNegative = 0.02
-    """m per m; the part of the noise that grows with the distance."""
+    """Part of the range noise that grows with the distance, in m per m."""
     bias: NotNegative = 0.05
-    """m; the error that all ranges of one object share, because they end on its surface or are calibrated a little long.
-    More ranges do not average it out."""
+    """Standard deviation in m of the error shared by all ranges of one object. Ranges end on the surface of the object, or have
+    a calibration error. Averaging does not reduce this error."""
 
 
 class Odometry(Section):
-    """How far odometry drifts: standard deviations that grow with the square root of the way (a random walk)."""
+    """Configure the drift of odometry. It is a random walk: the standard deviations grow with the square root of the motion."""
 
     x_per_m: NotNegative = 0.02
-    """m along the drive after 1 m of it."""
+    """Standard deviation along the driving direction in m after 1 m of driving."""
     y_per_m: NotNegative = 0.005
-    """m sideways after 1 m; wheels hardly slip sideways, an omnidirectional base may need as much as for x."""
+    """Sideways standard deviation in m after 1 m of driving. Wheels slip little sideways. An omnidirectional base may need the
+    value of x_per_m."""
     xy_per_rad: NotNegative = 0.005
-    """m after turning 1 rad on the spot."""
+    """Standard deviation of the position in m after 1 rad of turning in place."""
     yaw_per_m: NotNegative = 0.02
-    """rad after 1 m of driving."""
+    """Standard deviation of the heading in rad after 1 m of driving."""
     yaw_per_rad: NotNegative = 0.05
-    """rad after turning 1 rad."""
+    """Standard deviation of the heading in rad after 1 rad of turning."""
     floor_xy: Positive = 1e-3
-    """m for each step between keyframes; the noise that remains when the robot stands."""
+    """Minimum standard deviation of the position in m per keyframe step. It applies to a robot at rest too."""
     floor_yaw: Positive = 1e-3
-    """rad for each step between keyframes; likewise."""
+    """Minimum standard deviation of the heading in rad per keyframe step. It applies to a robot at rest too."""
 
 
 class Planar(Section):
-    """How planar a planar path is, for each step; a real floor is not perfect."""
+    """Configure the deviation of each step from a planar path, because a real floor is not perfectly flat."""
 
     z: Positive = 1e-3
-    """m; one standard deviation of the height."""
+    """Standard deviation of the height in m."""
     tilt: Positive = 1e-3
-    """rad; one standard deviation of roll and of pitch."""
+    """Standard deviation of roll and of pitch in rad."""
 
 
 class Localization(Section):
-    """How good absolute poses are (standard deviation of each pose)."""
+    """Configure the accuracy of absolute poses."""
 
     xy: Positive = 0.02
-    """m; of x and of y."""
+    """Standard deviation of x and of y in m."""
     yaw: Positive = 0.005
-    """rad; of the heading."""
+    """Standard deviation of the heading in rad."""

@@ -1,4 +1,4 @@
-"""The settings of what a run writes: the surface of the room, the recording, the picture."""
+"""The settings of the outputs of a run: surface reconstruction, recording and picture."""
 
 from __future__ import annotations
 
@@ -6,42 +6,42 @@ from typing import Annotated
 
 from pydantic import Field
 
-from objslam.config.section import Device, Positive, Section
+from objslam.config.section import Count, Device, Positive, Section
 
 
 class Reconstruction(Section):
-    """The surface of the room, from depth images fused at the solved poses."""
+    """Configure the surface of the room, which is fused from depth images at the estimated poses."""
 
     use: bool = True
-    """whether there is one where the log has depth images."""
+    """Reconstruct the surface if the log has depth images."""
     before: bool = False
-    """also one at the poses as the log brought them, to compare."""
+    """Also reconstruct the surface at the poses of the log, for comparison."""
     cloud: bool = False
-    """also its points alone, with normals, in a file of their own."""
+    """Also write the points of the surface with normals to a separate file."""
     device: Device = "auto"
     voxel: Positive = 0.02
-    """m; the size of a voxel."""
+    """Edge length of a voxel in m."""
     truncation: Positive = 0.06
-    """m; distance from a surface within which depths are averaged: more than their error, less than things are thick, and at
-    least 2 voxels."""
+    """Distance in m from a surface within which depths are averaged. It must exceed the depth error, be below the thickness of
+    things, and be at least 2 voxels."""
     max_depth: Positive = 4.0
-    """m; depths beyond it are not used."""
-    min_views: Annotated[int, Field(ge=1)] = 3
-    """depth images that must have seen a surface before it counts."""
-    stride: Annotated[int, Field(ge=1)] = 1
-    """one depth image in this many is used."""
+    """Maximum depth in m. Larger depths are ignored."""
+    min_views: Count = 3
+    """Minimum number of depth images that show a surface before the surface is kept."""
+    stride: Count = 1
+    """Step between the depth images that are used. 1 uses every depth image."""
     max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
-    """depth images at the most; of more, some are left out evenly."""
+    """Maximum number of depth images. Above it, some images are skipped evenly."""
     max_blocks: Annotated[int, Field(ge=2048)] = 80_000
-    """blocks of 6^3 voxels that the grid grows to at the most, at 4.3 kB each."""
+    """Maximum number of blocks of 6^3 voxels in the grid. A block takes 4.3 kB."""
 
 
 class Output(Section):
-    """What a run writes."""
+    """Configure the files that a run writes."""
 
     recording: bool = True
     images: Annotated[int, Field(ge=0)] = 1000
-    """images of each camera in the recording at the most, evenly spread; 0: none."""
+    """Maximum number of images of each camera in the recording, evenly spread. 0 records no images."""
     image_width: Annotated[int, Field(ge=16)] = 480
-    """px; in the recording wider images are made smaller, by a whole number."""
+    """Maximum width in px of an image in the recording. A wider image is reduced by an integer factor."""
     picture: bool = True
