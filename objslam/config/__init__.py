@@ -1,6 +1,5 @@
-"""The settings: nested sections with a default for every value, changed by YAML files and `--set key=value`.
-A value that describes objects, rooms or robots is a setting, and a value that only a method needs is a constant in the code.
-"""
+"""The settings: nested sections with a default for every value, changed by YAML files and `--set key=value`. A value that
+describes objects, rooms or robots is a setting, and a value that only a method needs is a constant in the code."""
 
 from objslam.config.detector import Activation, BoxForm, BoxUnits, Colour, Detector, Layout, Resize, Role
 from objslam.config.estimation import AssociationSettings, Fixed, Joint, Loss, Triangulation

@@ -24,14 +24,14 @@ class Detector(Section):
     """
 
     layout: Layout | None = None
-    """Layout of the outputs. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow). In ssd, one output may hold boxes and
-    scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score, class
-    (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
+    """Layout of the outputs. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow). In ssd, one output may hold boxes
+    and scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score,
+    class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
     outputs: dict[Role, str] | None = None
     """Output name of each role. ssd has boxes, labels, scores. detr has boxes, logits. Other layouts have predictions."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
-    """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has one
-    name per line, or is YAML with the key `names`. It lies beside the settings file or beside the model."""
+    """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
+    one name per line, or is YAML with the key `names`. It lies beside the settings file or beside the model."""
     first_label: Annotated[int, Field(ge=0)] | None = None
     """Class number of the first name. It is 1 if class 0 is the background and the names omit the background."""
     classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
@@ -47,8 +47,8 @@ class Detector(Section):
     size: tuple[Count, Count] | None = None
     """Width and height of the input in px, for a model that accepts any size."""
     resize: Resize | None = None
-    """How an image is fitted into the input. letterbox keeps the aspect ratio and pads all sides. corner keeps the aspect ratio
-    and pads right and bottom. stretch changes the aspect ratio. none keeps the image size."""
+    """How an image is fitted into the input. letterbox keeps the aspect ratio and pads all sides. corner keeps the aspect
+    ratio and pads right and bottom. stretch changes the aspect ratio. none keeps the image size."""
     pad: Annotated[int, Field(ge=0, le=255)] | None = None
     """Grey value of the padding. null is 114."""
     colour: Colour | None = None

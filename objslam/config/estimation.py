@@ -15,12 +15,13 @@ class AssociationSettings(Section):
     """Configure how rays are associated with objects."""
 
     method: Literal["auto", "global", "by_label"] = "auto"
-    """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label if
-    no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
+    """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
+    if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of points from ray pairs tested per label in one pass. A larger value finds rarer objects and takes longer."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
-    """Share of an object's own boxes that pass the gate on the residual of a ray. A larger value accepts more wrong boxes."""
+    """Share of an object's own boxes that pass the gate on the residual of a ray. A larger value accepts more wrong
+    boxes."""
     min_existence: Share = 0.5
     """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
     min_rays: Annotated[int, Field(ge=2)] = 3
@@ -31,7 +32,8 @@ class AssociationSettings(Section):
     loop_evidence: Positive = 7.0
     """Minimum log odds that current landmarks match those of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """Minimum lead in log odds of the best place over the second best to close a loop. A larger value separates similar places."""
+    """Minimum lead in log odds of the best place over the second best to close a loop. A larger value separates similar
+    places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 
@@ -61,7 +63,8 @@ class Joint(Section):
 
     loss: Loss = "huber"
     factor: Literal["bearing", "point_to_line"] = "bearing"
-    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because distances shrink with the scale."""
+    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because distances shrink with the
+    scale."""
     min_parallax_deg: NotNegative = 8.0
     """Minimum parallax in degrees between its rays before a landmark enters the growing graph."""
     prior_sigma: Positive = 20.0

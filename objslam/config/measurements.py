@@ -30,11 +30,11 @@ class RayNoise(Section):
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
-    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object, so
-    the box is dropped and counted. A negative value keeps such boxes."""
+    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object,
+    so the box is dropped and counted. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
-    """Distance from the image edge as a share of the box width or height within which a box also counts as cut off. Detectors
-    often end a cut box short of the edge."""
+    """Distance from the image edge as a share of the box width or height within which a box also counts as cut off.
+    Detectors often end a cut box short of the edge."""
 
 
 class Depth(Section):
@@ -46,18 +46,19 @@ class Depth(Section):
     sigma_per_m: NotNegative = 0.02
     """Part of the range noise that grows with the distance, in m per m."""
     bias: NotNegative = 0.05
-    """Standard deviation in m of the error shared by all ranges of one object. Ranges end on the surface of the object, or have
-    a calibration error. Averaging does not reduce this error."""
+    """Standard deviation in m of the error shared by all ranges of one object. Ranges end on the surface of the object, or
+    have a calibration error. Averaging does not reduce this error."""
 
 
 class Odometry(Section):
-    """Configure the drift of odometry. It is a random walk: the standard deviations grow with the square root of the motion."""
+    """Configure the drift of odometry. It is a random walk: the standard deviations grow with the square root of the
+    motion."""
 
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""
     y_per_m: NotNegative = 0.005
-    """Sideways standard deviation in m after 1 m of driving. Wheels slip little sideways. An omnidirectional base may need the
-    value of x_per_m."""
+    """Sideways standard deviation in m after 1 m of driving. Wheels slip little sideways. An omnidirectional base may need
+    the value of x_per_m."""
     xy_per_rad: NotNegative = 0.005
     """Standard deviation of the position in m after 1 rad of turning in place."""
     yaw_per_m: NotNegative = 0.02

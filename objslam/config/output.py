@@ -22,8 +22,8 @@ class Reconstruction(Section):
     voxel: Positive = 0.02
     """Edge length of a voxel in m."""
     truncation: Positive = 0.06
-    """Distance in m from a surface within which depths are averaged. It must exceed the depth error, be below the thickness of
-    things, and be at least 2 voxels."""
+    """Distance in m from a surface within which depths are averaged. It must exceed the depth error, be below the thickness
+    of things, and be at least 2 voxels."""
     max_depth: Positive = 4.0
     """Maximum depth in m. Larger depths are ignored."""
     min_views: Count = 3

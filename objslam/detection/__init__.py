@@ -1,4 +1,4 @@
-"""Detection: a CNN detector, any ONNX model, on a log's images. The only room that knows onnxruntime."""
+"""Run a CNN detector, which may be any ONNX model, on the images of a log. Only this folder imports onnxruntime."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A detector on a log: every rgb image becomes a frame with boxes."""
+"""Detection in a log: each rgb image becomes a frame with boxes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
 from objslam.io.prefetch import ahead
 
-_AHEAD = 8  # images that may be decoded ahead of the network, besides its batch
+_AHEAD = 8  # The number of images decoded ahead of the network in addition to a batch.
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage's name, what is done and the total (0 when it is not known)."""
+"""A callback with the name of the stage, the number of finished items, and the total (0 if unknown)."""
 
 
 def detect_log(
@@ -37,11 +37,16 @@ def detect_log(
     cache: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Log:
-    """The log with the detections of each camera that has rgb images, in place of those it may have brought.
+    """Return the log with detections from the rgb images, which replace the detections of the log.
 
-    Images that cannot be read or decoded, or have another size than the camera, are no frames: dropped and counted. With
-    depth.use, boxes get their depth from the depth images, where there are some. cache: a folder that remembers what was
-    found in which image (see `DetectionCache`). LogError where no image can be used; DetectorError where the network fails.
+    An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
+    box gets its depth from a depth image if the camera has depth images.
+
+    Args:
+        cache: folder of the `DetectionCache`. None disables the cache.
+    Raises:
+        LogError: no image can be used.
+        DetectorError: the network fails.
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
@@ -57,16 +62,14 @@ def detect_log(
         reasons = "; ".join(line for line in ledger.lines() if "rgb image" in line)
         raise LogError(f"none of the {total} rgb images can be used", where=log.name, hint=reasons)
     if not any(len(d) for d in found if d is not None):
-        ledger.warn(
-            f"the detector found nothing in {frames} images: does detector.min_score suit the model, and its layout?"
-        )
+        ledger.warn(f"the detector found nothing in {frames} images: check detector.min_score and detector.layout")
     cameras = []
     for camera_log, detections in zip(log.cameras, found, strict=True):
         if detections is None:
             cameras.append(camera_log)
             continue
         if camera_log.detections is not None:
-            ledger.warn(f"camera {camera_log.camera.name}: the detector's boxes replace those that the log brought")
+            ledger.warn(f"camera {camera_log.camera.name}: the boxes of the detector replace the boxes of the log")
         if camera_log.depth is not None and settings.depth.use:
             progress("depths at the boxes", 0, 0)
             detections = depths_at_boxes(detections, camera_log.depth, camera_log.camera, ledger)
@@ -75,7 +78,7 @@ def detect_log(
 
 
 class _Meter:
-    """Tells the progress, with the rate."""
+    """Report the progress and the rate in frames/s."""
 
     def __init__(self, total: int, progress: Progress) -> None:
         self._total, self._progress = total, progress
@@ -112,10 +115,8 @@ def _detect_images(
 def _detect_batch(
     waiting: list[tuple[int, str, Array]], found: list[Boxes | None], detector: Detector, store: DetectionCache | None
 ) -> None:
-    """Run the detector on the waiting images (index, digest, pixels), and empty `waiting`.
-
-    The boxes of an image go to found[index], and into the cache if there is one.
-    """
+    """Detect in the waiting images (index, digest, pixels), store boxes in found[index] and the cache, and empty
+    `waiting`."""
     for (index, digest, image), boxes in zip(waiting, detector.detect([image for _, _, image in waiting]), strict=True):
         found[index] = boxes
         if store is not None:

@@ -1,4 +1,4 @@
-"""The images of a camera, read and decoded ahead of the network in threads of their own."""
+"""Reading and decoding of the images of a camera, to be run in threads ahead of the network."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from objslam.io.text import read_bytes
 
 @dataclass(frozen=True)
 class Frame:
-    """One image file: its pixels, or what the cache knows of it, or the problem with it (and where that is)."""
+    """Hold one image file: its pixels, its boxes from the cache, or its problem with the place of the problem."""
 
     digest: str = ""
     image: Array | None = None
@@ -27,27 +27,20 @@ class Frame:
 
 
 def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Frame:
-    """Read an image file, and decode it (8 bit, BGR, as the sensor has it: no EXIF rotation) unless the cache knows it."""
+    """Read an image file, and decode it to 8 bit BGR without EXIF rotation unless the cache has its boxes."""
     try:
         data = read_bytes(path)
     except LogError as error:
         return Frame(problem="rgb image that cannot be read", where=str(error))
     digest = hashlib.sha256(data).hexdigest()
-    entry = None if cache is None else cache.read(digest)
+    image, entry = None, None if cache is None else cache.read(digest)
     if entry is not None:
-        problem, where = _wrong_size(entry.width, entry.height, path, camera)
-        return Frame(digest, known=entry.boxes, problem=problem, where=where)
-    image = decode_colour(data)
-    if image is None:
+        width, height = entry.width, entry.height
+    elif (image := decode_colour(data)) is not None:
+        height, width = image.shape[:2]
+    else:
         return Frame(digest, problem="rgb image that cannot be decoded", where=str(path))
-    problem, where = _wrong_size(image.shape[1], image.shape[0], path, camera)
-    return Frame(digest, image, problem=problem, where=where)
-
-
-def _wrong_size(width: int, height: int, path: Path, camera: Camera) -> tuple[str | None, str]:
-    if (width, height) == (camera.width, camera.height):
-        return None, ""
-    return (
-        "rgb image that has not the camera's size",
-        f"{path} is {width}x{height}, the camera {camera.width}x{camera.height}",
-    )
+    if (width, height) != (camera.width, camera.height):
+        where = f"{path} is {width}x{height}, the camera {camera.width}x{camera.height}"
+        return Frame(digest, problem="rgb image that has not the camera's size", where=where)
+    return Frame(digest, image, None if entry is None else entry.boxes)

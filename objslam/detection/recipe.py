@@ -61,9 +61,9 @@ class InputSize:
 class Recipe:
     """How images go in and boxes come out: the detector settings, with nothing left open.
 
-    names: of the classes, empty where nobody knows them. first_label: the number that the model gives to the first.
-    taken: the classes that count, by their place in names (by their number without names), None for all. channels: of class
-    scores. row_boxes: predictions have a box a row. box_units None: the values tell.
+    names: of the classes, empty where nobody knows them. first_label: the number that the model gives to the first. taken:
+    the classes that count, by their place in names (by their number without names), None for all. channels: of class scores.
+    row_boxes: predictions have a box a row. box_units None: the values tell.
     """
 
     layout: Layout
