@@ -1,7 +1,5 @@
 """The settings of association, triangulation and the factor graph."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The settings of the measurements: poses, bearings, depths, odometry, localisation."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

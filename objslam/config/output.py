@@ -1,7 +1,5 @@
 """The settings of the outputs of a run: surface reconstruction, recording and picture."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The base class of all settings, and the value types of settings."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field

@@ -1,7 +1,5 @@
 """The class of all settings, which loads from YAML files and overrides and is dumped as YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal

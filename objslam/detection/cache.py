@@ -6,8 +6,6 @@ again gets its own boxes. Each line is appended in one write, so several process
 line that a killed process left incomplete, and the line is skipped.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,8 +1,6 @@
 """The class names of a model: from the settings, from the model's metadata, or from COCO if the number of classes
 matches."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Detection in a log: each rgb image becomes a frame with boxes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

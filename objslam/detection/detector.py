@@ -1,7 +1,5 @@
 """The detector, which finds boxes with labels and scores in images."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +20,9 @@ from objslam.detection.preprocess import Fit, fill, fit
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_DECODING = 1  # The version of the decoding. It is raised if the same outputs give other boxes, so that old caches are unused.
+_DECODING = (
+    1  # The version of the decoding. It is raised if the same outputs give other boxes, so that old caches are unused.
+)
 
 
 class Boxes(NamedTuple):

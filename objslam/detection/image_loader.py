@@ -1,7 +1,5 @@
 """Reading and decoding of the images of a camera, to be run in threads ahead of the network."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Inference of a model's recipe. The settings override the model's own description, which overrides the layout's habits."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

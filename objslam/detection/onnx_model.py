@@ -1,7 +1,5 @@
 """The network: an ONNX model in an onnxruntime session, with its inputs, outputs and metadata."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recognition of the layout of a model's outputs from their shapes for one image and from the model's metadata."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,12 +66,12 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
         ConfigError: the settings name a missing output, or roles that form no layout.
         DetectorError: no layout fits. The message lists the outputs and says how to describe them.
     """
-    layout, roles = settings.layout, settings.outputs
+    layout = settings.layout
+    roles: Roles | None = settings.outputs
     if roles is not None:
         named = _named(outputs, roles, model)
         layout = layout or _by_roles(named, facts)
-        forms = _ROLES.get(layout, _SINGLE) if layout is not None else (frozenset(named),)
-        if frozenset(named) not in forms:
+        if layout is not None and frozenset(named) not in (forms := _ROLES.get(layout, _SINGLE)):
             allowed = " or ".join(", ".join(sorted(form)) for form in forms)
             message = f"detector.outputs names {', '.join(sorted(named))}, but the layout {layout} has {allowed}"
             raise ConfigError(message, where=str(model))

@@ -1,7 +1,5 @@
 """Decoding of the outputs of one image to boxes, with one function per layout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Conversion of images to the size, colours and value range of the network input, and of boxes back to the image."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The recipe of a detector model, which defines how an image becomes network input and how outputs become boxes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 
