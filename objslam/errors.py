@@ -11,11 +11,8 @@ def one_line(text: object) -> str:
 
 
 class ObjslamError(Exception):
-    """Report a failure that a user can correct.
-
-    `where` is a file:line, topic or timestamp, and `hint` is the remedy. Message, place, hint and the text of the error
-    become one line each.
-    """
+    """Report a failure that a user can correct. `where` is a file:line, topic or timestamp, and `hint` is the remedy.
+    Message, place, hint and the text of the error become one line each."""
 
     exit_code = 1
 

@@ -12,16 +12,13 @@ import typer
 from objslam.cli.console import say
 from objslam.cli.live_drive import LatestObjects, drive, finish
 from objslam.cli.options import Config, Out, Set, settings_of, with_options
-from objslam.live.adapters import ADAPTERS, LiveOptions, NetworkOptions
+from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
 
 if TYPE_CHECKING:
-    from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
-    from objslam.core.types import Log, Truth
-    from objslam.live.adapters import Feed
-    from objslam.live.session.session import Session
+    from objslam.core.types import Log
 
 
 Speed = Annotated[
@@ -65,6 +62,7 @@ def live(
 ) -> None:
     """Map objects while the robot drives. objects.json is updated, and the end (Ctrl-C) writes a complete result folder."""
     from objslam.errors import ConfigError, OutputError
+    from objslam.live.adapters.replay import ReplayAdapter
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
@@ -89,7 +87,9 @@ def live(
         if recording is None:
             feed = ADAPTERS[source].opens(session, settings, options)
         else:
-            feed, truth = _replay(recording, session, settings, speed or None)
+            (log, ledger), newest = recording, lambda: session.newest
+            adapter = ReplayAdapter(session, log, speed or None, session.wait, newest, ledger=ledger, settings=settings)
+            feed, truth = Feed(adapter), log.truth
         for close in feed.close:
             stack.callback(close)
         if publish:
@@ -155,16 +155,3 @@ def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
             say(f"no message came: restored {file} of the earlier session", stderr=True)
 
     stack.callback(end)
-
-
-def _replay(
-    recording: tuple[Log, Ledger], session: Session, settings: Settings, speed: float | None
-) -> tuple[Feed, Truth | None]:
-    from objslam.live.adapters import Feed
-    from objslam.live.adapters.replay import ReplayAdapter
-
-    log, ledger = recording
-    adapter = ReplayAdapter(
-        session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger, settings=settings
-    )
-    return Feed(adapter), log.truth

@@ -47,9 +47,7 @@ class LatestObjects:
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
     """Run the adapter until it ends, the session ends, or the user presses Ctrl-C. Update the status line and objects.json.
-
-    Return an error of a view or of the disk, so that `finish` can write the map before it raises the error.
-    """
+    Return an error of a view or of the disk, so that `finish` can write the map before it raises the error."""
     from objslam.live.session import low_latency
 
     low_latency.configure()
@@ -92,9 +90,7 @@ def finish(
     session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
 ) -> None:
     """End the session, write its result, and print a summary. Then raise the error that ended the session or a view early.
-
-    An error of the session becomes an ObjslamError. If there is no result, objects.json holds the last snapshot.
-    """
+    An error of the session becomes an ObjslamError. If there is no result, objects.json holds the last snapshot."""
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
 

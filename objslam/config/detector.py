@@ -16,10 +16,8 @@ Activation = Literal["none", "sigmoid", "softmax"]
 
 
 class Detector(Section):
-    """Configure the ONNX model that detects boxes in the images of a log.
-
-    A setting of null is inferred from the model's metadata, from the shapes of its outputs, or from its model family.
-    """
+    """Configure the ONNX model that detects boxes in the images of a log. A setting of null is inferred from the model's
+    metadata, from the shapes of its outputs, or from its model family."""
 
     layout: Layout | None = None
     """Layout of the outputs. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow). In ssd, one output may hold boxes

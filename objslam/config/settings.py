@@ -7,11 +7,8 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
+from objslam.config import mapping
 from objslam.config.detector import Detector
-from objslam.config.estimation import AssociationSettings, Fixed, Joint, Triangulation
-from objslam.config.live import Live
-from objslam.config.measurements import Depth, Localization, Odometry, Planar, Poses, RayNoise
-from objslam.config.output import Output, Reconstruction
 from objslam.config.section import Section
 from objslam.errors import ConfigError
 
@@ -22,19 +19,19 @@ class Settings(Section):
     mode: Literal["fixed", "joint"] = "fixed"
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
-    poses: Poses = Poses()
-    rays: RayNoise = RayNoise()
-    depth: Depth = Depth()
-    odometry: Odometry = Odometry()
-    planar: Planar = Planar()
-    localization: Localization = Localization()
-    association: AssociationSettings = AssociationSettings()
-    triangulation: Triangulation = Triangulation()
-    fixed: Fixed = Fixed()
-    joint: Joint = Joint()
-    live: Live = Live()
-    reconstruction: Reconstruction = Reconstruction()
-    output: Output = Output()
+    poses: mapping.Poses = mapping.Poses()
+    rays: mapping.RayNoise = mapping.RayNoise()
+    depth: mapping.Depth = mapping.Depth()
+    odometry: mapping.Odometry = mapping.Odometry()
+    planar: mapping.Planar = mapping.Planar()
+    localization: mapping.Localization = mapping.Localization()
+    association: mapping.AssociationSettings = mapping.AssociationSettings()
+    triangulation: mapping.Triangulation = mapping.Triangulation()
+    fixed: mapping.Fixed = mapping.Fixed()
+    joint: mapping.Joint = mapping.Joint()
+    live: mapping.Live = mapping.Live()
+    reconstruction: mapping.Reconstruction = mapping.Reconstruction()
+    output: mapping.Output = mapping.Output()
 
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:

@@ -33,10 +33,8 @@ class DetectionCache:
     """Store the entries of one detector, as a context manager. One thread may read while another thread writes."""
 
     def __init__(self, folder: Path, key: str, ledger: Ledger) -> None:
-        """Open the cache of the detector with this key. Drop and count damaged lines.
-
-        If the cache cannot be opened or written, warn in the ledger and continue without the cache.
-        """
+        """Open the cache of the detector with this key. Drop and count damaged lines. If the cache cannot be opened or
+        written, warn in the ledger and continue without the cache."""
         self._file = folder / f"{key}.jsonl"
         self._ledger = ledger
         self._lines: dict[str, bytes] = {}

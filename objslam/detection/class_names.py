@@ -32,10 +32,8 @@ def is_background(name: str) -> bool:
 
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
-    """Return the class names that the setting `detector.names` defines: a list, coco, coco91 or a file.
-
-    A file is looked up as given, then beside the model. ConfigError if the file is missing, unreadable or has a wrong name.
-    """
+    """Return the class names that the setting `detector.names` defines: a list, coco, coco91 or a file. A file is looked up
+    as given, then beside the model. ConfigError if the file is missing, unreadable or has a wrong name."""
     if given is None:
         return None
     if isinstance(given, tuple):
@@ -65,9 +63,7 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
 
 def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
     """Parse the names in a model's metadata, a list or dictionary in Python or JSON. Return None if there is no text.
-
-    DetectorError if the text is something else.
-    """
+    DetectorError if the text is something else."""
     if not text:
         return None
     try:

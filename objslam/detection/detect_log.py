@@ -1,9 +1,10 @@
 """Detection in a log: each rgb image becomes a frame with boxes."""
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -11,14 +12,16 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Array, Floats
+from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Images, Log, label_table
 from objslam.detection.cache import DetectionCache, Entry
 from objslam.detection.detector import Boxes, Detector
-from objslam.detection.image_loader import load_frame
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
+from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
+from objslam.io.text import read_bytes
 
 _AHEAD = 8  # The number of images decoded ahead of the network in addition to a batch.
 
@@ -54,14 +57,14 @@ def detect_log(
     meter = _Meter(total, progress)
     with nullcontext() if cache is None else DetectionCache(cache, detector.key, ledger) as store:
         run = partial(_detect_images, detector=detector, store=store, ledger=ledger, meter=meter)
-        found = [None if c.rgb is None else run(c, c.rgb) for c in log.cameras]
+        found = [None if c.rgb is None else run(c.camera, c.rgb) for c in log.cameras]
     frames = sum(len(d.frame_stamps) for d in found if d is not None)
     if not frames:
         reasons = "; ".join(line for line in ledger.lines() if "rgb image" in line)
         raise LogError(f"none of the {total} rgb images can be used", where=log.name, hint=reasons)
     if not any(len(d) for d in found if d is not None):
         ledger.warn(f"the detector found nothing in {frames} images: check detector.min_score and detector.layout")
-    cameras = []
+    cameras: list[CameraLog] = []
     for camera_log, detections in zip(log.cameras, found, strict=True):
         if detections is None:
             cameras.append(camera_log)
@@ -73,6 +76,37 @@ def detect_log(
             detections = depths_at_boxes(detections, camera_log.depth, camera_log.camera, ledger)
         cameras.append(replace(camera_log, detections=detections))
     return replace(log, cameras=tuple(cameras))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Hold one image file: its pixels, its boxes from the cache, or its problem with the place of the problem."""
+
+    digest: str = ""
+    image: Array | None = None
+    known: Boxes | None = None
+    problem: str | None = None
+    where: str = ""
+
+
+def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Frame:
+    """Read an image file, and decode it to 8 bit BGR without EXIF rotation unless the cache has its boxes."""
+    try:
+        data = read_bytes(path)
+    except LogError as error:
+        return Frame(problem="rgb image that cannot be read", where=str(error))
+    digest = hashlib.sha256(data).hexdigest()
+    image, entry = None, None if cache is None else cache.read(digest)
+    if entry is not None:
+        width, height = entry.width, entry.height
+    elif (image := decode_colour(data)) is not None:
+        height, width = image.shape[:2]
+    else:
+        return Frame(digest, problem="rgb image that cannot be decoded", where=str(path))
+    if (width, height) != (camera.width, camera.height):
+        where = f"{path} is {width}x{height}, the camera {camera.width}x{camera.height}"
+        return Frame(digest, problem="rgb image that has not the camera's size", where=where)
+    return Frame(digest, image, None if entry is None else entry.boxes)
 
 
 class _Meter:
@@ -90,11 +124,18 @@ class _Meter:
 
 
 def _detect_images(
-    camera_log: CameraLog, images: Images, *, detector: Detector, store: DetectionCache | None, ledger: Ledger, meter: _Meter
+    camera: Camera, images: Images, *, detector: Detector, store: DetectionCache | None, ledger: Ledger, meter: _Meter
 ) -> Detections:
-    camera = camera_log.camera
     found: list[Boxes | None] = [None] * len(images.paths)
     waiting: list[tuple[int, str, Array]] = []
+
+    def detect_waiting() -> None:
+        for (index, digest, image), boxes in zip(waiting, detector.detect([image for *_, image in waiting]), strict=True):
+            found[index] = boxes
+            if store is not None:
+                store.write(digest, Entry(image.shape[1], image.shape[0], boxes))
+        waiting.clear()
+
     load = partial(load_frame, camera=camera, cache=store)
     for index, frame in enumerate(ahead(load, images.paths, _AHEAD + detector.batch)):
         if frame.problem is not None:
@@ -104,22 +145,10 @@ def _detect_images(
         elif frame.image is not None:
             waiting.append((index, frame.digest, frame.image))
         if len(waiting) == detector.batch:
-            _detect_batch(waiting, found, detector, store)
+            detect_waiting()
         meter.step()
-    _detect_batch(waiting, found, detector, store)
+    detect_waiting()
     return _as_detections(images.stamps, found)
-
-
-def _detect_batch(
-    waiting: list[tuple[int, str, Array]], found: list[Boxes | None], detector: Detector, store: DetectionCache | None
-) -> None:
-    """Detect in the waiting images (index, digest, pixels), store boxes in found[index] and the cache, and empty
-    `waiting`."""
-    for (index, digest, image), boxes in zip(waiting, detector.detect([image for _, _, image in waiting]), strict=True):
-        found[index] = boxes
-        if store is not None:
-            store.write(digest, Entry(image.shape[1], image.shape[0], boxes))
-    waiting.clear()
 
 
 def _as_detections(stamps: Floats, found: Sequence[Boxes | None]) -> Detections:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from objslam import config
-from objslam.config import Role
+from objslam.config.detector import Role
 from objslam.core.arrays import Array, Floats
 from objslam.detection.infer_recipe import input_size, settle, with_description
 from objslam.detection.onnx_model import Network, open_network
@@ -49,10 +49,8 @@ class Detector:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def detect(self, images: Sequence[Array]) -> list[Boxes]:
-        """Return the boxes of each image (H, W, 3), uint8, BGR.
-
-        ValueError if an image has another form. DetectorError if the network fails or its outputs cannot be boxes.
-        """
+        """Return the boxes of each image (H, W, 3), uint8, BGR. ValueError if an image has another form. DetectorError if
+        the network fails or its outputs cannot be boxes."""
         for image in images:
             if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
                 raise ValueError(f"an image must be (H, W, 3) uint8, got {image.shape} {image.dtype}")

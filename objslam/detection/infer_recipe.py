@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 from difflib import get_close_matches
 
 from objslam import config
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array
 from objslam.detection.class_names import default_names, is_background, names_from_metadata, names_from_settings
 from objslam.detection.onnx_model import Network
@@ -29,9 +29,7 @@ _UNNAMED = "the model names no classes: they are numbered (set detector.names)"
 
 def with_description(network: Network, settings: config.Detector) -> config.Detector:
     """Return the settings with unset values taken from the model's own description in its metadata, if it has one.
-
-    DetectorError if the description is invalid.
-    """
+    DetectorError if the description is invalid."""
     text = network.metadata.get(DESCRIPTION)
     if text is None:
         return settings
@@ -48,9 +46,7 @@ def with_description(network: Network, settings: config.Detector) -> config.Dete
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
     """Return the input size of the model, or of the settings, or of the training in the metadata, or 640 px, in this order.
-
-    ConfigError if the settings have another size than the model.
-    """
+    ConfigError if the settings have another size than the model."""
     image = network.image
     width, height = settings.size or _training_size(network.metadata) or (_SIZE, _SIZE)
     if settings.size is not None and (width, height) != (image.width or width, image.height or height):

@@ -41,10 +41,8 @@ class Tensor:
 
 @dataclass(frozen=True)
 class ImageInput:
-    """Hold the layout of the image input, HWC if `channels_last` is True, else CHW.
-
-    A size of None is free. A batch of 0 means that the input has no batch axis.
-    """
+    """Hold the layout of the image input, HWC if `channels_last` is True, else CHW. A size of None is free. A batch of 0
+    means that the input has no batch axis."""
 
     tensor: Tensor
     batch: int | None

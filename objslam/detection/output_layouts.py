@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 
 from objslam import config
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array
 from objslam.errors import ConfigError, DetectorError
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array, Floats, Ints
 from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 
-from objslam.config import Activation, BoxForm, BoxUnits, Colour, Layout, Resize
+from objslam.config.detector import Activation, BoxForm, BoxUnits, Colour, Layout, Resize
 from objslam.detection.output_layouts import Roles
 
 Three = tuple[float, float, float]
@@ -47,10 +47,8 @@ HABITS: dict[Layout, Habits] = {
 
 @dataclass(frozen=True)
 class InputSize:
-    """Hold the size of the network input in px, which is the maximum along an axis of free size.
-
-    An input of free size shrinks to its image, and each of its sides is then a multiple of `stride`.
-    """
+    """Hold the size of the network input in px, which is the maximum along an axis of free size. An input of free size
+    shrinks to its image, and each of its sides is then a multiple of `stride`."""
 
     width: int
     height: int

@@ -37,10 +37,8 @@ class Match:
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """Hold the matched, missed and false objects. A match is one-to-one, has one label, and is within the radius.
-
-    An unresolved object has no reliable position. It is counted, but is neither matched nor false.
-    """
+    """Hold the matched, missed and false objects. A match is one-to-one, has one label, and is within the radius. An
+    unresolved object has no reliable position. It is counted, but is neither matched nor false."""
 
     matches: tuple[Match, ...]
     missed: tuple[TruthObject, ...]

@@ -686,7 +686,8 @@ def test_an_unforeseen_error_asks_for_a_report(objslam, log_folder, tmp_path, mo
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
     assert failed.code == 1
     assert failed.err == (
-        "objslam: internal error, ZeroDivisionError: a fault of ours (please report it with the traceback from objslam --debug)\n"
+        "objslam: internal error, ZeroDivisionError: a fault of ours "
+        "(please report it with the traceback from objslam --debug)\n"
     )
     monkeypatch.setattr("objslam.mapping.pipeline.run", lambda *_: exhausted())
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
