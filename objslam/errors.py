@@ -28,8 +28,7 @@ class ObjslamError(Exception):
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of the text of an error, at most 300 characters. An error without a text becomes its type
-    name."""
+    """Return at most 300 characters of the first line of an error, or the type name of an error without a text."""
     text = str(error).strip().splitlines()
     return text[0][:300] if text else type(error).__name__
 

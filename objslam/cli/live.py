@@ -27,14 +27,10 @@ Speed = Annotated[
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[
-    bool,
-    typer.Option("--publish", help="Publish objects, markers and the path over DDS for RViz and Nav2, every --interval."),
+    bool, typer.Option("--publish", help="Publish objects, markers and path over DDS for RViz and Nav2, every --interval.")
 ]
 View = Annotated[
-    str | None,
-    typer.Option(
-        "--view", help="Show the map: window, web (a browser on this machine), FILE.rrd, or the address of a viewer."
-    ),
+    str | None, typer.Option("--view", help="Show the map: window, web (a local browser), FILE.rrd, or a viewer's address.")
 ]
 WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Record all messages on the disk.")]
 
@@ -74,9 +70,8 @@ def live(
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
     settings = settings_of("joint", config, set_)
     _say_what_is_not_used(source, options, speed, publish)
-    recording = (
-        None if source in ADAPTERS else _read(Path(source), options)
-    )  # read first, because it may be the journal in OUT
+    # The recording is read first, because it may be the journal in OUT.
+    recording = None if source in ADAPTERS else _read(Path(source), options)
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)

@@ -13,8 +13,8 @@ class Poses(Section):
     """Configure which poses of a log are used."""
 
     use: Literal["auto", "odometry", "localization"] = "auto"
-    """Poses to use if a log has odometry and localisation. auto uses the localisation. In joint mode, auto also uses the
-    odometry between the localised poses."""
+    """Poses to use if a log has both kinds. auto uses localisation, and in joint mode also the odometry between its
+    poses."""
     max_gap: Positive = 1.1
     """Maximum gap of the path in s. A frame in a longer gap is dropped and counted."""
 
@@ -25,8 +25,8 @@ class RayNoise(Section):
     pixel_sigma: Positive = 3.0
     """Standard deviation of a box centre per axis in px."""
     box_sigma: NotNegative = 0.05
-    """Standard deviation of a box centre as a share of the box size, which is the geometric mean of width and height. It is
-    added in quadrature to pixel_sigma."""
+    """Box centre noise as a share of the box size (geometric mean of width and height), added in quadrature to
+    pixel_sigma."""
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
@@ -51,14 +51,13 @@ class Depth(Section):
 
 
 class Odometry(Section):
-    """Configure the drift of odometry. It is a random walk: the standard deviations grow with the square root of the
-    motion."""
+    """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion."""
 
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""
     y_per_m: NotNegative = 0.005
-    """Sideways standard deviation in m after 1 m of driving. Wheels slip little sideways. An omnidirectional base may need
-    the value of x_per_m."""
+    """Sideways standard deviation in m after 1 m, small for wheels. An omnidirectional base may need the value of
+    x_per_m."""
     xy_per_rad: NotNegative = 0.005
     """Standard deviation of the position in m after 1 rad of turning in place."""
     yaw_per_m: NotNegative = 0.02
@@ -66,9 +65,9 @@ class Odometry(Section):
     yaw_per_rad: NotNegative = 0.05
     """Standard deviation of the heading in rad after 1 rad of turning."""
     floor_xy: Positive = 1e-3
-    """Minimum standard deviation of the position in m per keyframe step. It applies to a robot at rest too."""
+    """Standard deviation of the position in m per keyframe step that also remains for a robot at rest."""
     floor_yaw: Positive = 1e-3
-    """Minimum standard deviation of the heading in rad per keyframe step. It applies to a robot at rest too."""
+    """Standard deviation of the heading in rad per keyframe step that also remains for a robot at rest."""
 
 
 class Planar(Section):
@@ -98,8 +97,7 @@ class AssociationSettings(Section):
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of points from ray pairs tested per label in one pass. A larger value finds rarer objects and takes longer."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
-    """Share of an object's own boxes that pass the gate on the residual of a ray. A larger value accepts more wrong
-    boxes."""
+    """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5
     """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
     min_rays: Annotated[int, Field(ge=2)] = 3
@@ -110,8 +108,7 @@ class AssociationSettings(Section):
     loop_evidence: Positive = 7.0
     """Minimum log odds that current landmarks match those of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """Minimum lead in log odds of the best place over the second best to close a loop. A larger value separates similar
-    places."""
+    """Minimum lead in log odds of the best place over the next to close a loop. A larger value separates similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 
@@ -141,8 +138,7 @@ class Joint(Section):
 
     loss: Loss = "huber"
     factor: Literal["bearing", "point_to_line"] = "bearing"
-    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because distances shrink with the
-    scale."""
+    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because this reduces all distances."""
     min_parallax_deg: NotNegative = 8.0
     """Minimum parallax in degrees between its rays before a landmark enters the growing graph."""
     prior_sigma: Positive = 20.0
@@ -161,8 +157,7 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m since the last keyframe that makes a frame a keyframe. The first ten frames of a camera at rest are
-    keyframes too."""
+    """Camera motion in m since the last keyframe for a new keyframe. The first ten frames at rest are keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
     """Camera rotation in degrees since the last keyframe that makes a frame a keyframe. A frame is also a keyframe if the
     keyframes at the current place lack one of its labels."""
@@ -179,18 +174,17 @@ class Live(Section):
     """Speed in m/s above which odometry counts as a jump. A turn above four times this number in rad/s is also a jump. After
     a jump, odometry continues from the last pose."""
     min_rays: Annotated[int, Field(ge=3)] = 5
-    """Minimum number of consistent boxes before an object enters the graph. It exceeds association.min_rays, because a live
-    session knows only the current poses."""
+    """Consistent boxes before an object enters the graph. It exceeds association.min_rays, because only current poses are
+    known."""
     ghost_share: Share = 0.1
-    """Share of detections among the frames that should show an object. Below it, the object is dropped as false. A larger
-    value drops more objects, and also true objects."""
+    """Share of detections in frames that should show an object. Below it, the object is dropped. A larger value drops true
+    objects too."""
     ghost_frames: Count = 40
-    """Minimum number of frames that should show an object before it can be dropped as false. A larger value keeps false
-    objects longer."""
+    """Frames that should show an object before it can be dropped as false. A larger value keeps false objects longer."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes for a repeated offline association at the end of a session, which takes a few seconds."""
     forget: Positive = 5.0
-    """Time in s without an observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
+    """Time in s without observation after which a track of fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""
 
 
@@ -207,8 +201,8 @@ class Reconstruction(Section):
     voxel: Positive = 0.02
     """Edge length of a voxel in m."""
     truncation: Positive = 0.06
-    """Distance in m from a surface within which depths are averaged. It must exceed the depth error, be below the thickness
-    of things, and be at least 2 voxels."""
+    """Distance in m from a surface within which depths are averaged. It exceeds the depth error and 2 voxels, not the
+    thickness of things."""
     max_depth: Positive = 4.0
     """Maximum depth in m. Larger depths are ignored."""
     min_views: Count = 3

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -54,9 +55,16 @@ def detect_log(
         raise LogError("no camera has rgb images for the detector", where=log.name, hint="rgb.txt lists them")
     for warning in detector.warnings:
         ledger.warn(warning)
-    meter = _Meter(total, progress)
+    done, begin = count(1), time.perf_counter()
+
+    def step() -> None:
+        number = next(done)
+        rate = number / max(time.perf_counter() - begin, 1e-6)
+        progress(f"detecting, {rate:.1f} frames/s", number, total)
+
+    progress("detecting", 0, total)
     with nullcontext() if cache is None else DetectionCache(cache, detector.key, ledger) as store:
-        run = partial(_detect_images, detector=detector, store=store, ledger=ledger, meter=meter)
+        run = partial(_detect_images, detector=detector, store=store, ledger=ledger, step=step)
         found = [None if c.rgb is None else run(c.camera, c.rgb) for c in log.cameras]
     frames = sum(len(d.frame_stamps) for d in found if d is not None)
     if not frames:
@@ -109,22 +117,14 @@ def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Fram
     return Frame(digest, image, None if entry is None else entry.boxes)
 
 
-class _Meter:
-    """Report the progress and the rate in frames/s."""
-
-    def __init__(self, total: int, progress: Progress) -> None:
-        self._total, self._progress = total, progress
-        self._done, self._begin = 0, time.perf_counter()
-        progress("detecting", 0, total)
-
-    def step(self) -> None:
-        self._done += 1
-        rate = self._done / max(time.perf_counter() - self._begin, 1e-6)
-        self._progress(f"detecting, {rate:.1f} frames/s", self._done, self._total)
-
-
 def _detect_images(
-    camera: Camera, images: Images, *, detector: Detector, store: DetectionCache | None, ledger: Ledger, meter: _Meter
+    camera: Camera,
+    images: Images,
+    *,
+    detector: Detector,
+    store: DetectionCache | None,
+    ledger: Ledger,
+    step: Callable[[], None],
 ) -> Detections:
     found: list[Boxes | None] = [None] * len(images.paths)
     waiting: list[tuple[int, str, Array]] = []
@@ -146,7 +146,7 @@ def _detect_images(
             waiting.append((index, frame.digest, frame.image))
         if len(waiting) == detector.batch:
             detect_waiting()
-        meter.step()
+        step()
     detect_waiting()
     return _as_detections(images.stamps, found)
 

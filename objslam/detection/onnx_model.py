@@ -106,9 +106,14 @@ def open_network(path: Path, settings: config.Detector) -> Network:
     if settings.device == "cuda" and _CUDA not in session.get_providers():
         raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="check its CUDA libraries")
     inputs, outputs = ([_tensor(node) for node in nodes] for nodes in (session.get_inputs(), session.get_outputs()))
-    image, extras = _split_inputs(path, inputs)
+    images = [image for image in map(_as_image, inputs) if image is not None]
+    extras = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
+    if len(images) != 1 or len(extras) + 1 != len(inputs):
+        saw = "; ".join(map(str, inputs)) or "none"
+        hint = f"export the model with one image input of 3 channels, and at most {_MASK} and {_SIZES} besides"
+        raise DetectorError(f"the model has inputs that an image does not feed: {saw}", where=str(path), hint=hint)
     metadata = session.get_modelmeta().custom_metadata_map
-    return Network(path, session, digest, metadata, image, extras, tuple(outputs))
+    return Network(path, session, digest, metadata, images[0], extras, tuple(outputs))
 
 
 def _digest(path: Path) -> str:
@@ -134,16 +139,6 @@ def _providers(onnxruntime: Any, device: config.Device) -> list[str]:
 def _tensor(node: Any) -> Tensor:
     shape = tuple(n if isinstance(n, int) and n > 0 else None for n in node.shape)
     return Tensor(node.name, shape, str(node.type).removeprefix("tensor(").removesuffix(")"))
-
-
-def _split_inputs(path: Path, inputs: list[Tensor]) -> tuple[ImageInput, tuple[Tensor, ...]]:
-    images = [image for image in map(_as_image, inputs) if image is not None]
-    rest = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
-    if len(images) != 1 or len(rest) + 1 != len(inputs):
-        saw = "; ".join(map(str, inputs)) or "none"
-        hint = f"export the model with one image input of 3 channels, and at most {_MASK} and {_SIZES} besides"
-        raise DetectorError(f"the model has inputs that an image does not feed: {saw}", where=str(path), hint=hint)
-    return images[0], rest
 
 
 def _as_image(tensor: Tensor) -> ImageInput | None:

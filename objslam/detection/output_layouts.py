@@ -45,11 +45,6 @@ class Facts:
     metadata: Mapping[str, str]
 
     @property
-    def cells(self) -> int:
-        """Return the number of cells of the three grids."""
-        return sum(-(-self.height // stride) * -(-self.width // stride) for stride in STRIDES)
-
-    @property
     def ultralytics_detr(self) -> bool:
         """Return whether the metadata of Ultralytics describe a DETR model.
 
@@ -175,7 +170,8 @@ def _is_numbered(output: Output) -> bool:
 def _tell_single(output: Output, facts: Facts) -> Layout | None:
     if _is_numbered(output):
         return "end_to_end"
-    (rows, columns), cells, classes = output.values.shape[-2:], facts.cells, facts.classes
+    (rows, columns), classes = output.values.shape[-2:], facts.classes
+    cells = sum(-(-facts.height // stride) * -(-facts.width // stride) for stride in STRIDES)
     few = rows <= _FEW and rows not in (cells, 3 * cells)
     if few and facts.ultralytics_detr:
         return "end_to_end" if columns == 6 and (classes != 2 or "head" in facts.metadata) else "detr"
@@ -186,7 +182,12 @@ def _tell_single(output: Output, facts: Facts) -> Layout | None:
     if rows == 3 * cells:
         return "yolov5"
     if rows == cells and (classes is None or columns != 4 + classes):
-        return _tell_yolox(output.values)
+        # Raw offsets of box centres are a few cells. Decoded centres in px are spread over the image.
+        if np.median(np.abs(output.values[..., :2])) < STRIDES[0]:
+            return "yolox"
+        return (
+            "yolov5" if (output.values[..., 4] == 1).all() else "yolox_decoded"
+        )  # YOLOv6 has an objectness of 1 throughout
     if classes is not None and 4 + classes in (rows, columns):
         return "detr" if few and columns == 4 + classes else "yolov8"
     if classes is not None and columns == 5 + classes:
@@ -194,13 +195,6 @@ def _tell_single(output: Output, facts: Facts) -> Layout | None:
     if max(rows, columns) > _FEW:  # a grid with more strides or anchors
         return "yolov8" if columns > rows else "yolov5"
     return None
-
-
-def _tell_yolox(values: Array) -> Layout:
-    """Return yolox if the box centres are raw offsets of a few cells, not px that are spread over the image."""
-    if np.median(np.abs(values[..., :2])) < STRIDES[0]:
-        return "yolox"
-    return "yolov5" if (values[..., 4] == 1).all() else "yolox_decoded"  # YOLOv6 writes an objectness of 1 for every box
 
 
 def _by_roles(named: Mapping[Role, Output], facts: Facts) -> Layout | None:

@@ -28,13 +28,8 @@ class Candidates:
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first.
 
-    A label is an index into the recipe's names, or the class number of the model if the recipe has no names.
-
-    Args:
-        outputs: the outputs by role, without the batch axis.
-        width, height: size of the network input in px.
-    Raises:
-        DetectorError: a score is no probability, or a class has no name.
+    A label is an index into the recipe's names, or the class number of the model if the recipe has no names. The outputs
+    have no batch axis. DetectorError if a score is no probability or if a class has no name.
     """
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
@@ -92,7 +87,9 @@ def _yolov5(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candi
 
 def _yolox(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     rows, likely = _likely(recipe, outputs["predictions"])
-    cells, strides = _grid(width, height)
+    grids = [np.indices((-(-height // stride), -(-width // stride))).reshape(2, -1) for stride in STRIDES]
+    cells = np.concatenate(grids, axis=1)[::-1].T.astype(np.float64)  # (N, 2) corners of the cells, by grid, then by row
+    strides = np.repeat(STRIDES, [grid.shape[1] for grid in grids]).astype(np.float64)
     if len(strides) != len(outputs["predictions"]):
         count = len(outputs["predictions"])
         message = f"{count} predictions, but the grids of an input of {width}x{height} have {len(strides)}"
@@ -151,13 +148,6 @@ def _probability(values: Array, recipe: Recipe) -> Array:
     if recipe.activation != "sigmoid":
         return values
     return 0.5 * (1.0 + np.tanh(0.5 * values.astype(np.float64)))  # the logistic function without overflow
-
-
-def _grid(width: int, height: int) -> tuple[Floats, Floats]:
-    """Return the corner (N, 2) and stride (N,) of each cell, ordered by grid, then by row."""
-    grids = [np.indices((-(-height // stride), -(-width // stride))).reshape(2, -1) for stride in STRIDES]
-    strides = np.repeat(STRIDES, [grid.shape[1] for grid in grids])
-    return np.concatenate(grids, axis=1)[::-1].T.astype(np.float64), strides.astype(np.float64)
 
 
 def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:

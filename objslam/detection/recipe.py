@@ -13,22 +13,17 @@ NO_STD: Three = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Habits:
-    """Hold the properties shared by the models of a layout. The settings and the model's own description override them.
-
-    Attributes:
-        box_units: None infers the units from the values of the boxes.
-        mean, std: normalisation of each channel after the division.
-    """
+    """Hold the properties shared by the models of a layout. The settings and the model's own description override them."""
 
     resize: Resize
     colour: Colour
     divide_by: float
     box_form: BoxForm
-    box_units: BoxUnits | None
+    box_units: BoxUnits | None  # None infers the units from the values of the boxes.
     nms: bool
     activation: Activation = "none"
-    mean: Three = NO_MEAN
-    std: Three = NO_STD
+    mean: Three = NO_MEAN  # The mean of each channel after the division.
+    std: Three = NO_STD  # The standard deviation of each channel after the division.
 
 
 _YOLO = Habits("letterbox", "rgb", 255.0, "cxcywh", "pixels", nms=True)
@@ -59,25 +54,17 @@ class InputSize:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Habits):
-    """Hold the detector settings of a model with every value determined.
-
-    Attributes:
-        names: class names, empty if they are unknown.
-        first_label: class number that the model gives to the first name.
-        taken: indices into names (class numbers without names) of the classes to keep. None keeps all classes.
-        channels: number of class scores per box.
-        row_boxes: True if a row of the predictions is a box, False if a column is a box.
-    """
+    """Hold the detector settings of a model with every value determined."""
 
     layout: Layout
     outputs: Roles
     size: InputSize
     pad: int
-    names: tuple[str, ...]
-    first_label: int
-    taken: tuple[int, ...] | None
-    channels: int | None
-    row_boxes: bool
+    names: tuple[str, ...]  # The class names. The tuple is empty if the names are unknown.
+    first_label: int  # The class number that the model gives to the first name.
+    taken: tuple[int, ...] | None  # The indices into names (or class numbers) of the classes to keep. None keeps all.
+    channels: int | None  # The number of class scores per box.
+    row_boxes: bool  # True if a row of the predictions is a box, False if a column is a box.
     min_score: float
     iou: float
     max_boxes: int

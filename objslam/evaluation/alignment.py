@@ -81,7 +81,7 @@ def align_objects(
     Args:
         source, target: map objects (N, 3) and true objects (M, 3) in m.
         same: (N, M), True if two objects may be the same.
-        start: initial transform. None aligns each pair of map objects with each possible pair of true objects of about the same
+        start: initial transform. None aligns each pair of map objects with each possible pair of true objects of similar
             distance. At most 3,000 of these alignments are sampled, with a fixed seed.
     """
     if kind == "none" or not same.any():

@@ -64,19 +64,12 @@ class ObjectScores:
 
 @dataclass(frozen=True)
 class PathScores:
-    """Hold the absolute trajectory error (ATE; Sturm et al., IROS 2012) at the timestamps of the path with truth.
+    """Hold the absolute trajectory error (ATE; Sturm et al., IROS 2012) at the timestamps of the path with truth."""
 
-    Attributes:
-        errors: translation errors (N,) in m after the alignment of the path.
-        errors_with_map: translation errors (N,) in m after the alignment of the objects. None without objects.
-        outside: number of timestamps without truth.
-        transform: alignment of the path.
-    """
-
-    errors: Floats
-    errors_with_map: Floats | None
-    outside: int
-    transform: Transform
+    errors: Floats  # The translation errors (N,) in m after the alignment of the path.
+    errors_with_map: Floats | None  # The translation errors (N,) in m after the alignment of the objects, if any.
+    outside: int  # The number of timestamps without truth.
+    transform: Transform  # The alignment of the path.
 
 
 @dataclass(frozen=True)
@@ -143,12 +136,7 @@ def evaluate(
 
 def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
     """Compare the result folder `out` with the truth in the path `truth` (see `load_truth`), or with the truth of its log.
-
-    Raises:
-        LogError: there is no truth. The message names the places searched.
-        OutputError: the result cannot be read.
-        ConfigError: the radius is not positive.
-    """
+    LogError if there is no truth, OutputError if the result cannot be read, ConfigError if the radius is not positive."""
     _check_radius(radius)
     map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
     if known is None:

@@ -49,7 +49,7 @@ def load_truth(path: Path) -> Truth | None:
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is an estimate and no truth. Give that file to compare two results.
+            of its log. The objects.json of a result folder is not its truth. Give that file itself to compare two results.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """
