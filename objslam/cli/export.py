@@ -11,7 +11,7 @@ from objslam.output.export.formats import FORMATS
 _HELP = " ".join(f"{known.name}: {known.help}." for known in FORMATS.values())
 _DATUM_HELP = (
     f"{', '.join(known.name for known in FORMATS.values() if known.takes_datum)}: latitude, longitude of the map origin "
-    "(WGS 84, degrees) and heading of the x axis (degrees clockwise from north). By default, coordinates are in m in the map."
+    "(WGS 84, degrees) and heading of the x axis (degrees clockwise of north). By default, coordinates are in m on the map."
 )
 
 

@@ -35,11 +35,8 @@ class Settings(Section):
 
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
-    """Load settings from a YAML file and `key=value` overrides with dotted keys and YAML values.
-
-    An override replaces a value of the file, and a value of the file replaces a default. ConfigError names the file or the
-    override, the key and the problem.
-    """
+    """Load settings from a YAML file and from `key=value` overrides (dotted keys, YAML values), which replace values of the
+    file. ConfigError names the file or the override, the key and the problem."""
     data: dict[str, Any] = {}
     if file is not None:
         data = _read_yaml(file)

@@ -1,9 +1,9 @@
 """A cache on disk of the boxes that a detector found, so that a second run does not detect again.
 
 Each detector has one file, named by its key (model and recipe). Each line holds a checksum and one image as JSON: the
-SHA-256 of the image content and the boxes. The content identifies an image, so a log that was moved, copied or rendered
-again gets its own boxes. Each line is appended in one write, so several processes can share the file. The checksum reveals a
-line that a killed process left incomplete, and the line is skipped.
+SHA-256 of the image content and the boxes. The content identifies an image even if the log is moved, copied or rendered
+again. Each line is appended in one write, so processes can share the file. A line without its checksum is incomplete and is
+skipped.
 """
 
 import errno

@@ -42,13 +42,8 @@ def detect_log(
     """Return the log with detections from the rgb images, which replace the detections of the log.
 
     An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
-    box gets its depth from a depth image if the camera has depth images.
-
-    Args:
-        cache: folder of the `DetectionCache`. None disables the cache.
-    Raises:
-        LogError: no image can be used.
-        DetectorError: the network fails.
+    box gets its depth from a depth image if the camera has depth images. `cache` is the folder of a `DetectionCache`, if
+    any. LogError if no image can be used. DetectorError if the network fails.
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:

@@ -92,12 +92,10 @@ class Detector:
 
 
 def load_detector(model: Path, settings: config.Detector) -> Detector:
-    """Load an ONNX detector, run it once, and determine its recipe.
+    """Load an ONNX detector, run it once, and determine its recipe. ConfigError if the settings do not fit the model.
 
-    Raises:
-        DetectorError: the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of an unknown
-            layout. The message lists the outputs and says how to describe them.
-        ConfigError: the settings do not fit the model.
+    DetectorError if the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of an unknown
+    layout. Its message lists the outputs and says how to describe them.
     """
     network = open_network(model, settings)
     settings = with_description(network, settings)

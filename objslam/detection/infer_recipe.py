@@ -65,10 +65,8 @@ def input_size(network: Network, settings: config.Detector) -> InputSize:
 def settle(
     network: Network, settings: config.Detector, size: InputSize, outputs: Sequence[Output]
 ) -> tuple[Recipe, str | None]:
-    """Infer the recipe of a model from its outputs on one image of this size. Return a warning too if names are a guess.
-
-    ConfigError or DetectorError if the layout is unknown, the task is no detection, or the names do not match the model.
-    """
+    """Infer the recipe from the outputs for one image of this size, with a warning if the names are a guess. ConfigError or
+    DetectorError if the layout is unknown, the task is no detection, or the names do not match the model."""
     task = network.metadata.get("task", "detect")
     if task in ("classify", "obb"):
         message = f"the model's task is {task}, which gives no axis-aligned boxes"

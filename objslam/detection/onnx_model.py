@@ -80,12 +80,8 @@ class Network:
 
 
 def open_network(path: Path, settings: config.Detector) -> Network:
-    """Load an ONNX model on the device and with the threads of the settings.
-
-    Raises:
-        DetectorError: the file is missing, is no ONNX model, or has inputs that need more than an image.
-        ConfigError: the device is cuda, but this onnxruntime has no CUDA.
-    """
+    """Load an ONNX model on the device and with the threads of the settings. DetectorError if the file is missing, is no
+    ONNX model, or needs more inputs than an image. ConfigError if the device is cuda and onnxruntime has no CUDA."""
     import onnxruntime
 
     try:

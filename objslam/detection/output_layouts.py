@@ -46,21 +46,14 @@ class Facts:
 
     @property
     def ultralytics_detr(self) -> bool:
-        """Return whether the metadata of Ultralytics describe a DETR model.
-
-        Such a model has one output with the class scores of each box. Since version 8.4, whose metadata have the key `head`,
-        the output has the best score and class of each box instead.
-        """
+        """Return whether the metadata of Ultralytics describe a DETR model. Its single output has the class scores of each
+        box. Since version 8.4, with the metadata key `head`, the output has the best score and class of each box instead."""
         return "detr" in self.metadata.get("description", "").lower()
 
 
 def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
-    """Return the layout and the output name of each role. The settings override the recognition.
-
-    Raises:
-        ConfigError: the settings name a missing output, or roles that form no layout.
-        DetectorError: no layout fits. The message lists the outputs and says how to describe them.
-    """
+    """Return the layout and the output name of each role. The settings override the recognition. ConfigError if the settings
+    name a missing output or roles that form no layout. DetectorError with the outputs and a remedy if no layout fits."""
     layout = settings.layout
     roles: Roles | None = settings.outputs
     if roles is not None:

@@ -26,11 +26,9 @@ class Candidates:
 
 
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
-    """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first.
-
-    A label is an index into the recipe's names, or the class number of the model if the recipe has no names. The outputs
-    have no batch axis. DetectorError if a score is no probability or if a class has no name.
-    """
+    """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
+    is an index into the names, or a class number without names. The outputs have no batch axis. DetectorError if a score is
+    no probability or a class has no name."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:

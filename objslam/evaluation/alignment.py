@@ -154,11 +154,9 @@ def _nearest_cost(transform: Transform, source: Floats, target: Floats, same: Bo
 
 
 def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
-    """Return the truth in the frame of the map, for drawing.
-
-    A map from odometry alone has its own frame. The truth is aligned in the plane if fewer than half of the possible matches
-    are within the radius (m), and if the alignment increases the number of matches. Otherwise it is unchanged.
-    """
+    """Return the truth in the frame of the map, for drawing. A map from odometry alone has its own frame. The truth is
+    aligned in the plane if fewer than half of the possible matches are within the radius (m) and the alignment increases
+    their number."""
     source, target, same = correspondences(objects.resolved(), truth.objects)
     matched = len(match_points(source, target, same, radius)[0])
     if 2 * matched >= min(len(source), len(target)):
