@@ -20,8 +20,10 @@ def demo(
         bool, typer.Option("--boxes", help="Simulate detector boxes instead of rendered images, which takes seconds only.")
     ] = False,
 ) -> None:
-    """Simulate a drive, map it with fixed poses and with joint estimation, and compare both maps with the truth. The drive
-    is rendered as RGB-D images of a furnished room with seven objects of the detector shipped with objslam."""
+    """Simulate a drive, map it with fixed poses and with joint estimation, and compare both maps with the truth.
+
+    The drive is rendered as RGB-D images of a furnished room with seven objects of the detector shipped with objslam.
+    """
     from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError
     from objslam.output.result_folder import prepare_output

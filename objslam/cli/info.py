@@ -24,9 +24,7 @@ _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned co
 
 @with_options
 def info(
-    source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or another supported recording.")
-    ],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or another recording.")],
     *,
     options: SourceOptions,
 ) -> None:
@@ -47,9 +45,7 @@ def _show_log(found: Contents, kind: str) -> None:
     starts, ends = ([getattr(s.timing, end) for s in found.streams] for end in ("start", "end"))
     begin = min(starts, default=0.0)
     say(f"{found.name}: {kind}; {_span(begin, max(ends, default=0.0))}")
-    rows = [
-        (stream.role, str(stream.timing.count), *_numbers(stream.timing, begin), stream.detail) for stream in found.streams
-    ]
+    rows = [(s.role, str(s.timing.count), *_numbers(s.timing, begin), s.detail) for s in found.streams]
     _table(("role", *_NUMERIC, "what"), rows)
     _show_cameras(found.cameras)
     _list("missing for a run", found.missing, "nothing is missing for a run")

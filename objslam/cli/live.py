@@ -56,7 +56,7 @@ def live(
     publish: Publish = False,
     view: View = None,
 ) -> None:
-    """Map objects while the robot drives. objects.json is updated, and the end (Ctrl-C) writes a complete result folder."""
+    """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C)."""
     from objslam.errors import ConfigError, OutputError
     from objslam.live.adapters.replay import ReplayAdapter
     from objslam.live.session.session import Session

@@ -21,7 +21,7 @@ Config = Annotated[Path | None, typer.Option("--config", help="YAML file with se
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting. May be repeated.")]
 Mode = Annotated[
     Literal["fixed", "joint"] | None,
-    typer.Option("--mode", help="fixed: keep the poses. joint: estimate poses and objects together. [default: fixed]"),
+    typer.Option("--mode", help="fixed (the default): keep the poses. joint: estimate poses and objects together."),
 ]
 Align = Annotated[
     Literal["none", "se2", "sim2"],
@@ -48,7 +48,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def call(**given: Any) -> None:
-        values = {}
+        values: dict[str, Any] = {}
         for name, (_, option) in declared.items():
             value, default = given.pop(name), getattr(kind, name)
             if isinstance(default, tuple):

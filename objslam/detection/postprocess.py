@@ -47,7 +47,7 @@ def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candid
 
 
 def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
-    """Return the indices of the boxes (N, 4) left by non-maximum suppression per label, the highest score first."""
+    """Return the indices of the boxes (N, 4) left by non-maximum suppression per label above `iou`, best first."""
     import cv2
 
     if len(boxes) == 0:
