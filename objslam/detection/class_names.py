@@ -13,8 +13,8 @@ from objslam.core.coco import COCO_NAMES
 from objslam.errors import ConfigError, DetectorError
 
 _GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers without a class among the 91 of COCO.
-_BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})
-_MOST = 100_000  # The class number from which a dictionary of names is rejected, which bounds memory.
+_BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
+_MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
 
 
 def _coco91() -> tuple[str, ...]:

@@ -20,9 +20,7 @@ from objslam.detection.preprocess import Fit, fill, fit
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_DECODING = (
-    1  # The version of the decoding. It is raised if the same outputs give other boxes, so that old caches are unused.
-)
+_DECODING = 1  # The version of the decoding. A changed decoding raises it, so that old cache files are ignored.
 
 
 class Boxes(NamedTuple):

@@ -12,7 +12,7 @@ from objslam.core.arrays import Array
 from objslam.detection.class_names import default_names, is_background, names_from_metadata, names_from_settings
 from objslam.detection.onnx_model import Network
 from objslam.detection.output_layouts import Facts, Output, Roles, count_classes, recognise, rows_are_boxes
-from objslam.detection.recipe import HABITS, NO_MEAN, NO_STD, Habits, InputSize, Recipe
+from objslam.detection.recipe import HABITS, NO_MEAN, UNIT_STD, Habits, InputSize, Recipe
 from objslam.errors import ConfigError, DetectorError
 
 DESCRIPTION = "objslam.detector"
@@ -122,15 +122,15 @@ def _habits(
     if layout == "end_to_end" and facts.ultralytics_detr:
         habits = replace(habits, resize="stretch", box_form="cxcywh", box_units="fractions")
     if layout == "detr" and "predictions" in named:  # RT-DETR exported by Ultralytics
-        habits = replace(habits, activation="none", mean=NO_MEAN, std=NO_STD)
+        habits = replace(habits, activation="none", mean=NO_MEAN, std=UNIT_STD)
     elif layout == "detr":
         queries, classes = named["logits"].shape[-2:]
         old = queries < _QUERIES
         if classes == facts.classes + 1 if facts.classes is not None else old:
             habits = replace(habits, activation="softmax")
         if not old and roles["boxes"] != "dets":  # RT-DETR and its variants do not normalise. RF-DETR ("dets") does.
-            habits = replace(habits, mean=NO_MEAN, std=NO_STD)
-    return replace(habits, divide_by=1.0, mean=NO_MEAN, std=NO_STD) if bytes_in else habits
+            habits = replace(habits, mean=NO_MEAN, std=UNIT_STD)
+    return replace(habits, divide_by=1.0, mean=NO_MEAN, std=UNIT_STD) if bytes_in else habits
 
 
 def _training_size(metadata: Mapping[str, str]) -> tuple[int, int] | None:

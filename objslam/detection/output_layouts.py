@@ -178,9 +178,8 @@ def _tell_single(output: Output, facts: Facts) -> Layout | None:
         # Raw offsets of box centres are a few cells. Decoded centres in px are spread over the image.
         if np.median(np.abs(output.values[..., :2])) < STRIDES[0]:
             return "yolox"
-        return (
-            "yolov5" if (output.values[..., 4] == 1).all() else "yolox_decoded"
-        )  # YOLOv6 has an objectness of 1 throughout
+        # YOLOv6 has an objectness of 1 for every box.
+        return "yolov5" if (output.values[..., 4] == 1).all() else "yolox_decoded"
     if classes is not None and 4 + classes in (rows, columns):
         return "detr" if few and columns == 4 + classes else "yolov8"
     if classes is not None and columns == 5 + classes:

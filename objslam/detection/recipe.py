@@ -8,7 +8,7 @@ from objslam.detection.output_layouts import Roles
 
 Three = tuple[float, float, float]
 NO_MEAN: Three = (0.0, 0.0, 0.0)
-NO_STD: Three = (1.0, 1.0, 1.0)
+UNIT_STD: Three = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Habits:
     nms: bool
     activation: Activation = "none"
     mean: Three = NO_MEAN  # The mean of each channel after the division.
-    std: Three = NO_STD  # The standard deviation of each channel after the division.
+    std: Three = UNIT_STD  # The standard deviation of each channel after the division.
 
 
 _YOLO = Habits("letterbox", "rgb", 255.0, "cxcywh", "pixels", nms=True)
