@@ -70,7 +70,8 @@ class DetectionCache:
             return None
         found = json.loads(line.partition(b" ")[2])
         boxes = np.array(found["boxes"], dtype=np.float64).reshape(-1, 4)
-        return Entry(*found["size"], Boxes(boxes, tuple(found["labels"]), np.array(found["scores"], dtype=np.float64)))
+        width, height = found["size"]
+        return Entry(width, height, Boxes(boxes, tuple(found["labels"]), np.array(found["scores"], dtype=np.float64)))
 
     def write(self, digest: str, entry: Entry) -> None:
         """Append the entry of an image to the file."""

@@ -217,7 +217,7 @@ def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
     shutil.copytree(log_folder, tmp_path / "log")
     demo = objslam("demo", "-o", tmp_path, "--boxes")
     assert demo.code == 1
-    demo.says("no demo made", "-o")
+    demo.says("not from a demo", "-o")
     assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
 
 
