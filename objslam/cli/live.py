@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from objslam.core.types import Log
 
 
-Speed = Annotated[
-    float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 1: real time. 0: as fast as possible.")
-]
+Speed = Annotated[float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0: as fast as possible.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[

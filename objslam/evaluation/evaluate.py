@@ -115,8 +115,7 @@ def evaluate(
         LogError: there is no truth to compare with.
         ConfigError: the radius is not positive.
     """
-    if not radius > 0:
-        raise ConfigError(f"the radius must be positive, got {radius}")
+    _check_radius(radius)
     pairs = None
     if trajectory is not None and truth is not None and truth.trajectory is not None:
         poses, known = interpolate(truth.trajectory.stamps, truth.trajectory.poses, trajectory.stamps, MAX_TRUTH_GAP)
@@ -138,6 +137,7 @@ def evaluate(
 def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
     """Compare the result folder `out` with the truth in the path `truth` (see `load_truth`), or with the truth of its log.
     LogError if there is no truth, OutputError if the result cannot be read, ConfigError if the radius is not positive."""
+    _check_radius(radius)
     map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
     if known is None:
         if truth is None:
@@ -153,6 +153,11 @@ def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = 
 def write_evaluation(evaluation: Evaluation, out: Path) -> None:
     """Write evaluation.json into the result folder `out`. OutputError if the file cannot be written."""
     write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())
+
+
+def _check_radius(radius: float) -> None:
+    if not radius > 0:
+        raise ConfigError(f"the radius must be positive, got {radius}")
 
 
 def _score_objects(
