@@ -217,7 +217,7 @@ def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
     shutil.copytree(log_folder, tmp_path / "log")
     demo = objslam("demo", "-o", tmp_path, "--boxes")
     assert demo.code == 1
-    demo.says("no demo made", "-o")
+    demo.says("not from a demo", "-o")
     assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
 
 
@@ -621,7 +621,7 @@ def test_what_went_with_the_older_result_is_told(objslam, variant, tmp_path):
     assert objslam("export", out, "--to", "csv").code == 0
     assert objslam("eval", out).code == 0
     told = objslam("run", variant, "-o", out, *LEAN).out
-    assert f"removed from {out}, for it was of the older result: evaluation.json, objects.csv" in told
+    assert f"removed the older result from {out}: evaluation.json, objects.csv" in told
 
 
 def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
@@ -686,7 +686,8 @@ def test_an_unforeseen_error_asks_for_a_report(objslam, log_folder, tmp_path, mo
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
     assert failed.code == 1
     assert failed.err == (
-        "objslam: internal error, ZeroDivisionError: a fault of ours (please report it; objslam --debug shows where)\n"
+        "objslam: internal error, ZeroDivisionError: a fault of ours "
+        "(please report it with the traceback from objslam --debug)\n"
     )
     monkeypatch.setattr("objslam.mapping.pipeline.run", lambda *_: exhausted())
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)

@@ -129,7 +129,7 @@ def test_a_live_recording_is_not_where_the_result_puts_its_own(log, tmp_path):
         command(log, out, "--view", str(out / "recording.rrd")), capture_output=True, text=True, timeout=LIMIT
     )
     assert failed.returncode == 1
-    assert "the recording of the result goes there" in failed.stderr
+    assert "this file is the recording of the result" in failed.stderr
     assert len(failed.stderr.strip().splitlines()) == 1
     assert not out.exists()
 
