@@ -1,4 +1,4 @@
-"""Live: the map while the robot drives, shown and published as it grows.
+"""Live: the map of a running robot, which is shown and published while it grows.
 
-A log that is complete is mapped by `mapping`; the session here shares its rooms with it, but for the driver.
+The offline driver for a complete log is in `mapping`; this folder uses the same rooms below it.
 """

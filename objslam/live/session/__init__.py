@@ -1,4 +1,4 @@
-"""A session: messages checked and queued, journalled, worked in by a thread, shown as snapshots, ended with a result.
+"""A session checks messages, journals them, works them into a map in its own thread, and ends with a result.
 
-The map itself is in `live.mapper`; where messages come from is in `live.adapters`.
+The map itself is in `live.mapper`, and the adapters that bring messages are in `live.adapters`.
 """
