@@ -1,4 +1,4 @@
-"""A running ROS 2 robot, heard as a ROS node: where ROS 2 is installed and its setup is sourced."""
+"""Receives the messages of a ROS 2 robot as a ROS node, which needs an installed and sourced ROS 2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
 @dataclass
 class _Subscription:
-    """A subscription and the QoS that it asks for: reliable, transient-local."""
+    """A subscription. kind: whether its QoS is reliable, and whether it is transient-local."""
 
     entity: Any
     kind: tuple[bool, bool]
@@ -25,10 +25,10 @@ class _Subscription:
 
 @dataclass
 class RclpyAdapter:
-    """Subscribes to topics by their types, as their publishers come and go, and hands the messages on.
+    """Subscribes to topics by type while their publishers come and go. ObjslamError when rclpy cannot be imported.
 
-    ROS does not say which publisher a message is from, so a topic has one subscription: reliable where all its publishers
-    are, else best-effort, which hears both. ObjslamError where rclpy cannot be imported.
+    ROS does not name the publisher of a message, so each topic has one subscription. It is reliable if all publishers are
+    reliable; otherwise it is best-effort, which receives from all of them.
     """
 
     messages: RosMessages
@@ -40,16 +40,16 @@ class RclpyAdapter:
         try:
             import rclpy  # noqa: F401
         except ImportError as error:
-            hint = "source the setup of ROS 2 in a Python that fits it; `objslam live dds` needs no ROS"
+            hint = "source the setup of ROS 2 with its own Python, or use `objslam live dds`, which needs no ROS"
             raise ObjslamError(f"rclpy cannot be imported ({error})", hint=hint) from error
 
     @property
     def ledger(self) -> Ledger:
-        """What was dropped before it could be pushed, and warnings."""
+        """The counts of messages that were dropped before a push, and warnings."""
         return self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
-        """Hand messages on until stop is set."""
+        """Push messages until stop is set."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
@@ -74,7 +74,7 @@ class RclpyAdapter:
             rclpy.shutdown(context=context)
 
     def _look_around(self, node: Any, settled: bool) -> None:
-        """Subscribe to what is published and wanted, again where the publishers' QoS asks for it."""
+        """Subscribe to the wanted topics, again if the QoS of their publishers has changed."""
         offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
         for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
             type_ = offered[topic]

@@ -1,4 +1,4 @@
-"""DDS, the transport of ROS 2: the network, the types on it, and the map published there.
+"""DDS, the transport of ROS 2: the network, the message types, and the publication of the map.
 
-The adapter that feeds a session from it is `live.adapters.dds`.
+The adapter that receives a session's messages over DDS is `live.adapters.dds`.
 """

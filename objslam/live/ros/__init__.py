@@ -1,4 +1,4 @@
-"""ROS messages of a live robot: which topics to take, and what each message tells a session.
+"""ROS messages of a running robot: the choice of topics, and the pushes that each message causes.
 
-How messages arrive is in `live.adapters`; what they mean by themselves is in `ros`.
+The adapters that receive messages are in `live.adapters`, and the meaning of each message type is in `ros`.
 """

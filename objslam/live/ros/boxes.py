@@ -1,4 +1,4 @@
-"""The boxes of one image on their way to a session, and how what is dropped on it is told."""
+"""The boxes of one image before they are pushed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats
 
 Drop = Callable[[str, str], None]
-"""Called with the reason why something was dropped, and where."""
+"""A function that counts a drop, given its reason and its place."""
 
 
 @dataclass
 class Boxes:
-    """The boxes of one image: stamp, s; frame: the camera's, as tf names it, "" where unknown; arrived: s, any clock.
+    """The boxes of one image.
 
-    points: by the index of its box, a tag that comes without a box (see boxes2d). size: of the image, where known.
-    whole: as `types.Detections` has it. image: (H, W, 3) uint8 BGR, where it was at hand.
+    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: s, any clock. points: by the index of a box, the tag that
+    replaces the box, (5, 3) m in the camera frame. size: (width, height) of the image, px, None if unknown. whole: as in
+    `types.Detections`. image: (H, W, 3) uint8 BGR, None if not available.
     """
 
     topic: str
@@ -37,4 +38,5 @@ class Boxes:
 
     @property
     def place(self) -> str:
+        """The topic and the stamp, as reports name the image."""
         return f"{self.topic} at {self.stamp:.3f} s"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,20 +14,14 @@ from objslam.core.camera import COEFFICIENTS, Camera
 from objslam.core.types import MAX_BOXES
 from objslam.sources.journal.records import FrameMessage
 
-LARGEST = 1e9
-"""The largest valid length, m or px. A larger value accepts more nonsense."""
-_LATEST = 1e11
-"""The largest valid stamp, s. A float has no microseconds beyond it. A larger value accepts more nonsense."""
+LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more nonsense.
+_LATEST = 1e11  # The largest valid stamp, s. A float has no microseconds beyond it. A larger value accepts more nonsense.
 _RIGID = 1e-3
 """The most that an entry of R^T R may differ from the identity. A larger value accepts matrices that are no rotation."""
-_LONGEST_NAME = 1000
-"""The most letters of a camera's name. A larger number accepts longer names."""
-_LETTERS = 80
-"""The most letters of a text in a report. A larger number makes longer lines."""
-_NUMBERS = "iufO"
-"""The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects."""
-_EXACT = 2**53
-"""The bound below which a float represents every whole number exactly."""
+_LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
+_LETTERS = 80  # The most letters of a text in a report. A larger number makes longer lines.
+_NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
+_EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
 def floats(values: object, *shape: int) -> Floats | None:
@@ -128,19 +122,6 @@ def sound_camera(camera: object) -> Camera | str:
     return Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size))
 
 
-class SoundFrame(NamedTuple):
-    """A checked frame.
-
-    message: the frame without its invalid boxes; None if the whole frame is malformed. fault: the reason for dropping the
-    whole frame. where: the frame's name in reports. left_out: the number of invalid boxes by reason.
-    """
-
-    message: FrameMessage | None
-    fault: str
-    where: str
-    left_out: dict[str, int]
-
-
 def sound_frame(
     stamp: object,
     camera: str,
@@ -150,13 +131,18 @@ def sound_frame(
     depths: object,
     track_ids: object,
     whole: object,
-) -> SoundFrame:
-    """Check the arguments of `Sink.push_detections`, which may be of any type."""
+) -> tuple[FrameMessage | None, str, str, dict[str, int]]:
+    """Check the arguments of `Sink.push_detections`, which may be of any type.
+
+    Returns:
+        The frame without its invalid boxes, or None if the whole frame is malformed. The reason for dropping the whole
+        frame. The frame's name in reports. The number of invalid boxes by reason.
+    """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:
-        return SoundFrame(None, "frame without a stamp", where, {})
+        return None, "frame without a stamp", where, {}
     where = f"{where}, stamp {given:.3f}"
-    malformed = SoundFrame(None, "frame that is malformed", where, {})
+    malformed = None, "frame that is malformed", where, dict[str, int]()
     words = label_list(labels)
     if words is None or not is_camera_name(camera) or not isinstance(whole, bool | np.bool_):
         return malformed
@@ -183,7 +169,7 @@ def sound_frame(
             good &= fine
     kept = np.flatnonzero(good)
     columns = corners[kept], tuple(str(words[i]) for i in kept.tolist()), score[kept], depth[kept], track[kept]
-    return SoundFrame(FrameMessage(given, camera, *columns, bool(whole)), "", where, left_out)
+    return FrameMessage(given, camera, *columns, bool(whole)), "", where, left_out
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:

@@ -11,8 +11,7 @@ _SURE = 5
 A larger number drops more poses before the clock is followed, and mistakes fewer late poses for a clock set back."""
 _BACK = 0.5
 """The least step, s, of a clock that is set back. A stamp less far back is late. A larger value ignores small steps."""
-_KEPT = 8
-"""The number of earlier clocks that stamps may still belong to. More clocks only cost memory."""
+_KEPT = 8  # The number of earlier clocks that stamps may still belong to. More clocks only cost memory.
 _MISSED = 0.005
 """The time, s, by which the path is assumed to advance while the clock is set back: a step of odometry at 200 Hz."""
 
@@ -21,9 +20,7 @@ _MISSED = 0.005
 class Clock:
     """Converts stamps to session time, in which the stamps of the path increase.
 
-    Attributes:
-        shift: the time, s, that is now added to a stamp.
-        newest: the newest stamp of the path in session time, s; -inf without any.
+    shift: the time, s, that is now added to a stamp. newest: the newest stamp of the path in session time, s, or -inf.
     """
 
     shift: float = 0.0
@@ -60,12 +57,9 @@ class Clock:
 
 
 class Lead:
-    """Chooses the path whose stamps set the clock.
+    """Chooses the `path` whose stamps set the clock; None before the first pose.
 
     The odometry sets the clock. The localisation takes over when it continues for max_gap (s) without odometry.
-
-    Attributes:
-        path: the path that sets the clock; None before the first pose.
     """
 
     def __init__(self, clock: Clock, max_gap: float) -> None:

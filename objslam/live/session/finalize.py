@@ -80,20 +80,16 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
 def _solve_joint(
     keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
 ) -> Estimate:
-    """Return the joint solve from the session's poses (K, 4, 4), or the offline solve if its residuals are smaller.
-
-    The session may have rejected a ray early, when little was known, and never tested it again.
-    """
+    """Return the joint solve from the session's poses (K, 4, 4), or the offline solve if its residuals are smaller."""
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements
     from objslam.graph.outlier_rejection import misfit
 
     found = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
-    if not association.count or len(rays) > settings.live.reassociate:
+    few = association.count and len(rays) <= settings.live.reassociate
+    if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return found
-    if keyframes.odom_T_base is None or keyframes.localized_every:
-        return found
-    other_ledger = Ledger()
+    other_ledger = Ledger()  # the session may have rejected a ray early, and never tested it again
     try:
         other = batch_solver.solve_joint(keyframes, rays, association, settings, other_ledger)
     except SolveError:
@@ -159,10 +155,7 @@ def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """Return the object (R,) of each ray, -1 without one, and the label (N,) and position (N, 3) of each object.
-
-    Tracks are numbered after the landmarks.
-    """
+    """Return the object (R,) of each ray, -1 without one, and the objects' labels (N,) and positions (N, 3)."""
     landmarks, rays = m.landmarks, m.rays
     owner = rays.owner.copy()
     first = int(landmarks.id.max(initial=-1)) + 1

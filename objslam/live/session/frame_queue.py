@@ -12,20 +12,16 @@ from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.sources.journal.records import FrameMessage, Message
 
-TOO_SLOW = "frames that waited too long (live.max_lag)"
-"""The reason for dropping a frame that the session had no time for."""
+TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason for dropping a frame that the session had no time for.
 _RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or live.max_lag is too short"
 _NEVER_COVERED = "frames that the path never covered"
 
 
 class FrameQueue:
-    """Feeds messages to the mapper.
+    """Feeds messages to the mapper. patient: whether frames of any age are accepted.
 
-    Args:
-        patient: whether frames of any age are accepted.
-    Attributes:
-        lag: time, s, from the arrival of the newest frame until the map contains it.
-        worked: time, s, when the last frame was processed, by the clock of `time.perf_counter`.
+    lag: time, s, from the arrival of the newest frame until the map contains it. worked: when the last frame was processed,
+    s, by `time.perf_counter`.
     """
 
     def __init__(self, settings: Settings, counters: Counters, mapper: Mapper, patient: bool) -> None:
@@ -37,11 +33,9 @@ class FrameQueue:
         self.worked = -np.inf
 
     def take(self, message: Message, arrival: float, measured: bool = True) -> bool:
-        """Take a message, and return whether any frame left the queue.
+        """Take a message that arrived at a time, s, and return whether any frame left the queue.
 
-        Args:
-            arrival: when the message arrived, s.
-            measured: whether the lag is recorded and limited. It is not for a message of a journal.
+        measured: whether the lag is recorded and limited. It is not for a message of a journal.
         """
         if isinstance(message, FrameMessage):
             self._frames += 1

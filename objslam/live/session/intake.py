@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 
@@ -28,10 +27,8 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1
-"""The step, m, that odometry may make besides live.max_speed. A larger value takes more restarts for motion."""
-_TURN = 0.3
-"""The angle, rad, that odometry may turn besides _TURNS_PER_M. A larger value takes more restarts for motion."""
+_JUMP = 0.1  # The step, m, that odometry may make besides live.max_speed. A larger value takes more restarts for motion.
+_TURN = 0.3  # The angle, rad, that odometry may turn besides _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0
 """The turn rate, rad/s, allowed for each m/s of live.max_speed. A larger value takes more restarts for motion."""
 _ZERO = 0.05
@@ -60,7 +57,7 @@ class Intake:
         self._lock = threading.Lock()
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
-        self._stamps: dict[str, tuple[deque[float], set[float]]] = {}
+        self._stamps: dict[str, dict[float, None]] = {}  # by camera, in the order of arrival
         self._start_T_odom = np.eye(4)
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
@@ -124,10 +121,10 @@ class Intake:
                     return self._refuse("frame that is late (live.max_late)", where)
                 if at > newest + _AHEAD:
                     return self._refuse("frame with a stamp too far ahead of the path", where)
-            order, seen = self._stamps.setdefault(camera, (deque(), set()))
+            seen = self._stamps.get(camera, {})
             if at in seen:
                 return self._refuse("frame with a repeated stamp", where)
-            if order and at < order[-1]:
+            if seen and at < next(reversed(seen)):
                 self.counters.accept("frames out of order")
             if not self._hand_on(replace(frame, stamp=at)):
                 return False
@@ -216,11 +213,10 @@ class Intake:
         return np.asarray(pose)
 
     def _remember(self, camera: str, at: float) -> None:
-        order, seen = self._stamps.setdefault(camera, (deque(), set()))
-        order.append(at)
-        seen.add(at)
-        if len(order) > _STAMPS:
-            seen.discard(order.popleft())
+        seen = self._stamps.setdefault(camera, {})
+        seen[at] = None
+        if len(seen) > _STAMPS:
+            del seen[next(iter(seen))]
 
     def _note(self) -> None:
         self._hand_on(NoteMessage(self._clock.shift, self._start_T_odom))

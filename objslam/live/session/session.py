@@ -49,9 +49,6 @@ class Session(Intake):
         journal: the file that receives every accepted message before it is processed. Only one session may write the file.
         resume: whether to continue an existing journal. `start` processes its messages.
         patient: whether frames of any age are accepted, for a source that waits for the session.
-    Attributes:
-        counters: the counts of accepted and dropped messages.
-        failure: the error that ended the session early; None without one.
     """
 
     def __init__(

@@ -23,10 +23,8 @@ from objslam.live.session.finalize import offline_rays
 
 _BUDGET = 0.012
 """The time that a snapshot may take, s. A larger value makes frames wait, a smaller value leaves more descriptions old."""
-_MOST = 200
-"""The most rays, evenly spread, that describe an object. A larger number takes longer."""
-_FEW = 60
-"""The most rays for the parallax of an object, which compares all their pairs. A larger number takes longer."""
+_MOST = 200  # The most rays, evenly spread, that describe an object. A larger number takes longer.
+_FEW = 60  # The most rays for the parallax of an object, which compares all their pairs. A larger number takes longer.
 
 
 class Describer:
@@ -39,11 +37,7 @@ class Describer:
     def map(self, m: MapState, whole: bool = False) -> ObjectMap:
         """Return the landmarks with covariance and status by their ids, then the tracks with enough rays, unresolved.
 
-        Objects beyond the time budget keep their last description at their present position.
-
-        Args:
-            m: the state of the session's map.
-            whole: whether to ignore the budget.
+        Objects beyond the time budget, which `whole` ignores, keep their last description at their present position.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
         landmarks, known = m.landmarks, self._described
