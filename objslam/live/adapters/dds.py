@@ -16,10 +16,10 @@ from objslam.ros.bag.records import Connection, plain
 from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-_LONELY = 5.0  # The time without a publisher that matches, s, after which the user is warned.
-_TAKE = 200  # The most messages taken from a reader at once; larger: other topics wait longer.
+_LONELY = 5.0  # The time without a publisher that matches, s, after which the user is warned. A larger value warns later.
+_TAKE = 200  # The most messages taken from a reader at once. A larger number lets other topics wait longer.
 _MAX_READERS = 256  # The most open readers. It bounds the memory.
-_MIN_BUFFER = 2 << 20  # The smallest socket buffer for a raw image, bytes; a smaller one causes a warning.
+_MIN_BUFFER = 2 << 20  # The smallest socket buffer for a raw image, bytes. A larger value warns on more systems.
 _Kind = tuple[bool, bool]  # Whether a writer is reliable, and whether it is transient-local, which keeps past messages.
 
 
@@ -90,7 +90,6 @@ class DdsAdapter:
                 self._say_what_is_missing(now - begin)
 
     def _look_around(self, found: Any) -> None:
-        """Update the list of publishers."""
         from cyclonedds.core import InstanceState
 
         while samples := found.take(_TAKE):
@@ -131,7 +130,9 @@ class DdsAdapter:
         if not layouts:
             self.ledger.warn(f"{topic}: left out, because its type {type_} is unknown and DDS sends no definitions")
             return None
-        layout = next((layout for layout in layouts if _is_of(publication, layout)), layouts[0])
+        declared = publication.type_id  # older publishers declare none
+        fitting = (layout for layout in layouts if declared is not None and layout.__idl__.get_type_id() == declared)
+        layout = next(fitting, layouts[0])
         images = type_ in IMAGES
         qos = Qos(
             Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
@@ -201,11 +202,6 @@ class DdsAdapter:
                     self.ledger.warn(
                         f"{reader.of.topic}: the publisher has another QoS or another layout of {reader.of.type}"
                     )
-
-
-def _is_of(publication: _Publication, layout: Any) -> bool:
-    """Return whether a publisher declares this layout. Older publishers declare none."""
-    return publication.type_id is not None and layout.__idl__.get_type_id() == publication.type_id
 
 
 def _kind(qos: Any, type_: str) -> _Kind:

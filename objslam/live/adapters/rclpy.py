@@ -14,13 +14,7 @@ from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-
-@dataclass
-class _Subscription:
-    """A subscription. kind: whether its QoS is reliable, and whether it is transient-local."""
-
-    entity: Any
-    kind: tuple[bool, bool]
+_Kind = tuple[bool, bool]  # Whether the QoS is reliable, and whether it is transient-local.
 
 
 @dataclass
@@ -33,7 +27,7 @@ class RclpyAdapter:
 
     messages: RosMessages
     choice: TopicChoice
-    _open: dict[str, _Subscription] = field(default_factory=dict)
+    _open: dict[str, tuple[Any, _Kind]] = field(default_factory=dict)
     _unknown: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -82,16 +76,14 @@ class RclpyAdapter:
             if not profiles or type_ in self._unknown:
                 continue
             kind = _kind(profiles, type_)
-            old = self._open.get(topic)
-            if old is not None and old.kind == kind:
-                continue
-            message = self._message(type_)
+            old, old_kind = self._open.get(topic, (None, None))
+            message = self._message(type_) if old_kind != kind else None
             if message is None:
                 continue
             if old is not None:
-                node.destroy_subscription(old.entity)
+                node.destroy_subscription(old)
             entity = node.create_subscription(message, topic, partial(self._take, type_, topic), _profile(kind, type_))
-            self._open[topic] = _Subscription(entity, kind)
+            self._open[topic] = entity, kind
 
     def _message(self, type_: str) -> Any:
         from rosidl_runtime_py.utilities import get_message
@@ -107,7 +99,7 @@ class RclpyAdapter:
         self.messages.receive(type_, topic, message, time.time())
 
 
-def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
+def _kind(profiles: list[Any], type_: str) -> _Kind:
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
@@ -115,7 +107,7 @@ def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
     return reliable, latched and type_ in LATCHED
 
 
-def _profile(kind: tuple[bool, bool], type_: str) -> Any:
+def _profile(kind: _Kind, type_: str) -> Any:
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     reliable, latched = kind

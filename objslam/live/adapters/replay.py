@@ -15,15 +15,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, Log, Trajectory
 from objslam.live.interface import Sink
 
-_BEHIND = 1.0  # The delay of a replay, s, above which the user is warned.
+_BEHIND = 1.0  # The delay of a replay, s, above which the user is warned. A larger value warns later.
 
 
 @dataclass
 class ReplayAdapter:
     """Pushes the content of a log in the order of `events`.
 
-    speed: 2 is twice the speed of the drive, None is as fast as possible. wait: called after each frame without a speed; it
-    returns when the map contains the frame. after: returns the stamp, s, before which a resumed session has everything.
+    speed: 2 is twice the speed of the drive, None is as fast as possible. wait: without a speed, it is called after each
+    frame, and returns once the map contains the frame. after: the stamp, s, before which a resumed session has everything.
     """
 
     sink: Sink
@@ -105,15 +105,8 @@ def _frames(detections: Detections, camera: str) -> Callable[[int], Push]:
     def push(i: int) -> Push:
         boxes = slice(bounds[i], bounds[i + 1])
         labels = tuple(detections.label_names[j] for j in detections.label[boxes].tolist())
-        return lambda sink: sink.push_detections(
-            float(detections.frame_stamps[i]),
-            camera,
-            detections.boxes[boxes],
-            labels,
-            detections.scores[boxes],
-            detections.depths[boxes],
-            detections.track_ids[boxes].tolist(),
-            detections.whole,
-        )
+        depths, tracks = detections.depths[boxes], detections.track_ids[boxes].tolist()
+        found = detections.boxes[boxes], labels, detections.scores[boxes], depths, tracks, detections.whole
+        return lambda sink: sink.push_detections(float(detections.frame_stamps[i]), camera, *found)
 
     return push

@@ -32,9 +32,9 @@ from objslam.live.interface import Sink
 
 _CAMERA = "camera"
 _TYPES = ("camera", "odometry", "localization", "mount", "detections")
-_LONGEST = 1 << 20  # The longest line, bytes; longer lines are skipped. It bounds the memory.
-_CHUNK = 1 << 16  # The most bytes of one read; larger: fewer reads.
-_WAIT = 0.1  # The time until a stop is noticed, s; larger: later.
+_LONGEST = 1 << 20  # The longest line, bytes. Longer lines are skipped. A larger number costs memory.
+_CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
+_WAIT = 0.1  # The time until a stop is noticed, s. A larger value notices it later.
 
 
 @dataclass

@@ -44,12 +44,9 @@ _OPEN: dict[int, tuple[str | None, Network]] = {}
 def open_network(domain: int | None = None, interface: str | None = None) -> Network:
     """Join a DDS domain, or return the network of a domain that the process has already joined.
 
-    Args:
-        domain: None for ROS_DOMAIN_ID, or 0 if that is not set.
-        interface: a name, an address, or "auto" for any network. None for CYCLONEDDS_URI, or loopback if that is not set.
-    Raises:
-        ObjslamError: when cyclonedds is not installed or the domain cannot be joined.
-        ConfigError: when the domain or the interface is invalid, or the domain is already open on another interface.
+    domain: None for ROS_DOMAIN_ID, else 0. interface: a name, an address, "auto" for any network, None for CYCLONEDDS_URI,
+    else loopback. ObjslamError when cyclonedds is not installed or the domain cannot be joined. ConfigError when the domain
+    or the interface is invalid, or the domain is already open on another interface.
     """
     try:
         import cyclonedds  # noqa: F401

@@ -51,10 +51,7 @@ def layouts_of(type_: str) -> tuple[type, ...]:
 
 
 def _make_type(store: Typestore, type_: str) -> type:
-    """Make a DDS type that declares its fields to other nodes, but passes bytes.
-
-    The own (de)serialisation of cyclonedds would process each field in Python.
-    """
+    """Make a DDS type that declares its fields but passes bytes: cyclonedds would process each field in Python."""
     made = _make_struct(store, type_, {})
 
     def serialize(self: Any, *args: Any, **kwargs: Any) -> bytes:
@@ -68,9 +65,8 @@ def _make_type(store: Typestore, type_: str) -> type:
     def init(self: Any, data: bytes) -> None:
         self.data = data
 
-    methods: dict[str, Any] = {"serialize": serialize, "__init__": init}
-    methods |= {name: classmethod(deserialize) for name in ("deserialize", "deserialize_key")}
-    for name, method in methods.items():
+    incoming = dict.fromkeys(("deserialize", "deserialize_key"), classmethod(deserialize))
+    for name, method in {"serialize": serialize, "__init__": init, **incoming}.items():
         setattr(made, name, method)
     return made
 

@@ -15,8 +15,7 @@ from objslam.core.camera import Camera
 from objslam.errors import LogError
 from objslam.io.camera_yaml import Calibration
 from objslam.live.interface import Sink
-from objslam.live.ros.boxes import Boxes, Drop
-from objslam.live.ros.depth_images import DepthImages
+from objslam.live.ros.boxes import Boxes, DepthImages, Drop
 from objslam.ros.bag.records import frame_name
 from objslam.ros.messages.camera_info import camera_names, camera_of
 from objslam.ros.messages.detections import boxes_of_points
@@ -24,11 +23,11 @@ from objslam.ros.tf.buffer import TfBuffer, UnknownTransform
 from objslam.ros.tf.frames import unchanged
 from objslam.ros.topics import closeness, is_named, is_rectified
 
-PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s; larger: they may come later.
-_DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s; larger: a slower camera's depths count.
+PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s. A larger value drops fewer boxes.
+_DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value uses depths of slower cameras.
 _MAX_WAITING = 200  # The most images whose boxes wait. It bounds the memory.
 _IMAGES = 4  # The number of images per camera that are kept for a view. It bounds the memory.
-_SAME = 0.001  # The most by which the stamps of an image and its boxes differ, s; far below the time between two images.
+_SAME = 0.001  # The most by which stamps of an image and its boxes differ, s. It is far below the time between two images.
 _MAX_CAMERAS = 64  # The most cameras that are kept. It bounds the memory.
 
 
@@ -75,19 +74,14 @@ class Cameras:
         frame = frame_name(info.header.frame_id)
         key = _fingerprint(info)
         old = self._infos.get(frame)
-        if old is not None and old[0] == key:
-            return
         if old is None and len(self._infos) >= _MAX_CAMERAS:
             self._drop(f"CameraInfo beyond the first {_MAX_CAMERAS} cameras", topic)
-            return
-        self._infos[frame] = key, topic, info
-        self._known = {name: known for name, known in self._known.items() if frame not in (name, known.source)}
+        elif old is None or old[0] != key:
+            self._infos[frame] = key, topic, info
+            self._known = {name: known for name, known in self._known.items() if frame not in (name, known.source)}
 
     def add(self, boxes: Boxes) -> None:
-        """Push boxes, or keep them until they can be pushed.
-
-        Only one topic per camera is used, because a second topic would count objects twice.
-        """
+        """Push boxes, or keep them until they can be pushed. A second topic of a camera would count objects twice."""
         if len(self._topics) < _MAX_CAMERAS and self._topics.setdefault(boxes.frame, boxes.topic) != boxes.topic:
             self._drop("detection frame from a second topic of its camera", boxes.place)
             return
@@ -102,11 +96,9 @@ class Cameras:
         held: set[str] = set()
         for boxes in self._waiting:
             reason = "earlier boxes of the camera wait" if boxes.frame in held else self._push(boxes, now - boxes.arrived)
-            if not reason:
-                continue
-            if now - boxes.arrived > PATIENCE:
+            if reason and now - boxes.arrived > PATIENCE:
                 self._drop("detection frame of a camera without calibration or transform", f"{boxes.place}: {reason}")
-            else:
+            elif reason:
                 held.add(boxes.frame)
                 still.append(boxes)
         self._waiting = still

@@ -88,7 +88,6 @@ class DetectorWorker:
             return topic, *self._waiting.pop(topic)
 
     def _look(self, topic: str, message: Any, stamp: float) -> None:
-        """Deliver the boxes of an image, or count its failure. The next image may succeed."""
         reason = _FAILED
         try:
             image = colour_image(message)

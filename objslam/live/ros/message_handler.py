@@ -29,7 +29,7 @@ from objslam.sources.ros_bag.options import RosOptions
 if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
-_GRACE = 2.0  # The time before tf replaces an odometry topic, s; larger: a robot without an odometry topic starts later.
+_GRACE = 2.0  # The time before tf replaces an odometry topic, s. A larger value starts a robot without such a topic later.
 _LONGEST = 160  # The most letters of a place in the ledger. It keeps lines readable.
 _MAX_TRACKS = 100_000  # The most track names that are kept. It bounds the memory.
 
@@ -201,10 +201,8 @@ class RosMessages:
 
     def _news(self, top: str, base: str) -> float | None:
         """Return the newest stamp of top_T_base; None if it is the same as last time or all transforms are static."""
-        stamp = self._tf.newest(top, base)
-        news = None if stamp == self._tf_stamp else stamp
-        self._tf_stamp = stamp
-        return news
+        before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
+        return None if self._tf_stamp == before else self._tf_stamp
 
     def _correct(self, odom: str) -> None:
         """Keep map -> odom to be pushed with the next odometry, unless it only repeats the last one."""

@@ -10,10 +10,10 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, OD
 from objslam.ros.topics import NONE, TF, Choices, closeness, warn_of_choice
 
 _NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in the names of image topics without readable colour images.
-LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s; larger: a new topic is received later.
-HEAD_START = 1.0  # The time to find all publishers before one of several is chosen, s; larger: a session begins later.
-STOP_WAIT = 0.05  # The time until an adapter notices a stop, s; smaller: it wakes more often without need.
-QUEUE = 1000  # The most waiting messages of a topic without images. It holds 5 s of odometry at 200 Hz.
+LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s. A larger value finds a new topic later.
+HEAD_START = 1.0  # The time to find all publishers before one of several is chosen, s. A larger value starts sessions later.
+STOP_WAIT = 0.05  # The time until an adapter notices a stop, s. A smaller value wakes it more often without need.
+QUEUE = 1000  # The most waiting messages of a topic without images: 5 s of odometry at 200 Hz. A larger number costs memory.
 
 
 @dataclass
@@ -26,8 +26,8 @@ class TopicChoice:
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
         """Return the wanted topics among those offered (name: type).
 
-        Of several topics that fit the odometry or a camera's images, the shortest name is chosen with a warning.
-        settled: whether all topics are probably known; before that, none of several is chosen.
+        If several topics fit the odometry or the image, the shortest name is chosen with a warning, once the topics are
+        `settled`: probably all known.
         """
         names = sorted(offered, key=lambda name: (len(name), name))
         picked = {name for name in names if self._plain(name, offered[name])}

@@ -16,8 +16,7 @@ from objslam.sources.journal.records import FrameMessage
 
 LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more nonsense.
 _LATEST = 1e11  # The largest valid stamp, s. A float has no microseconds beyond it. A larger value accepts more nonsense.
-_RIGID = 1e-3
-"""The most that an entry of R^T R may differ from the identity. A larger value accepts matrices that are no rotation."""
+_RIGID = 1e-3  # The most that an entry of R^T R differs from the identity. A larger value accepts worse rotations.
 _LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
 _LETTERS = 80  # The most letters of a text in a report. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
@@ -33,10 +32,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Copy track ids into an array (count,) with -1 where unknown; None if they are invalid.
-
-    values: None or a list, as in `Sink.push_detections`.
-    """
+    """Copy the track ids of `Sink.push_detections` into an array (count,), -1 where unknown; None if they are invalid."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)
@@ -123,20 +119,12 @@ def sound_camera(camera: object) -> Camera | str:
 
 
 def sound_frame(
-    stamp: object,
-    camera: str,
-    boxes: object,
-    labels: object,
-    scores: object,
-    depths: object,
-    track_ids: object,
-    whole: object,
+    stamp: Any, camera: str, boxes: Any, labels: Any, scores: Any, depths: Any, track_ids: Any, whole: Any
 ) -> tuple[FrameMessage | None, str, str, dict[str, int]]:
     """Check the arguments of `Sink.push_detections`, which may be of any type.
 
-    Returns:
-        The frame without its invalid boxes, or None if the whole frame is malformed. The reason for dropping the whole
-        frame. The frame's name in reports. The number of invalid boxes by reason.
+    Return the frame without its invalid boxes (None if the whole frame is malformed), the reason for dropping the whole
+    frame, the frame's name in reports, and the number of invalid boxes by reason.
     """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:

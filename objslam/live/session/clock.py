@@ -6,14 +6,10 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5
-"""The number of consecutive poses that prove a clock set back. They increase, and all are older than the path's newest pose.
-A larger number drops more poses before the clock is followed, and mistakes fewer late poses for a clock set back."""
-_BACK = 0.5
-"""The least step, s, of a clock that is set back. A stamp less far back is late. A larger value ignores small steps."""
+_SURE = 5  # The consecutive older poses that prove a clock set back. A larger number follows it later, but more surely.
+_BACK = 0.5  # The least step of a clock set back, s. A smaller step is lateness. A larger value ignores small steps.
 _KEPT = 8  # The number of earlier clocks that stamps may still belong to. More clocks only cost memory.
-_MISSED = 0.005
-"""The time, s, by which the path is assumed to advance while the clock is set back: a step of odometry at 200 Hz."""
+_MISSED = 0.005  # The advance of the path while the clock is set back, s. It is a step of odometry at 200 Hz.
 
 
 @dataclass
@@ -57,7 +53,7 @@ class Clock:
 
 
 class Lead:
-    """Chooses the `path` whose stamps set the clock; None before the first pose.
+    """Chooses the `path` whose stamps set the clock (None before the first pose).
 
     The odometry sets the clock. The localisation takes over when it continues for max_gap (s) without odometry.
     """

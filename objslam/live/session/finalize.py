@@ -22,10 +22,8 @@ from objslam.mapping.describe import describe, summarise
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     """Return the result of a session: association and solve alternate as in the joint mode, from the session's estimate.
 
-    If labels identify objects, or there are more rays than live.reassociate, the session's association is kept.
-
-    Raises:
-        SolveError: when no box could be mapped.
+    If labels identify objects, or there are more rays than live.reassociate, the session's association is kept. SolveError
+    when no box could be mapped.
     """
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
@@ -47,15 +45,12 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     else:
         start = InitialEstimate(poses, association, positions)
         solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start)
-    keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
+    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     accepted = m.counters.accepted()
-    counts = {
-        "detection_frames": accepted.get("frames", 0),
-        "frames_on_path": sum(m.frames.values()),
-        "detections": accepted.get("boxes", 0),
-    }
+    counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
+    counts["detections"] = accepted.get("boxes", 0)
     seconds = {"finish": round(time.perf_counter() - begin, 4)}
     summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
     stamps, first = np.unique(keyframes.stamps, return_index=True)
@@ -64,7 +59,7 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         keyframes=keyframes,
         map_T_base=estimate.map_T_base,
         rays=rays,
-        association=association,
+        association=solution.association,
         origins=origins,
         directions=directions,
         residual=residual,
@@ -139,19 +134,8 @@ def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats
 
 def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays at these rows (R,) in the type of the offline estimation. keyframe: (R,) their keyframes there."""
-    r = m.rays
-    return Rays(
-        keyframe=keyframe,
-        direction=r.direction[rows],
-        sigma=r.sigma[rows],
-        range=r.range[rows],
-        range_sigma=r.range_sigma[rows],
-        label=r.label[rows],
-        score=r.score[rows],
-        box=r.box[rows],
-        track_id=r.track[rows],
-        label_names=tuple(m.labels),
-    )
+    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box", "track")
+    return Rays(keyframe, *(getattr(m.rays, name)[rows] for name in names), tuple(m.labels))
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:

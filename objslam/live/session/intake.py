@@ -29,18 +29,12 @@ from objslam.sources.journal.records import (
 
 _JUMP = 0.1  # The step, m, that odometry may make besides live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The angle, rad, that odometry may turn besides _TURNS_PER_M. A larger value takes more restarts for motion.
-_TURNS_PER_M = 4.0
-"""The turn rate, rad/s, allowed for each m/s of live.max_speed. A larger value takes more restarts for motion."""
-_ZERO = 0.05
-"""Odometry this near to zero, m and rad, after a gap has restarted. A larger value takes more motion for a restart."""
-_FAR = 0.1
-"""The least distance from zero before the gap for a restart, m and rad. A larger value takes more restarts for motion."""
-_STAMPS = 256
-"""The number of stamps remembered per camera to detect duplicates. A larger number detects duplicates that come later."""
-_WAIT = 2.0
-"""The most that a stamp is ahead of the path, s, unless an older clock fits. A larger value takes old stamps for new."""
-_AHEAD = 60.0
-"""The most that a frame may be ahead of the path, s. A larger value lets a frame with one wrong stamp wait longer."""
+_TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
+_ZERO = 0.05  # The distance from zero, m and rad, of restarted odometry after a gap. A larger value detects more restarts.
+_FAR = 0.1  # The least distance from zero, m and rad, before such a gap. A larger value takes more restarts for motion.
+_STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
+_WAIT = 2.0  # The lead over the path, s, above which older clocks are tried. A larger value takes old stamps for new ones.
+_AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 

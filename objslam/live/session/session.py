@@ -26,17 +26,11 @@ from objslam.live.session.snapshots import Describer, take_snapshot
 from objslam.sources.journal.file import Journal, messages
 from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
 
-_MOST_POSES = 20_000
-"""The most messages besides frames that may wait: 100 s of odometry at 200 Hz. A larger number costs memory."""
-_IDLE = 0.05
-"""The longest sleep of the idle thread and the longest wait of a snapshot for a frame, s. A larger value answers later."""
-_SHORT = 0.015
-"""The longest processing of a frame, s, after which a snapshot is made. A larger value delays more frames, because the next
-frame may already wait after a long one."""
-_LONG = 0.5
-"""The wait for a snapshot, s, after which it follows any frame. A larger value answers later while frames take long."""
-_PATIENCE = 5.0
-"""The wait for a new snapshot, s, after which the last one is returned. A larger value keeps the caller waiting longer."""
+_MOST_POSES = 20_000  # The most waiting messages besides frames: 100 s of odometry at 200 Hz. A larger number costs memory.
+_IDLE = 0.05  # The longest sleep of the idle thread and wait of a snapshot for a frame, s. A larger value answers later.
+_SHORT = 0.015  # The longest time of a frame, s, that a snapshot follows. A larger value delays more frames.
+_LONG = 0.5  # The wait for a snapshot, s, after which it follows any frame. A larger value answers later.
+_PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
 class Session(Intake):
@@ -45,10 +39,9 @@ class Session(Intake):
     An error in the session's thread ends the session early. Then `failure` holds the error, every wait for the session ends,
     pushes are refused, and `stop` returns the result of the messages until then.
 
-    Args:
-        journal: the file that receives every accepted message before it is processed. Only one session may write the file.
-        resume: whether to continue an existing journal. `start` processes its messages.
-        patient: whether frames of any age are accepted, for a source that waits for the session.
+    journal: the file that receives every accepted message before it is processed. Only one session may write the file.
+    resume: whether to continue an existing journal, whose messages `start` processes. patient: whether frames of any age are
+    accepted, for a source that waits for the session.
     """
 
     def __init__(
@@ -116,11 +109,8 @@ class Session(Intake):
     def stop(self) -> RunResult:
         """Process the pushed messages, end the thread, and solve the whole map once more.
 
-        After a `failure` the result covers the messages until then, and the ledger gets a warning.
-
-        Raises:
-            SolveError: when no box could be mapped.
-            Exception: the `failure`, when it left no result.
+        After a `failure` the result covers the messages until then, and the ledger gets a warning. Raises the `failure` if
+        it left no result. SolveError when no box could be mapped.
         """
         self._close()
         if self.failure is not None:
@@ -195,7 +185,6 @@ class Session(Intake):
         self._end()
 
     def _serve(self) -> None:
-        """Process messages until the session stops."""
         while True:
             with self._changed:
                 self._busy = False
@@ -244,7 +233,6 @@ class Session(Intake):
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
     def _answer(self) -> None:
-        """Make a snapshot if one is wanted or the session ends."""
         wanted = self._wanted
         if wanted == self._given and not self._stopping:
             return

@@ -21,8 +21,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.live.session.finalize import offline_rays
 
-_BUDGET = 0.012
-"""The time that a snapshot may take, s. A larger value makes frames wait, a smaller value leaves more descriptions old."""
+_BUDGET = 0.012  # The time of a snapshot, s. A larger value delays frames, a smaller value leaves more descriptions old.
 _MOST = 200  # The most rays, evenly spread, that describe an object. A larger number takes longer.
 _FEW = 60  # The most rays for the parallax of an object, which compares all their pairs. A larger number takes longer.
 
@@ -165,7 +164,6 @@ def _track(m: MapState, track: Track) -> MapObject:
 
 
 def _spread(rows: Ints, most: int) -> Ints:
-    """Return at most so many of the rows, evenly spread."""
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
