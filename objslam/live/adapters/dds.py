@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from objslam.core.diagnostics import Ledger
 from objslam.live.dds.network import AUTO, LOOPBACK, Network, receive_buffer
 from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
@@ -59,10 +58,8 @@ class DdsAdapter:
     _topics: dict[str, Any] = field(default_factory=dict)
     _unread: dict[str, int] = field(default_factory=dict)
 
-    @property
-    def ledger(self) -> Ledger:
-        """The counts of messages that were dropped before a push, and warnings."""
-        return self.messages.ledger
+    def __post_init__(self) -> None:
+        self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
         """Push messages until stop is set."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
@@ -36,11 +35,7 @@ class RclpyAdapter:
         except ImportError as error:
             hint = "source the setup of ROS 2 with its own Python, or use `objslam live dds`, which needs no ROS"
             raise ObjslamError(f"rclpy cannot be imported ({error})", hint=hint) from error
-
-    @property
-    def ledger(self) -> Ledger:
-        """The counts of messages that were dropped before a push, and warnings."""
-        return self.messages.ledger
+        self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
         """Push messages until stop is set."""

@@ -31,7 +31,6 @@ from objslam.io.detections_jsonl import Malformed, add_frame, parse_object, read
 from objslam.live.interface import Sink
 
 _CAMERA = "camera"
-_TYPES = ("camera", "odometry", "localization", "mount", "detections")
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are skipped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
 _WAIT = 0.1  # The time until a stop is noticed, s. A larger value notices it later.
@@ -96,7 +95,7 @@ class StdinAdapter:
         elif kind == "detections":
             self._push_detections(message, place)
         else:
-            raise Malformed(f"type is none of {', '.join(_TYPES)}")
+            raise Malformed("type is none of camera, odometry, localization, mount, detections")
 
     def _push_detections(self, message: dict[str, Any], place: str) -> None:
         collector = BoxCollector()

@@ -1,4 +1,1 @@
-"""DDS, the transport of ROS 2: the network, the message types, and the publication of the map.
-
-The adapter that receives a session's messages over DDS is `live.adapters.dds`.
-"""
+"""DDS is the transport of ROS 2: network, message types, publication of the map. Its adapter is `live.adapters.dds`."""

@@ -20,7 +20,6 @@ _MAX_DOMAIN = 232  # The largest number of a DDS domain: larger domains have no 
 _BUFFER = "4MB"  # The requested socket buffer. It holds a raw image, which arrives as a burst of fragments.
 _FAILED = re.compile(r"deserialization (\S+) failed")
 _MALFORMED = re.compile(r"malformed packet")
-_DEVICE = b"lo\0"  # The name of the loopback device.
 
 
 @dataclass
@@ -138,7 +137,7 @@ def _keep_inside(sockets: set[int]) -> None:
         with socket.socket(fileno=os.dup(number)) as own:
             if own.type == socket.SOCK_DGRAM:
                 try:
-                    own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
+                    own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
                 except OSError as error:  # kernels before 5.7 need a privilege
                     raise ObjslamError(
                         f"the DDS sockets cannot be bound to the loopback interface ({error.strerror})",

@@ -39,7 +39,6 @@ class RosMessages:
 
     Odometry comes from one topic, or from tf without a topic. Localisation comes from poses in map, or from tf: each new
     map -> odom is pushed with the next odometry.
-
     ledger: the counts of unusable messages. chosen: the topics of the options. sources: the used topic, or "tf", by role.
     """
 

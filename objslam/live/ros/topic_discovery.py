@@ -51,9 +51,8 @@ class TopicChoice:
             return self._allows("camera_info", name, default=True)
         if type_ in IMAGES:
             return (self.images and self._allows("image", name)) or self._allows("depth", name)
-        if type_ == ODOMETRY and self._allows("odometry", name):
-            return True
-        return type_ in (ODOMETRY, *POSES) and self._allows("localization", name)
+        odometry = type_ == ODOMETRY and self._allows("odometry", name)
+        return odometry or (type_ in (ODOMETRY, *POSES) and self._allows("localization", name))
 
     def _allows(self, role: str, name: str, default: bool = False) -> bool:
         names = self.chosen.of(role)

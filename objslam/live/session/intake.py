@@ -35,7 +35,6 @@ _FAR = 0.1  # The least distance from zero, m and rad, before such a gap. A larg
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # The lead over the path, s, above which older clocks are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
-
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 
 

@@ -53,10 +53,9 @@ class Session(Intake):
         patient: bool = False,
     ) -> None:
         super().__init__(settings, Counters(), self._enqueue)
-        self._name = name
         self._mapper = Mapper(settings, self.counters)
         self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, patient)
-        self._journal_file, self._resume = journal, resume
+        self._name, self._journal_file, self._resume = name, journal, resume
         self._journal = Journal(journal, resume) if journal is not None else None
         if self._journal is not None and self._journal.torn:
             self.counters.drop("torn record at the end of the journal", f"{journal}, {self._journal.torn} bytes")
