@@ -123,7 +123,7 @@ class DdsAdapter:
         from cyclonedds.topic import Topic
 
         topic, type_, (reliable, latched) = publication.topic, publication.type, publication.kind
-        layouts = layouts_of(type_)
+        layouts: tuple[Any, ...] = layouts_of(type_)
         if not layouts:
             self.ledger.warn(f"{topic}: left out, because its type {type_} is unknown and DDS sends no definitions")
             return None

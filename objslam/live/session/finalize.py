@@ -134,8 +134,9 @@ def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats
 
 def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays at these rows (R,) in the type of the offline estimation. keyframe: (R,) their keyframes there."""
-    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box", "track")
-    return Rays(keyframe, *(getattr(m.rays, name)[rows] for name in names), tuple(m.labels))
+    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
+    columns = {name: getattr(m.rays, name)[rows] for name in names}
+    return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
