@@ -146,7 +146,7 @@ def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
     kept = journal_in(out)
     done = subprocess.run(command("stdin", out), input="", capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 1
-    assert "no camera came; no odometry or localisation came; no detections came" in done.stderr
+    assert "no camera arrived; no odometry or localisation arrived; no detections arrived" in done.stderr
     assert "Traceback" not in done.stderr
     assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
 
