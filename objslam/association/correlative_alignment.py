@@ -1,7 +1,5 @@
 """Align a stretch of rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints

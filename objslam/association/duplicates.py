@@ -1,7 +1,5 @@
 """Find estimated objects that may be duplicates, in a solved log and in a live session."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints

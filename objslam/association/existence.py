@@ -1,7 +1,5 @@
 """Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gate matches between rays and landmarks, and assign at most one ray of a frame to each landmark."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

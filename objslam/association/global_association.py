@@ -4,8 +4,6 @@ A search finds points where rays of one label meet, and the best points become l
 across labels and dropped, each time in favour of the cheaper explanation of the boxes and the misses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Search points that many rays of one label agree on, from pairs of rays, in torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Unknown objects may lie in their wide gates. So one pose error must explain the offsets of all landmarks together.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.association.gating import tangent_basis

@@ -1,7 +1,5 @@
 """Find the other labels that a detector sometimes gives to an object."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

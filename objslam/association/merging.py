@@ -1,7 +1,5 @@
 """Decide whether two landmarks are one object, by the cheaper explanation of their rays, common frames and misses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nearest-neighbour association of rays with known landmarks by predicted bearing, or of each label with one object."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.association.gating import best_assignment, gate_limit, gated_edges

@@ -1,7 +1,5 @@
 """Rays as lines in the map for association, their closest approaches, and the sizes of what they observe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Self

@@ -4,8 +4,6 @@ Several landmarks that fit under one shift and turn within the drift are evidenc
 factor of "these landmarks are those" over "all of them are new".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

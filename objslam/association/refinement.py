@@ -1,7 +1,5 @@
 """Residuals of rays at points, and points that fit rays best, by iterated weighted least squares."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations

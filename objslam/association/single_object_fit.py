@@ -3,8 +3,6 @@
 Both use a consensus of ray pairs. This module uses numpy, because a call of torch takes too long for a frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Determine in which frames each object should be detected, and in which frames it is."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

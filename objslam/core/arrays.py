@@ -1,7 +1,5 @@
 """Short names of the array types."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A calibrated camera with its projection, undistortion and field of view."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from functools import cached_property

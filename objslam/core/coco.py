@@ -1,7 +1,5 @@
 """The 80 class names of COCO, in the order of their numbers in COCO detectors (Lin et al., ECCV 2014)."""
 
-from __future__ import annotations
-
 COCO_NAMES: tuple[str, ...] = tuple(
     """
     person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light, fire hydrant, stop sign,

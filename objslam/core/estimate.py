@@ -1,7 +1,5 @@
 """The result type of every solver."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from objslam.core.arrays import Bools, Floats

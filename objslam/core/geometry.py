@@ -3,8 +3,6 @@
 Twists have the order of GTSAM, rotation first: (wx, wy, wz, vx, vy, vz).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The result of a run, from which every output is made."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The state of a live session at one moment."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

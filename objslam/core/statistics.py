@@ -3,8 +3,6 @@
 Deviations are in standard deviations. The deviation of a ray is the norm of two components across the ray.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rule by which an object counts as resolved. Triangulation, runs and sessions share it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Corrections of a path by the corrections of its keyframes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Floats

@@ -4,8 +4,6 @@ Frames follow REP 103/105: `map`, `odom`, `base` (x forward, y left, z up), `cam
 forward). `a_T_b` is the pose of b in a: it takes b coordinates to a coordinates. SI units, radians, seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Turn boxes into bearing rays: the undistorted centre of a box gives a direction from its keyframe's camera."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.config import Settings

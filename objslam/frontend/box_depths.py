@@ -1,7 +1,5 @@
 """Read the depths of boxes from depth images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

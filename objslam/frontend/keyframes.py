@@ -1,7 +1,5 @@
 """Select keyframes: camera frames whose pose is known from the robot's path."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.config import Settings

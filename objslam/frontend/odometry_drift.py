@@ -1,7 +1,5 @@
 """The covariance that odometry accumulates along its path."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Choose the factors for the measurements of a log, for the initialisations, outlier rejection and the final solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

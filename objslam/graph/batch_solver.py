@@ -1,7 +1,5 @@
 """Solve a whole log in one factor graph: objects at fixed poses, or poses and objects together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Triangulate objects at fixed camera poses, with the noise of these poses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.config import Settings

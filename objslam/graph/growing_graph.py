@@ -1,7 +1,5 @@
 """Keep the variables and factors of a growing graph. The factors are the same as offline, and all of them are stored."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes
 solved ones predict. A landmark enters when its rays so far determine its position.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -5,8 +5,6 @@ landmarks by predicted bearing, with a gate that contains the odometry's drift. 
 whose poses still agree, give new landmarks. The result is the start of a global association.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ If an update throws, Levenberg-Marquardt solves the stored factors from the last
 The damping covers variables that nothing holds yet.
 """
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

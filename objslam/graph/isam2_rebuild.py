@@ -1,7 +1,5 @@
 """Rebuild a large iSAM2 graph in slices, while the old graph stays in use, so that no frame waits for the whole rebuild."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import gtsam

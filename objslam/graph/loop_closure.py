@@ -1,7 +1,5 @@
 """Close loops during initialisation: find recent landmarks that are also old landmarks, and correct the path."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

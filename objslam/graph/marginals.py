@@ -1,7 +1,5 @@
 """Compute marginal covariances of landmarks, also if the graph does not determine all landmarks."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Optimise a factor graph by Levenberg-Marquardt or GNC, and turn GTSAM's exceptions into errors with a hint."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

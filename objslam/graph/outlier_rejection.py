@@ -1,7 +1,5 @@
 """Reject outliers: the joint solve and a test of every ray alternate until the set of inliers is stable."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

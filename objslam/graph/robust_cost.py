@@ -1,7 +1,5 @@
 """Compute the cost of poses and landmarks for comparing solutions with different inliers, and the information of rays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints

@@ -3,8 +3,6 @@
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, Self
 

@@ -1,7 +1,5 @@
 """Write single files and sets of files atomically, so that a killed process leaves no partial result."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Collect boxes frame by frame and check them together."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -3,8 +3,6 @@
 The reader uses YAML nodes, which keep line numbers. Numbers such as 1e-05, which YAML 1.1 reads as text, stay numbers.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read and write detections.jsonl, which has one camera frame per line as JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

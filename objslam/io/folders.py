@@ -1,7 +1,5 @@
 """Remove empty folders after a failure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Image lists in TUM format, rgb.txt and depth.txt, with "stamp relative/path" per line and '#' comments."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Read the stated size of a compressed image from its header without decoding the image."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 

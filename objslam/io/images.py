@@ -3,8 +3,6 @@
 A PNG, JPEG or GIF file of some kB can state a size of gigabytes. The stated size is therefore checked first.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

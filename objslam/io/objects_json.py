@@ -1,7 +1,5 @@
 """Read and write objects.json, the file format of object maps and of ground truth."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """Read and write motions.parquet, the odometry between the poses of a result, for exports and other optimisers."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

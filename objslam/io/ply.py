@@ -1,7 +1,5 @@
 """Write surfaces as PLY files (binary, little endian) for MeshLab, CloudCompare, Blender and Open3D."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

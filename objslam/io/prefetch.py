@@ -1,7 +1,5 @@
 """Process items in threads before the consumer needs them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

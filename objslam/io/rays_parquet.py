@@ -1,7 +1,5 @@
 """Read and write rays.parquet, the file with the rays of a result."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

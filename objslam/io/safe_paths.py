@@ -1,7 +1,5 @@
 """Check that the files that a log lists are inside its folder."""
 
-from __future__ import annotations
-
 import os
 import stat
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read text files of a log line by line. Malformed lines are dropped and counted with file and line."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import stat

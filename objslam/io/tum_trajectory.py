@@ -1,7 +1,5 @@
 """Trajectories in TUM format, with "stamp tx ty tz qx qy qz qw" per line and '#' comments."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Counters of a session: accepted messages, dropped messages by reason, and the duration of map updates."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter, deque
 

@@ -1,7 +1,5 @@
 """The interface between adapters, which push messages, and a session, which maps them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

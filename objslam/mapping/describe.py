@@ -1,7 +1,5 @@
 """Describe a solution: each object with its evidence, and the summary of the run."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import platform
 from pathlib import Path

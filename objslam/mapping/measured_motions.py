@@ -1,7 +1,5 @@
 """Compute the odometry between the poses of a result, for exports and other optimisers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Run the offline mapping: turn a whole log into a map of objects."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The result folder: the functions that write its files, clear it, and replace an older result by a new result."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

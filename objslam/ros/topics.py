@@ -1,7 +1,5 @@
 """Assign roles to topics: the known roles, the choices of the user, and hints in topic names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile

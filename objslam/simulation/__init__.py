@@ -2,8 +2,6 @@
 objects and each noise have their own random generators, so a change of one noise leaves the others unchanged.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.geometry import lift_se2

@@ -1,7 +1,5 @@
 """Simulate the views of the cameras, and the boxes of their detector."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Make random furnished rooms for rendered drives: walls, tables, shelves and cabinets, with objects on them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Render colour, depth and objects of a furnished room by ray casting with Open3D on the CPU, without a display."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

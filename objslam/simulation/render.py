@@ -1,7 +1,5 @@
 """Render drives of a robot with an RGB-D camera among furniture and the paper's seven objects, as log folders."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Draw the standing and the moving objects of a simulated drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, count, islice

@@ -1,7 +1,5 @@
 """Simulate an RGB-D camera on rendered images: exposure, blur, vignette and grain, and depth with noise and holes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

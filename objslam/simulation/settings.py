@@ -1,7 +1,5 @@
 """The settings of a simulated drive: the room, the robot, the cameras, the objects and every error."""
 
-from __future__ import annotations
-
 from math import gcd
 from typing import Annotated, Any, Literal, Self
 

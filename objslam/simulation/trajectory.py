@@ -1,7 +1,5 @@
 """Simulate the path of the robot, its odometry and its localisation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Read and write log folders, the format on disk that holds everything in a `Log`."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -4,8 +4,6 @@ Each source declares its options as the fields of a frozen dataclass. `--help` i
 such a file imports nothing heavy at its top, not even numpy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, get_type_hints

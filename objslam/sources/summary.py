@@ -1,7 +1,5 @@
 """A summary of a log for `objslam info`: its streams, its cameras and the data that a run needs but the log lacks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ share of rays whose agreement is the least likely by chance (Moisan & Stival, IJ
 2, 2012).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Covariance and parallax of triangulated objects, and their fusion with ranges, for many objects at once, in torch."""
 
-from __future__ import annotations
-
 import math
 
 import torch

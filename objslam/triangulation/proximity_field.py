@@ -1,7 +1,5 @@
 """The proximity field: the cost of Eq. 1 around one object, as in the heat map of Staszak & Belter's Fig. 2."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

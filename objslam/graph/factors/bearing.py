@@ -1,7 +1,5 @@
 """Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray (Eq. 1)."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Factors for a localisation, which measures the absolute pose of a keyframe."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Make noise models from a standard deviation and a loss, which limits the influence of outliers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Compute motions between keyframes by odometry, their covariances, and their factors."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Priors without a measurement: they fix the map frame and keep the linear system determined."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

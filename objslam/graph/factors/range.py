@@ -1,7 +1,5 @@
 """Factors for the measured range of a box, with the pose as a variable or fixed."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Make the factors of rays, offline and live: a bearing for each ray, and a range for each ray with a measured range."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gtsam

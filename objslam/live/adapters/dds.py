@@ -1,7 +1,5 @@
 """Receives the messages of a ROS 2 robot over DDS, without an installed ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Receives the messages of a ROS 2 robot as a ROS node, which needs an installed and sourced ROS 2."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Replays a log at its own speed, at another speed, or as fast as the session accepts it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

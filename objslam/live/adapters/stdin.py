@@ -10,8 +10,6 @@ A planar pose has "x", "y", "yaw" instead of translation and rotation. Odometry 
 36 numbers. "camera" and "name" may be left out with a single camera, which is then called "camera".
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

@@ -1,7 +1,5 @@
 """Joins DDS domains on a chosen network, and counts the payloads that the DDS library rejects."""
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re

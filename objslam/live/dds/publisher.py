@@ -1,7 +1,5 @@
 """Publishes a session's map over DDS for RViz and Nav2: objects, markers and the corrected path."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

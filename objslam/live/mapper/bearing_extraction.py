@@ -1,7 +1,5 @@
 """The bearings of a frame, with the calibrations and mounts of the cameras and the numbers of labels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

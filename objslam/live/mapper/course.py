@@ -3,8 +3,6 @@
 Localisation replaces missing odometry. It also relates two pieces of the course at a change of source or after a gap.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

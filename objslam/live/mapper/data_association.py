@@ -1,7 +1,5 @@
 """The association of a new keyframe's rays with landmarks and tracks, and the ray factors in the graph."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.association.landmarks import PredictedLandmarks

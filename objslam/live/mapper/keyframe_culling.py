@@ -1,7 +1,5 @@
 """The culling of old keyframes, which bounds the size of the map."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Bools, Ints

@@ -1,7 +1,5 @@
 """The selection of keyframes by motion and by new labels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table of landmarks, with their covariances, their noise, and the landmarks that a camera should see."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

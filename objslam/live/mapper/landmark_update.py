@@ -1,7 +1,5 @@
 """The update of landmarks by a new keyframe, and the merging and removal of landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """Factors on keyframe poses: absolute poses by localisation, and motions between consecutive keyframes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Floats

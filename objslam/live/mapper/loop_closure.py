@@ -1,7 +1,5 @@
 """Loop closure: landmarks seen now are recognised as landmarks seen long ago, several at once, and merged."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """The periodic maintenance of a map: solves, outlier rejection, merging of duplicates, loop closure, and bounded growth."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.association.duplicates import near_pairs, seen_as_two

@@ -3,8 +3,6 @@
 The map depends on the messages and their order only, never on the clock, so a replayed journal gives the same map.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The uncertainty of a camera pose, and the uncertainty of landmarks relative to the camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The prediction of the camera pose of a frame, with its uncertainty, before association."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

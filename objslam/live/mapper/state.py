@@ -1,7 +1,5 @@
 """The state of a live map: graph, course, keyframes, rays, landmarks and tracks."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 

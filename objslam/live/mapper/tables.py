@@ -1,7 +1,5 @@
 """Tables of arrays that grow by rows, and the tables of keyframes and rays."""
 
-from __future__ import annotations
-
 from copy import copy
 from typing import Any, Self
 

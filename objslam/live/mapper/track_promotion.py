@@ -1,7 +1,5 @@
 """The promotion of tracks to landmarks, and the removal of surplus tracks."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import count

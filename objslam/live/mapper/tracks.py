@@ -1,7 +1,5 @@
 """Tracks: boxes of one object over several frames, before their parallax is enough for a landmark."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

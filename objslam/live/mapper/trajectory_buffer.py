@@ -1,7 +1,5 @@
 """A buffer of the newest poses of a path, with interpolation and accumulated drift."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from typing import NamedTuple
 

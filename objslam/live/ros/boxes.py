@@ -1,7 +1,5 @@
 """The boxes of one image before they are pushed, and the depth images that give their depths."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The cameras of a running robot: calibrations, places, and the boxes that wait until both are known."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

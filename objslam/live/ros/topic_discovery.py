@@ -1,7 +1,5 @@
 """The choice of topics of a running robot, by message type or by the user's options."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

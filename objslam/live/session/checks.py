@@ -1,7 +1,5 @@
 """Checks of pushed messages: values of any type become valid numbers, names, cameras and frames, or None."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Set
 from typing import Any

@@ -1,7 +1,5 @@
 """The session's clock: session time never goes back, even when the robot's clock does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind

@@ -1,7 +1,5 @@
 """The end of a session: its keyframes and rays are solved once more as offline, and become a result."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

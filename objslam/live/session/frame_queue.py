@@ -1,7 +1,5 @@
 """The queue of frames that wait until the path covers them, and then enter the map in the order of their stamps."""
 
-from __future__ import annotations
-
 import bisect
 import time
 

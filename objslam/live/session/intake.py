@@ -1,7 +1,5 @@
 """The entry of a session: every message is checked, put on the session's clock, delivered and counted."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

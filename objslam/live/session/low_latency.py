@@ -1,7 +1,5 @@
 """Settings of the Python process that shorten its pauses."""
 
-from __future__ import annotations
-
 import gc
 import sys
 

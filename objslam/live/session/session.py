@@ -1,7 +1,5 @@
 """A session: messages pushed from any thread become a map in the session's own thread."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """Snapshots of the map, made in milliseconds: only objects that were seen since the last snapshot are described again."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

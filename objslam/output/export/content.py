@@ -1,7 +1,5 @@
 """The content of an export: a result that is read back from its folder, and the position of its map on the earth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self

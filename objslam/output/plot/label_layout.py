@@ -1,7 +1,5 @@
 """Placement of labels in a picture, so that no label covers another label or a dot."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats

@@ -1,7 +1,5 @@
 """The picture map.png: the map from above."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Colours, captions, ray lengths and the framed area of the map, for all pictures, recordings and exports."""
 
-from __future__ import annotations
-
 import colorsys
 from collections import Counter
 from typing import Literal

@@ -3,8 +3,6 @@
 The errors against the ground truth are computed in `evaluation`, and the picture of the map is drawn in `plot`.
 """
 
-from __future__ import annotations
-
 from objslam.output.report.page import write_report
 
 __all__ = ["write_report"]

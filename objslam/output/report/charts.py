@@ -1,7 +1,5 @@
 """Histograms of residuals; the page's template draws their bars in SVG."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

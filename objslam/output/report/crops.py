@@ -1,7 +1,5 @@
 """Pictures of an object: crops of its best boxes from the images of the log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The HTML page of a result folder: this module collects the data, and a template lays them out."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """The layout of a recording when the viewer first opens it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import rerun as rr

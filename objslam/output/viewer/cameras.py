@@ -1,7 +1,5 @@
 """Cameras in a recording: moving frusta, images, boxes, and the objects of the map projected into the images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

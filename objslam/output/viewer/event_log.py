@@ -1,7 +1,5 @@
 """The texts of a recording: events of the drive, changes of each round, changes of a live map, a table of the run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Camera images for a recording: a limited number of small JPEGs, which threads read ahead."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Objects in a recording: points, labels, covariance ellipsoids, boxes, and a line for each unresolved object."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

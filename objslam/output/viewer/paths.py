@@ -1,7 +1,5 @@
 """Paths, the robot on its path, and the estimate after each iteration of the solver."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

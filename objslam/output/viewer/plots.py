@@ -1,7 +1,5 @@
 """Curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rays: used rays are blue, rejected rays are red, and unexplained rays are grey."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

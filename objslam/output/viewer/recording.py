@@ -1,7 +1,5 @@
 """The recording of a run, recording.rrd, for the rerun viewer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The timelines of a recording: the stamps of the drive and the iterations of the solver."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

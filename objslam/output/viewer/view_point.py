@@ -1,7 +1,5 @@
 """The first view of a map, and the placement of labels on the map and in camera images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

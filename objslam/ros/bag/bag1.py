@@ -3,8 +3,6 @@
 The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes only reveal missing messages.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

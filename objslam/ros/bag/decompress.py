@@ -1,7 +1,5 @@
 """Decompression with a size limit, which also recovers the readable part of data that are cut off."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator
 from pathlib import Path

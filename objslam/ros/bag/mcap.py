@@ -3,8 +3,6 @@
 See https://mcap.dev/spec. The summary only supplies the message count and channels whose first description is lost.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

@@ -1,7 +1,5 @@
 """Find the files of one recording, sort them, and read their messages in sequence."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Sequence

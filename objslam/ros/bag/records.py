@@ -1,7 +1,5 @@
 """The content of a bag file, independent of its format, and the report of unreadable parts."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

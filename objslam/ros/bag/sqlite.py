@@ -1,7 +1,5 @@
 """ROS 2 bags of the sqlite3 storage, read in rowid order. A damaged database is read page by page."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import tempfile

@@ -3,8 +3,6 @@
 https://www.sqlite.org/fileformat2.html, sections 1.3 (header), 1.6 (b-tree pages, cells, overflow), 2.1 (records).
 """
 
-from __future__ import annotations
-
 import mmap
 import struct
 from array import array

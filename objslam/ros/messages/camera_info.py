@@ -1,7 +1,5 @@
 """Convert CameraInfo messages to cameras."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from typing import Any, get_args

@@ -3,8 +3,6 @@
 The source is the documentation of the packages. vision_msgs 3.x and 4.x have equal bytes, and 2.x (Foxy) has more fields.
 """
 
-from __future__ import annotations
-
 _TYPES = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",

@@ -1,7 +1,5 @@
 """Read boxes from detection messages: vision_msgs in four layouts and AprilTags of several packages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Convert image messages to pixel arrays and to file contents."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any

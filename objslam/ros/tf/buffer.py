@@ -1,7 +1,5 @@
 """Buffer the transforms of /tf and /tf_static of a live robot, for as long as tf2 does."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Classify coordinate frames by name, and search the tree of frames."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any

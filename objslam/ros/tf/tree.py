@@ -1,7 +1,5 @@
 """Look up static and moving transforms in the tree of coordinate frames of /tf and /tf_static."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ A record is in the kernel's cache before its message counts, so a killed process
 `_SYNC_EVERY` later, so a power failure loses at most the messages of that time.
 """
 
-from __future__ import annotations
-
 import fcntl
 import itertools
 import os

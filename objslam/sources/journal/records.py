@@ -1,7 +1,5 @@
 """The messages that a live session accepts, and their encoding as bytes for the journal."""
 
-from __future__ import annotations
-
 import json
 import struct
 from bisect import bisect_right

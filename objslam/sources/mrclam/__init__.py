@@ -1,7 +1,5 @@
 """The options of UTIAS MRCLAM datasets. The folders are read in `reader`, which `--help` does not import."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -4,8 +4,6 @@ Source: Leung, Halpern, Barfoot, Liu, The UTIAS multi-robot cooperative localiza
 The reader converts bearings into pixels of a virtual pinhole camera in the origin of base that looks forward.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

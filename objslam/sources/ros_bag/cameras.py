@@ -1,7 +1,5 @@
 """Find the topics of each camera, its calibration and its pose on the robot."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """A summary of a ROS bag for `objslam info`: its content, and the role of each topic in a run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

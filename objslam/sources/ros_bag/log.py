@@ -1,7 +1,5 @@
 """Read ROS bags into a log."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The options of ROS messages, both recorded and live, and the options of bags."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Choose the topic for each role in a run, by type and content."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Read the robot's path, odometry and localisation, from topics and the tf tree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The options of TUM RGB-D datasets. The folders are read in `reader`, which `--help` does not import."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from objslam.sources.options import Label, WithRange

@@ -5,8 +5,6 @@ boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The sta
 groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are the camera's, so base is the camera.
 """
 
-from __future__ import annotations
-
 import lzma
 import re
 import tarfile

@@ -3,8 +3,6 @@
 Every command imports these modules at its start, so they import slow libraries (numpy too) inside their functions.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from pkgutil import iter_modules
 

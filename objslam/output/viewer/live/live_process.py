@@ -7,8 +7,6 @@ stdin. It answers each message with a line: "ok" if the viewer or the file has r
 uncertain.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """The messages from a session to its view process: JSON, followed by the images."""
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass
