@@ -1,4 +1,4 @@
-"""objslam: object SLAM for mobile robots, from detector boxes and planar poses to a map of objects in 3D."""
+"""objslam: object SLAM for mobile robots, which builds a 3D map of objects from detector boxes and planar poses."""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +11,7 @@ __all__ = ["ObjectMap", "__version__"]
 
 
 def __getattr__(name: str) -> object:
-    """`from objslam import ObjectMap`, imported when asked for: the command line must answer at once."""
+    """Import `ObjectMap` at its first use, so that the command line starts fast."""
     if name == "ObjectMap":
         from objslam.results.object_map import ObjectMap
 

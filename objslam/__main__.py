@@ -1,4 +1,4 @@
-"""`python -m objslam` is `objslam`."""
+"""Entry point of `python -m objslam`, which runs the command `objslam`."""
 
 from objslam.cli import main
 

@@ -1,10 +1,8 @@
-"""Errors that a user can act on: each says what is wrong, where, and what to do."""
-
-from __future__ import annotations
+"""Errors that a user can correct. Each error names the problem, the place and the remedy."""
 
 
 def one_line(text: object) -> str:
-    """A text, or what an exception says, on one line that any file can hold; an exception without words by its type."""
+    """Return a text or an exception as one line of valid Unicode. An exception without a text becomes its type name."""
     said = str(text)
     if not said.isprintable():
         joined = " ".join(part for line in said.splitlines() if (part := line.strip()))
@@ -13,10 +11,8 @@ def one_line(text: object) -> str:
 
 
 class ObjslamError(Exception):
-    """The work failed for a reason that a user can act on; `where` is a file:line, topic or stamp, `hint` what to do.
-
-    Whatever the three are made of, they and the error as text are one line each.
-    """
+    """Report a failure that a user can correct. `where` is a file:line, topic or timestamp, and `hint` is the remedy.
+    Message, place, hint and the text of the error become one line each."""
 
     exit_code = 1
 
@@ -32,28 +28,28 @@ class ObjslamError(Exception):
 
 
 def first_line(error: BaseException) -> str:
-    """What an error of some library says first, cut to what fits a line; its kind where it says nothing."""
+    """Return at most 300 characters of the first line of an error, or the type name of an error without a text."""
     text = str(error).strip().splitlines()
     return text[0][:300] if text else type(error).__name__
 
 
 class LogError(ObjslamError):
-    """A log, or a part of it that the work cannot do without, cannot be read."""
+    """Report a log, or a necessary part of a log, that cannot be read."""
 
 
 class SolveError(ObjslamError):
-    """The estimation has no answer to give: nothing to solve, or no solver found one."""
+    """Report an estimation without a solution: there is nothing to solve, or every solver fails."""
 
 
 class DetectorError(ObjslamError):
-    """A detector model cannot be loaded, understood or run."""
+    """Report a detector model that cannot be loaded, interpreted or run."""
 
 
 class OutputError(ObjslamError):
-    """A result cannot be written or read back."""
+    """Report a result that cannot be written or read."""
 
 
 class ConfigError(ObjslamError):
-    """A setting or an option is wrong: wrong use, not failed work."""
+    """Report a wrong setting or option, which is a usage error."""
 
     exit_code = 2

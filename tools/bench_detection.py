@@ -22,7 +22,7 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.detection import load_detector
 from objslam.detection.cache import DetectionCache, Entry
-from objslam.detection.image_loader import load_frame
+from objslam.detection.detect_log import load_frame
 
 PARTS = ("read and decode", "fit in", "network", "boxes from outputs", "write to cache")
 ENOUGH = 5.0  # ms that everything around the network may take

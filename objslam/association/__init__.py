@@ -1,4 +1,4 @@
-"""Which ray belongs to which object, for offline and live alike: gates, assignment, existence, place recognition.
+"""Decides which ray belongs to which object, offline and live: gates, assignment, existence and place recognition.
 
-Nothing here moves a pose or holds a factor: that is `graph`; the state of a live map is in `live.mapper`.
+It changes no pose and holds no factor: `graph` does, and `live.mapper` holds the state of a live map.
 """

@@ -1,6 +1,4 @@
-"""Correlative alignment (after Olson, ICRA 2009): the planar correction that lays rays of a stretch onto known landmarks."""
-
-from __future__ import annotations
+"""Align a stretch of rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
 
 import numpy as np
 
@@ -10,28 +8,25 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 _GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
-_MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most steps of the grid in yaw, and in x and y; larger costs time.
-_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The least steps (rad, m): the association that follows finds the rest.
-_LANDMARK_SIGMA = 0.03  # The standard deviation (m) of a landmark's position here.
-_MIN_LEVEL = 0.1  # The least cosine of a ray's elevation that its heading's noise is divided by.
-_AT_ONCE = 2_000_000  # The distances computed together; larger needs more memory.
-_MOST_RANGE_COST = 9.0  # The most that a range costs, in squared deviations, because it may be wrong.
+_MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y; larger costs time.
+_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m); later association corrects the rest.
+_LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
+_MIN_LEVEL = 0.1  # The least cosine of a ray's elevation by which its heading noise is divided.
+_AT_ONCE = 2_000_000  # The most distances computed together; larger needs more memory.
+_MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations, because the range may be wrong.
 
 
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
-    """The planar correction (4, 4), in map, of the cameras of these rays.
+    """Return the planar correction (4, 4) in map that aligns the rays of these cameras with the landmarks.
 
-    Every ray costs its squared deviation from the landmark of its label that it fits best, or that of a stray.
-
-    Args:
-        positions: (N, 3) m, and labels: (N,), of the landmarks.
-        centre: (3,) m, the point about which the correction turns.
-        spread: (3,) standard deviations of x, y (m) and yaw (rad) in map: the correction's prior, which also bounds it.
+    Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray. positions,
+    labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
+    standard deviations of x, y (m) and yaw (rad) in map, which define the prior and bound the grid.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
     cost = ((grid / np.maximum(spread, 1e-6)) ** 2).sum(axis=1)
-    few = max(1, _AT_ONCE // max(1, len(positions)))  # rays
+    few = max(1, _AT_ONCE // max(1, len(positions)))  # The number of rays in a block.
     size = max(1, _AT_ONCE // max(1, min(len(rays), few) * len(positions)))
     for first in range(0, len(rays), few):
         some = rays.take(np.arange(first, min(first + few, len(rays))))
@@ -46,7 +41,7 @@ def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, cen
 def _misfit(
     rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
 ) -> Floats:
-    """The cost (H,) of all rays under corrections (H, 3)."""
+    """Return the cost (H,) of all rays under corrections (H, 3)."""
     origin, direction = rays.in_map(map_T_camera)
     offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
     cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])
@@ -60,11 +55,11 @@ def _misfit(
     deviation = angle**2 / (sigma**2 + (_LANDMARK_SIGMA / distance) ** 2)
     miss = (distance - (rays.range * level)[:, None]) ** 2 / (rays.range_sigma**2 + _LANDMARK_SIGMA**2)[:, None]
     deviation += np.where(np.isfinite(rays.range)[:, None], np.minimum(miss, _MOST_RANGE_COST), 0.0)
-    same = rays.label[:, None] == labels
-    return np.asarray(np.where(same, deviation, STRAY_RAY).min(axis=2, initial=STRAY_RAY).sum(axis=1))
+    cost = np.where(rays.label[:, None] == labels, deviation, STRAY_RAY)
+    return np.asarray(cost.min(axis=2, initial=STRAY_RAY).sum(axis=1))
 
 
 def _steps(sigma: float, finest: float, most: int) -> Floats:
-    """The steps of the grid along one axis, 0 among them."""
+    """Return the grid values along one axis, which include 0."""
     half = int(min(np.ceil(_GRID_SIGMAS * sigma / finest), most // 2))
     return np.linspace(-_GRID_SIGMAS * sigma, _GRID_SIGMAS * sigma, 2 * half + 1) if half else np.zeros(1)

@@ -1,17 +1,15 @@
-"""Which estimated objects may be one and the same, in a solved log and in a session alike."""
-
-from __future__ import annotations
+"""Find estimated objects that may be duplicates, in a solved log and in a live session."""
 
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""The share of the frames with two objects that a wrong box may account for; larger merges objects that were seen as two."""
+"""The largest share of frames that may show both duplicates because of wrong boxes; larger merges separate objects."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs a < b (P,) of objects (N,) of one label less than `farthest` m apart, and the way from b to a (P, 3), m."""
+    """Return the pairs a < b (P,) of objects (N,) of one label within `farthest` m, and the offsets (P, 3) m from b to a."""
     a, b = np.triu_indices(len(position), 1)
     apart = position[a] - position[b]
     near = (label[a] == label[b]) & (np.linalg.norm(apart, axis=1) < farthest)
@@ -19,5 +17,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Whether frames show two objects to be two: `together` show both, `frames` the one seen less."""
+    """Return whether two objects differ. `together` frames show both, and `frames` frames show the rarer object."""
     return together > TOGETHER * frames

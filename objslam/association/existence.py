@@ -1,6 +1,4 @@
-"""Is there an object at rest at all? Boxes where it should be say so; misses, strays, odd sizes and motion deny it."""
-
-from __future__ import annotations
+"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion."""
 
 from dataclasses import dataclass
 
@@ -11,64 +9,58 @@ from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 
-_PHANTOM_SHARE = 1 / 8  # How often a phantom is detected where it should be, as a share of the rate of its class.
-_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # Tried values of how alike the rates of a class are.
-_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one, which drops fewer objects.
-_POOLED_BOXES = 100.0  # The boxes with which the rate of a class weighs as much as the rate of all classes.
-_RATE_LIMITS = (0.01, 0.95)  # The rates that a class may have: at 0 or 1 a single box, or a single miss, would be a proof.
-_MOST_PRIOR = 3.0  # The most that prior odds can be, which a class with few boxes has; larger keeps more weak objects.
-_EXPECTED_STRAYS = 5.0  # The stray boxes that every class is taken to have besides those that were seen.
-_LOG_SIZE = 0.7  # The standard deviation of ln size within a class: a factor of 2.
-_PHANTOM_LOG_RANGE = 4.6  # The width of the range of ln size in which a phantom may have any size: a factor of 100.
-_MOST_ODDS = 20.0  # The most that log odds against chance count; it only keeps them finite.
-_REST_PRIOR = 3.0  # The log odds of rest against motion before the rays are looked at; larger drops fewer objects.
-_WITHIN_SIZE = 0.5  # The share of an object's size within which it may seem to move: its box's middle wanders that far.
-_COUNTED_RAYS = 10  # The most rays that count as independent when motion is judged.
+_PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
+_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations of rates; larger means more alike.
+_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one; larger drops fewer objects.
+_POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
+_RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
+_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets; larger keeps more weak objects.
+_EXPECTED_STRAYS = 5.0  # The number of stray boxes that each class is assumed to have besides the observed ones.
+_LOG_SIZE = 0.7  # The standard deviation of ln size within a class, which is a factor of 2.
+_PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms, which is a factor of 100.
+_MOST_ODDS = 20.0  # The largest absolute log odds against chance, which only keeps them finite.
+_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one; larger drops fewer objects.
+_WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
+_COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
 @dataclass(frozen=True)
 class Rates:
-    """How often objects of each class are detected where they should be.
-
-    mean: (L,). concentration: the sum of the parameters of the beta distribution of an object's rate about that mean.
-    """
+    """Beta distributions of the detection rates in each class: mean (L,), and concentration, the sum of the parameters."""
 
     mean: Floats
     concentration: float
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
-        """-2 ln of the probability (N,) that objects of these labels (N,) are detected in just those frames."""
+        """Return -2 ln of the probability (N,) that objects of these labels (N,) have these detections and misses."""
         return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
 
     def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
-        """Log odds (N,) of an object of its class against a phantom, by how often it was detected."""
-        return _odds(history.seen, history.expected, self.mean[label], self.concentration)
+        """Return the log odds (N,) of an object of its class over a phantom, from its number of detections."""
+        rate = self.mean[label]
+        phantom = rate * _PHANTOM_SHARE
+        # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
+        as_phantom = _beta_binomial(history.seen, history.expected, phantom, 1 / phantom)
+        return np.asarray(_beta_binomial(history.seen, history.expected, rate, self.concentration) - as_phantom)
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
-    """The rate of each class: the median over its boxes, drawn to that of all classes where boxes are few.
+    """Estimate the rate of each class as the median over its boxes, drawn to the rate of all classes if they are few.
 
-    The concentration is the lowest one that is not clearly less likely than the best. Each object may be real or a phantom.
+    The concentration is the lowest one that is not clearly less likely than the best. Any object may be a phantom.
     """
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
     boxes = np.bincount(label, seen, labels)
     mean = (boxes * _weighted_median(own, seen, label, labels) + _POOLED_BOXES * overall) / (boxes + _POOLED_BOXES)
-    mean = np.clip(mean, *_RATE_LIMITS)
-    odds = np.array([_odds(history.seen, expected, mean[label], c) for c in _CONCENTRATIONS])
-    likelihood = np.logaddexp(0.0, odds).sum(axis=1)
-    return Rates(mean, _CONCENTRATIONS[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))])
-
-
-def _odds(seen: Ints, expected: Ints, rate: Floats, concentration: float) -> Floats:
-    phantom = rate * _PHANTOM_SHARE
-    as_phantom = _beta_binomial(seen, expected, phantom, 1 / phantom)  # with 1 / phantom the density falls from rate 0 on
-    return np.asarray(_beta_binomial(seen, expected, rate, concentration) - as_phantom)
+    rates = [Rates(np.clip(mean, *_RATE_LIMITS), concentration) for concentration in _CONCENTRATIONS]
+    likelihood = np.logaddexp(0.0, [rate.log_odds(history, label) for rate in rates]).sum(axis=1)
+    return rates[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))]
 
 
 def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
-    """ln of the probability of one sequence of detections and misses, the rate being beta distributed."""
+    """Return ln of the probability of one sequence of detections and misses with a beta-distributed rate."""
     from scipy.special import betaln
 
     a, b = concentration * rate, concentration * (1 - rate)
@@ -76,12 +68,11 @@ def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: floa
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:
-    """The value (count,) of each group with half the weight below; 0 where there is none."""
+    """Return the value (count,) of each group below which half of its weight lies, or 0 for a group without weight."""
     result = np.zeros(count)
     order = np.lexsort((values, group))
     total = np.cumsum(weight[order])
-    end = np.cumsum(np.bincount(group, minlength=count))
-    upper = np.append(0.0, total)[end]
+    upper = np.append(0.0, total)[np.cumsum(np.bincount(group, minlength=count))]
     lower = np.append(0.0, upper[:-1])
     some = upper > lower
     result[some] = values[order][np.searchsorted(total, ((lower + upper) / 2)[some])]
@@ -89,7 +80,7 @@ def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) ->
 
 
 def existence(state: State, gate: float) -> Floats:
-    """How likely each landmark is an object at rest (N,)."""
+    """Return the probability (N,) that each landmark is a static object."""
     from scipy.special import expit
 
     rates = detection_rates(state.history, state.label, len(state.unassigned))
@@ -98,10 +89,10 @@ def existence(state: State, gate: float) -> Floats:
 
 
 def chance_odds(state: State, gate: float) -> Floats:
-    """Log odds (N,) that the rays of each object do not meet by chance.
+    """Return the log odds (N,) that the rays of each landmark do not meet by chance.
 
-    Any two strays of its class make a point; rays without object, and rays of objects that have no more than it, are strays.
-    How many other strays pass that point within the gate is Poisson distributed.
+    Any two stray rays of a class define a point. The number of other strays in its gate is Poisson distributed. Strays are
+    the rays without landmark, and the rays of landmarks with no more rays than this one.
     """
     from scipy.stats import poisson
 
@@ -112,13 +103,13 @@ def chance_odds(state: State, gate: float) -> Floats:
 
 
 def prior_odds(state: State) -> Floats:
-    """Log odds (N,) of an object before its own boxes are looked at: how many boxes of its class have an object."""
+    """Return the prior log odds (N,) of an object, from the numbers of assigned and unassigned boxes of its class."""
     odds = np.log((state.label_count.sum(axis=0) + _EXPECTED_STRAYS * _MOST_PRIOR) / (state.unassigned + _EXPECTED_STRAYS))
     return np.minimum(odds, np.log(_MOST_PRIOR))[state.label]
 
 
 def stray_share(state: State, gate: float) -> Floats:
-    """The share (N,) of boxes thrown anywhere into the images that would pass each landmark within its gate."""
+    """Return the share (N,) of boxes at random places in the images that would pass each landmark within its gate."""
     angle2 = state.variance / np.maximum(state.distance, 1e-3) ** 2
     area = np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1)
     looks = np.maximum(state.history.inside, state.history.expected)
@@ -126,9 +117,9 @@ def stray_share(state: State, gate: float) -> Floats:
 
 
 def size_odds(state: State) -> Floats:
-    """Log odds (N,), at most 0, of an object of its class against a phantom, by its size.
+    """Return the log odds (N,), at most 0, of an object of its class over a phantom, from its size.
 
-    Where rays of different things cross, the distance is wrong, and so is the size that a box gives there.
+    Crossing rays of different objects give a wrong distance, and so a wrong size.
     """
     own = np.log(np.maximum(state.size, 1e-6))
     usual = _weighted_median(own, state.ray_count.astype(float), state.label, len(state.unassigned))[state.label]
@@ -137,27 +128,24 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """The rays (N,) of all objects of an object's class that have no more rays than it, itself included."""
-    order = np.lexsort((number, label))
+    """Return the number of rays (N,) of all landmarks of the same class with no more rays than each landmark."""
+    rank = label * (int(number.max(initial=0)) + 1) + number
+    order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))
-    rank = label[order] * (int(number.max(initial=0)) + 1) + number[order]
-    first, last = np.searchsorted(label[order], label[order]), np.searchsorted(rank, rank, side="right")
-    result = np.empty(len(number), dtype=np.int64)
-    result[order] = total[last] - total[first]
-    return result
+    first, last = np.searchsorted(label[order], label), np.searchsorted(rank[order], rank, side="right")
+    return np.asarray(total[last] - total[first])
 
 
 def rest_odds(state: State) -> Floats:
-    """Log odds (N,), at most 0, of a point at rest against one of constant velocity.
+    """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
-    Rays of a thing that moves slowly can meet for a while, but a moving point explains them much better. The odds are by
-    BIC, from the share of the squared deviations that a velocity explains. The middle of a box wanders over its object as
-    the view changes, which looks like motion. So only a few rays count, and a way within the object's size is none.
+    Rays of a slow object may meet for a while, but a moving point explains them much better. The odds are by BIC, from the
+    share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes, which
+    looks like motion. So only a few rays count, and motion within the object's size does not count.
     """
-    stamps = state.view.stamps[state.obs.frame[state.assigned]]
-    explained, way = velocity_gain(
-        state.obs, state.assigned, state.owner, state.landmarks.position, state.landmarks.noise, stamps
-    )
-    size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # each ray measures two coordinates
+    obs, landmarks = state.obs, state.landmarks
+    stamps = state.view.stamps[obs.frame[state.assigned]]
+    explained, way = velocity_gain(obs, state.assigned, state.owner, landmarks.position, landmarks.noise, stamps)
+    size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
     odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * size * np.log(np.clip(1 - explained, 1e-6, 1.0))
     return np.where(way > _WITHIN_SIZE * state.size, np.minimum(odds, 0.0), 0.0)

@@ -1,6 +1,4 @@
-"""Gated costs of matches between rays and landmarks, and the best assignment: one ray a landmark and frame."""
-
-from __future__ import annotations
+"""Gate matches between rays and landmarks, and assign at most one ray of a frame to each landmark."""
 
 from dataclasses import dataclass
 
@@ -13,19 +11,18 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import skew
 
 TRACK_GAIN = 2.0
-"""What a match costs less if most other boxes of the ray's track have that landmark; larger trusts the tracker more."""
-_PAIRS_AT_ONCE = 1 << 19  # The pairs of a ray and a landmark gated together; larger needs more memory.
-_FEW_PAIRS = 1 << 12  # The number of pairs below which all are computed exactly: a bound first would take longer.
-_TABLE = 1 << 22  # The most entries of a table of gains that is written out; larger ones are sparse.
+"""The cost reduction of a match if most other boxes of the ray's track have its landmark; larger trusts the tracker more."""
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together; larger needs more memory.
+_FEW_PAIRS = 1 << 12  # The number of pairs up to which computing all exact costs is faster than a bound first.
+_TABLE = 1 << 22  # The most entries of a dense table of gains; larger tables are sparse.
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Possible matches, sorted by ray, then landmark.
+    """Possible matches (E,), sorted by ray, then by landmark.
 
-    ray, landmark: (E,). deviation: (E,) squared, of the bearing in standard deviations (2 degrees of freedom). vague: (E,)
-    ln of the area in which the landmark may appear over that of the ray's own noise. cost: (E,) deviation, vague and the
-    cost of the range together.
+    deviation: squared deviation of the bearing, in variances (2 degrees of freedom). vague: ln of the area in which the
+    landmark may appear, divided by the area of the ray's own noise. cost: the sum of deviation, vague and the range cost.
     """
 
     ray: Ints
@@ -36,9 +33,9 @@ class Edges:
 
 
 def tangent_basis(direction: Floats) -> Floats:
-    """Two unit vectors (R, 2, 3) across each unit direction (R, 3) and each other."""
+    """Return two unit vectors (R, 2, 3) perpendicular to each other and to each unit direction (R, 3)."""
     turn = skew(direction)
-    furthest = np.abs(direction).argmin(axis=1)  # the axis of the map that is least parallel
+    furthest = np.abs(direction).argmin(axis=1)  # The map axis that is least parallel to the direction.
     axes = np.empty((len(direction), 2, 3))
     first = turn[np.arange(len(direction)), :, furthest]
     axes[:, 0] = first / np.sqrt((first * first).sum(axis=1))[:, None]
@@ -47,9 +44,9 @@ def tangent_basis(direction: Floats) -> Floats:
 
 
 def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
-    """All pairs of a ray and a landmark that accepts its label, with a squared deviation of the bearing within the gate.
+    """Return all pairs of a ray and a landmark that accepts its label, with a squared bearing deviation within the gate.
 
-    pose: (R, 6, 6) covariance of each ray's camera: rotations about the map's axes (rad), then position (m).
+    pose: (R, 6, 6) covariance of each ray's camera, rotations about the map axes (rad) before the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]
@@ -59,7 +56,9 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
     x, y = np.einsum("eij,ej->ie", axes, to)
     covariance = landmarks.covariance[index]
     if pose is not None:
-        covariance = covariance + _carried(to, pose[ray])
+        lever = skew(to)
+        jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
+        covariance = covariance + jacobian @ pose[ray] @ np.swapaxes(jacobian, 1, 2)
     spread = axes @ covariance @ np.swapaxes(axes, 1, 2)
     own = variance(obs, distance, landmarks.noise[index], ray)
     a, b, c = spread[:, 0, 0] + own, spread[:, 0, 1], spread[:, 1, 1] + own
@@ -73,29 +72,18 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
     return Edges(ray[keep], index[keep], deviation[keep], vague[keep], cost[keep])
 
 
-def _carried(to: Floats, pose: Floats) -> Floats:
-    """The covariance (E, 3, 3) that the cameras' (E, 6, 6) adds to landmarks `to` (E, 3) m away."""
-    lever = skew(to)
-    jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
-    return np.asarray(jacobian @ pose @ np.swapaxes(jacobian, 1, 2))
-
-
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Pairs that a bound on their deviation lets through; it takes only matrix products, so it is fast for many."""
-    rays: list[Ints] = [np.zeros(0, dtype=np.int64)]
-    found: list[Ints] = [np.zeros(0, dtype=np.int64)]
+    """Return pairs that pass a bound on their deviation. The bound takes only matrix products, which are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
-    if pairs == 0:
-        return rays[0], found[0]
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
         ahead = np.einsum("ei,ei->e", landmarks.position[index] - obs.origin[ray], obs.direction[ray]) > MIN_DEPTH
         return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
-    turn: Floats = np.zeros(len(obs.label))
-    move: Floats = np.zeros(len(obs.label))
-    if pose is not None:  # twice each block bounds both with their correlation
+    turn, move = np.zeros((2, len(obs.label)))
+    if pose is not None:  # Twice its diagonal blocks bound a covariance with any correlation between them.
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
+    rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
     for label in np.unique(obs.label):
         mine, which = np.flatnonzero(obs.label == label), np.flatnonzero(landmarks.accepts[:, label])
@@ -108,29 +96,19 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
             depth = n @ p.T - (m * n).sum(axis=1)[:, None]
             distance2 = (m * m).sum(axis=1)[:, None] + p2 - 2 * m @ p.T
             limit = distance2 * ((obs.sigma[r] ** 2)[:, None] * noise2 + turn[r, None]) + obs.position_sigma**2 * noise2
-            limit += spread[which] + move[r, None] + 1e-9  # for rounding of the products
+            limit += spread[which] + move[r, None] + 1e-9  # The constant covers rounding of the products.
             a, b = np.nonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
             rays.append(r[a])
             found.append(which[b])
     return np.concatenate(rays), np.concatenate(found)
 
 
-def reassign(obs: Observations, landmarks: Landmarks, matched: Ints, gate: float) -> Ints:
-    """The best landmark of each ray (R,), -1 none; matched: (R,) the landmark before, by which tracks keep together."""
-    edges = gated_edges(obs, landmarks, gate)
-    return best_assignment(edges, edges.cost - track_bonus(edges, obs.track, matched), obs.frame, gate)
-
-
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
-    """The landmark of each ray (R,), -1 for none, such that the total cost is the least.
+    """Return the landmark (R,) of each ray, -1 for none, with the least total cost.
 
-    A landmark gets at most one ray per frame. Each frame is solved by itself. Parts of a frame that share no ray and no
+    A landmark gets at most one ray per frame. Each frame is solved separately. Parts of a frame that share no ray and no
     landmark are also solved separately. Only a part with several rays and several landmarks needs the Hungarian method.
-
-    Args:
-        cost: (E,) the cost of each edge.
-        frame: (R,) the frame of each ray.
-        unmatched: the cost of a ray without a landmark.
+    cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -140,7 +118,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     if len(useful) == 0:
         return chosen
     ray, landmark, gain = edges.ray[useful], edges.landmark[useful], unmatched - cost[useful]
-    places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)  # landmark and frame
+    # A place is one landmark in one frame.
+    places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)
     size = len(frame) + len(places)
     graph = coo_array((np.ones(len(ray)), (ray, len(frame) + place)), shape=(size, size))
     part = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[ray]
@@ -150,7 +129,7 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     end = np.append(first[1:], len(part))
     one_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)
     one_place = np.minimum.reduceat(place, first) == np.maximum.reduceat(place, first)
-    simple = one_ray | one_place  # then the best edge of the part is the answer
+    simple = one_ray | one_place  # A part with one ray or one place takes its best edge.
     chosen[ray[first[simple]]] = landmark[first[simple]]
     for i, j in zip(first[~simple].tolist(), end[~simple].tolist(), strict=True):
         rows, r = np.unique(ray[i:j], return_inverse=True)
@@ -161,9 +140,10 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 
 
 def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tuple[Ints, Ints]:
-    """Pairs (P,) of a row and a column, each in at most one pair, with the greatest total gain (Hungarian method).
+    """Return the pairs (P,) of a row and a column with the greatest total gain (Hungarian method).
 
-    row, column, gain: (E,) of the possible pairs, the gains above zero. shape: the number of rows and of columns.
+    Each row and each column is in at most one pair. row, column, gain: (E,) of the possible pairs, with gains above 0.
+    shape: the numbers of rows and columns.
     """
     from scipy.optimize import linear_sum_assignment
     from scipy.sparse import csr_array
@@ -176,9 +156,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
         first, second = linear_sum_assignment(dense, maximize=True)
         real = dense[first, second] > 0
         return first[real], second[real]
-    # in the sparse table each row also gets a column of its own that stands for none, so that every row has a pair
+    # Every row of the sparse table needs a pair. So each row also gets a column of its own that stands for no pair.
     each = np.arange(rows)
-    value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # zeros would be no entries
+    value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # Entries of 0 would not count as possible pairs.
     entries = (np.append(row, each), np.append(column, columns + each))
     table = csr_array((value, entries), (rows, columns + rows))
     one, other = (np.asarray(found, dtype=np.int64) for found in min_weight_full_bipartite_matching(table, maximize=True))
@@ -186,9 +166,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """What tracks take off the cost of each edge (E,), where most other boxes of the ray's track have its landmark.
+    """Return the cost reduction (E,) of the edges whose landmark most other boxes of the ray's track have.
 
-    track, matched: (R,) the track of each ray and its landmark so far, -1 none.
+    track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))
@@ -196,20 +176,18 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
         return bonus
     base = int(matched.max()) + 1
     keys, counts = np.unique(track[known] * base + matched[known], return_counts=True)
-    tracks, start = np.unique(keys // base, return_index=True)
-    total = np.add.reduceat(counts, start)
+    tracks, total = np.unique(track[known], return_counts=True)
     which = np.flatnonzero((track[edges.ray] >= 0) & (edges.landmark < base))
     ray, landmark = edges.ray[which], edges.landmark[which]
     at = np.minimum(np.searchsorted(keys, track[ray] * base + landmark), len(keys) - 1)
     same = keys[at] == track[ray] * base + landmark
-    own = (matched[ray] == landmark).astype(np.int64)
     t = np.minimum(np.searchsorted(tracks, track[ray]), len(tracks) - 1)
-    others = np.where(same, counts[at], 0) - own
+    others = np.where(same, counts[at], 0) - (matched[ray] == landmark)
     of = np.where(tracks[t] == track[ray], total[t], 0) - (matched[ray] >= 0)
     bonus[which] = np.where((others >= 2) & (2 * others > of), TRACK_GAIN, 0.0)
     return bonus
 
 
 def gate_limit(share: float) -> float:
-    """The squared deviation of a bearing below which that share of right matches lies."""
-    return float(-2 * np.log1p(-share))  # chi-squared with 2 degrees of freedom in closed form
+    """Return the squared deviation (chi-squared, 2 degrees of freedom) below which this share of correct matches lies."""
+    return float(-2 * np.log1p(-share))

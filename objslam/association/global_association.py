@@ -1,11 +1,8 @@
-"""Global association with known poses: which box is of which object, when nobody says how many objects there are.
+"""Global association at known poses: assign rays to an unknown number of objects.
 
-For each label, points where rays of different frames meet are scored against all its rays at once. The best become objects,
-and the rays that are left are searched again. Then objects are merged, fused across labels and dropped, each time by what
-explains the boxes and the misses more cheaply.
+A search finds points where rays of one label meet, and the best points become landmarks. Then landmarks are merged, fused
+across labels and dropped, each time in favour of the cheaper explanation of the boxes and the misses.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +10,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.existence import chance_odds, existence
-from objslam.association.gating import gate_limit, reassign
+from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
@@ -26,22 +23,22 @@ from objslam.core.statistics import grouped_quantile
 from objslam.core.torch_threads import torch_device
 from objslam.core.types import Association, Keyframes, Rays
 
-_TURNS = 8  # The most searches among the rays that are left; a search that finds nothing is the last.
-_ROUNDS = 12  # The most rounds of merging, and of merging and dropping: it bounds what could go on for ever.
-_ALTERNATIONS = 3  # The most times that assignment and refinement take turns after a change; more converge further.
-_SAMPLE = 4096  # The most rays of one label that a search looks at, in whole frames; a later turn looks at others.
-_FRAMES = 12  # The fewest frames that a search looks at, because an object is where rays of several frames meet.
-_MOST_RAYS = 1 << 14  # The most rays of one label that a search looks at where frames have very many; larger costs time.
-_MIN_SUPPORT = 2.5  # The least support of a point in a search, where a ray that fits perfectly counts 1.
-_ABOVE_CHANCE = 3.0  # The least standard deviations by which a point's support exceeds what strays give it.
-_CHANCE_ODDS = 3.0  # The least log odds of an object against strays that meet; larger drops weak objects while searching.
-_PARALLAX = np.radians(2.0)  # The least angle (rad) of two rays that make a point; larger finds fewer and surer points.
-_FAR = 1e6  # The distance (m) from the first camera beyond which a point is only where parallel rays meet.
+_TURNS = 8  # The most searches among the unassigned rays; fewer suffice once a search finds nothing.
+_ROUNDS = 12  # The most rounds of merging, and of merging and dropping, which could otherwise repeat without end.
+_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change; larger converges further.
+_SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames; later searches use other frames.
+_FRAMES = 12  # The fewest frames that a search uses, because an object is where rays of several frames meet.
+_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many; larger costs time.
+_MIN_SUPPORT = 2.5  # The least support of a point in a search, in rays that fit perfectly.
+_ABOVE_CHANCE = 3.0  # The least standard deviations by which a point's support must exceed the support by strays.
+_CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search; larger drops weak objects.
+_PARALLAX = np.radians(2.0)  # The least angle (rad) between two rays that define a point; larger finds fewer, surer points.
+_FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 
 
 @dataclass(frozen=True)
 class _Task:
-    """gate: squared deviations. device: torch's. seed: of the search's random pairs."""
+    """Constants of one association. gate: squared deviation. device: of torch. seed: of the random ray pairs."""
 
     gate: float
     settings: config.AssociationSettings
@@ -61,42 +58,40 @@ def associate_globally(
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
 ) -> Association:
-    """Which ray belongs to which object, at known camera poses.
+    """Assign rays to objects at known camera poses.
 
-    Objects come sorted by label, then by the frame that saw them first. Rays that no object at rest explains have none.
-    Nothing depends on the order of rays and keyframes.
+    Objects are sorted by label, then by their first frame. Rays that no static object explains get none. The result does not
+    depend on the order of rays and keyframes.
 
     Args:
-        keyframes: all frames that were looked at, those without a box too: what was not seen counts as well.
+        keyframes: all observed frames. Frames without a box count as misses.
         map_T_camera: (K, 4, 4) of the keyframes.
-        sigma: (R,) rad, the noise of the rays' angles with that of the poses.
-        position_sigma: m, that of their origins.
-        guess: an association of these rays to begin from, and the positions (N, 3) m of its objects, NaN to forget one.
+        sigma: (R,) rad, the noise of the rays' angles, including the noise of the poses.
+        position_sigma: m, the noise of the rays' origins.
+        guess: an initial association of these rays, and the positions (N, 3) m of its objects. NaN drops an object.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = CameraFrames(
-        stamps=keyframes.stamps[keyframe],
-        cameras=cameras,
-        camera=keyframes.camera[keyframe],
-        map_T_camera=map_T_camera[keyframe],
-        margin=settings.rays.border,
-        margin_share=settings.rays.border_share,
-    )
+    margins = settings.rays.border, settings.rays.border_share
+    camera = keyframes.camera[keyframe]
+    view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     device = torch_device(settings.triangulation.device)
     task = _Task(gate_limit(settings.association.gate), settings.association, device, seed)
     if guess is not None:
-        state = _begin(task, state, ray, *guess)
+        association, position = guess
+        landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
+        state = replace(state, landmarks=landmarks, matched=association.object[ray])
+        state = _alternate(task, state.keep(_plausible(task, state)))
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX), 2)
-        state = _merge_round(task, _drop_chance(task, state))
+        state = _merge_round(task, state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS))
         state = _drop(task, state, existence(state, task.gate))
         if state.count <= before:
             break
     state = _add_distant(task, state)
-    for _ in range(_ROUNDS):  # dropping a landmark frees its rays, and they may show that two others are one
+    for _ in range(_ROUNDS):  # The rays of a dropped landmark may show that two others are one object.
         merged = _merge_all(task, state)
         state, likely = _drop_all(task, merged)
         if state.count == merged.count:
@@ -107,15 +102,8 @@ def associate_globally(
     return _result(state, likely, ray)
 
 
-def _begin(task: _Task, nothing: State, ray: Ints, association: Association, position: Floats) -> State:
-    """The landmarks that are guessed; ray: (R,) which ray each observation is."""
-    landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(nothing.unassigned))
-    state = replace(nothing, landmarks=landmarks, matched=association.object[ray])
-    return _alternate(task, state.keep(_plausible(task, state)))
-
-
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
-    """For each label, add landmarks where free rays agree. A free ray belongs to no landmark yet."""
+    """For each label, add landmarks where unassigned rays agree."""
     from objslam.association.hypothesis_search import Search, discover
 
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
@@ -132,21 +120,17 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
             free = np.sort(rng.permutation(free)[:_MOST_RAYS])
         pool = obs.take(free)
         pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
-        # `chance` of these rays pass any point by chance, and each of them supports it by a half on average
+        # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / state.view.solid_angle
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
-        search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
-        points = discover(pool, search, rng)
+        points = discover(pool, Search(task.settings.hypotheses, support, task.gate, parallax, task.device), rng)
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
         landmarks = landmarks.and_also(new)
     return replace(state, landmarks=landmarks)
 
 
 def _add_distant(task: _Task, state: State) -> State:
-    """Add landmarks where rays without parallax agree.
-
-    Such rays come from distant objects, or from a robot that hardly moves.
-    """
+    """Add landmarks where rays without parallax agree, which see distant objects or come from a robot that hardly moves."""
     known = state.count
     state = _alternate(task, _discover(task, state, _TURNS, 0.0), 2)
     index, direction = state.owner, state.obs.direction[state.assigned]
@@ -154,14 +138,16 @@ def _add_distant(task: _Task, state: State) -> State:
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
-    return _drop_chance(task, state.keep(narrow | (np.arange(len(narrow)) < known)))
+    state = state.keep(narrow | (np.arange(len(narrow)) < known))
+    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
 
 
 def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
-    """Assign rays and refine positions in turns, until no ray changes its landmark, at most that many times."""
+    """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times."""
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched
-        matched = reassign(obs, old, before, task.gate)
+        edges = gated_edges(obs, old, task.gate)
+        matched = best_assignment(edges, edges.cost - track_bonus(edges, obs.track, before), obs.frame, task.gate)
         held = np.flatnonzero(matched >= 0)
         position = refine(obs, held, matched[held], old.position, old.noise)
         state = State(obs, state.view, replace(old, position=position), matched)
@@ -173,23 +159,16 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
 
 
 def _plausible(task: _Task, state: State) -> Bools:
-    """Which landmarks (N,) have enough rays, and are not where parallel rays meet."""
+    """Return which landmarks (N,) have enough rays and are not where parallel rays meet."""
     near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
     return np.asarray((state.ray_count >= task.settings.min_rays) & near)
-
-
-def _drop_chance(task: _Task, state: State) -> State:
-    """Drop landmarks whose rays may be strays that meet."""
-    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
 
 
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:
     if state.count < 2:
         return state
     target = merge_targets(state, task.gate, across_labels)
-    if (target == np.arange(len(target))).all():
-        return state
-    return _alternate(task, state.merge(target))
+    return state if (target == np.arange(len(target))).all() else _alternate(task, state.merge(target))
 
 
 def _merge_all(task: _Task, state: State) -> State:
@@ -203,7 +182,7 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
-    """Drop landmarks until all are likely enough to exist; also gives the probability (N,) that each one does."""
+    """Drop landmarks until all are likely enough to exist, and return their probabilities (N,) of existence as well."""
     while True:
         likely = existence(state, task.gate)
         left = _drop(task, state, likely)
@@ -213,33 +192,27 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 
 
 def _drop(task: _Task, state: State, likely: Floats) -> State:
-    """Drop landmarks whose probability (N,) is below association.min_existence; of neighbours the weaker goes first."""
+    """Drop landmarks whose probability (N,) is below association.min_existence.
+
+    Of two neighbours only the weaker one is dropped, because it may hold boxes of the stronger one.
+    """
     failing = likely < task.settings.min_existence
     if not failing.any():
         return state
-    return _alternate(task, state.keep(~failing | _has_weaker_neighbour(task, state, failing)))
-
-
-def _has_weaker_neighbour(task: _Task, state: State, failing: Bools) -> Bools:
-    """Whether a weaker failing landmark (N,) stands so near that it may hold boxes of this one: it has to go first."""
     number, label = state.ray_count, state.label
     a, b = close_pairs(state, task.gate)
     rivals = failing[a] & failing[b] & (label[a] == label[b])
-    a, b = a[rivals], b[rivals]
-    result = np.zeros(len(failing), dtype=bool)
-    result[np.where(number[a] > number[b], a, b)] = True
-    return result
+    keep = ~failing
+    keep[np.where(number[a] > number[b], a, b)[rivals]] = True
+    return _alternate(task, state.keep(keep))
 
 
 def _result(state: State, existence: Floats, ray: Ints) -> Association:
-    """The objects in their final order; existence: (N,) of each; ray: (R,) which ray each observation is."""
+    """Return the objects in their final order, with existence (N,). ray: (R,) the ray of each observation."""
     counts, label = state.label_count, state.label
     first = np.full(len(label), len(ray))
     np.minimum.at(first, state.owner, state.assigned)
     order = np.lexsort((first, label))
-    number = np.append(np.empty(len(label), dtype=np.int64), -1)
-    number[order] = np.arange(len(label))
-    matched = np.empty(len(ray), dtype=np.int64)
-    matched[ray] = number[state.matched]
+    matched = np.append(np.argsort(order), -1)[state.matched][np.argsort(ray)]
     weights = counts[order] / np.maximum(counts[order].sum(axis=1, keepdims=True), 1)
     return Association(matched, label[order], weights, existence[order])

@@ -1,6 +1,4 @@
-"""Where objects could be: points that many rays of one label agree on, found from pairs of rays, in torch."""
-
-from __future__ import annotations
+"""Search points that many rays of one label agree on, from pairs of rays, in torch."""
 
 from dataclasses import dataclass
 
@@ -12,22 +10,20 @@ from objslam.association.observations import MIN_DEPTH, Observations, closest_ap
 from objslam.core.arrays import Floats, Ints
 from objslam.core.torch_threads import one_torch_thread
 
-_PAIRS_AT_ONCE = 1 << 18  # The pairs of a ray and a point scored together, so that they fit into the processor's cache.
-_DRAWS_EACH = 8  # The pairs of rays drawn for each hypothesis that is wanted: most pairs do not meet.
-_REFINEMENTS = 2  # How often each hypothesis is moved to the least squares of its supporters; larger costs time.
-_MIN_LEFT = (
-    0.6  # The least share of its support that better ones leave a hypothesis; with less it waits for the next search.
-)
-_SINGLE_EXTENT = 30.0  # The greatest extent (m) of the origins for single precision; beyond it would lose millimetres.
-_RANGE_LIMIT = 3.0  # The standard deviations from which a range is wrong.
-_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes; larger trusts ranges more.
-_LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays that have no parallax.
+_PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
+_DRAWS_EACH = 8  # The ray pairs drawn for each hypothesis, because most pairs do not meet.
+_REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis; larger costs time.
+_MIN_LEFT = 0.6  # The least share of its support that a hypothesis must keep; with less it waits for the next search.
+_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision; a larger one would lose millimetres.
+_RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
+_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away; larger trusts ranges more.
+_LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
 @dataclass(frozen=True)
 class Search:
-    """How to search: the number of hypotheses, the least support of a point, the gate (squared deviations), the least
-    parallax (rad) of a pair, 0 to try distances along single rays too, and torch's device."""
+    """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: squared
+    deviation. parallax: least angle (rad) of a pair, or 0 to also try distances along single rays. device: of torch."""
 
     hypotheses: int
     support: float
@@ -36,20 +32,17 @@ class Search:
     device: str
 
 
+@one_torch_thread()
 def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Points (N, 3) m that rays of one label agree on, the best supported first; none lives on the rays of a better one.
+    """Return points (N, 3) m that rays of one label agree on, the best supported first.
 
-    Each hypothesis is scored against all rays at once. Of each frame the best ray counts: 1 if it fits, 0 at the gate.
+    Each hypothesis is scored against all rays at once. In each frame only the best ray counts, from 1 for a perfect fit to 0
+    at the gate. The support of a point excludes the rays of better points.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:
         return points
-    with one_torch_thread():
-        return _best(points, _Scorer(obs, search), search.support)
-
-
-def _best(points: Floats, scorer: _Scorer, least: float) -> Floats:
-    """The points that rays agree on, refined, the best first; each has at least `least` support that no better one took."""
+    scorer = _Scorer(obs, search)
     moved = scorer.load(points)
     for _ in range(_REFINEMENTS):
         moved = scorer.refine(moved, scorer.supports(moved))
@@ -58,17 +51,17 @@ def _best(points: Floats, scorer: _Scorer, least: float) -> Floats:
     left, found = whole.clone(), []
     for _ in range(len(moved)):
         best = int(torch.where(left >= _MIN_LEFT * whole, left, 0.0).argmax())
-        if float(left[best]) < max(least, _MIN_LEFT * float(whole[best])):
+        if float(left[best]) < max(search.support, _MIN_LEFT * float(whole[best])):
             break
         found.append(best)
         taken = support[best] > scorer.doubt
         left -= support[:, taken].sum(dim=1)
         support[:, taken] = 0.0
-    return scorer.unload(moved[found])
+    return np.asarray(moved[found].double().cpu().numpy() + scorer.centre)
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Points (H, 3): where two rays of different frames meet, and where measured ranges end."""
+    """Return points (H, 3) where two rays of different frames meet, where ranges end, and along rays without parallax."""
     first, second = _draw(obs, _DRAWS_EACH * search.hypotheses, rng)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
@@ -87,9 +80,9 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Pairs of rays: the second comes from the first one's track half of the time, if it has one, else from any frame.
+    """Draw pairs of rays. Half of the second rays come from the first ray's track if it has one, the others from any frame.
 
-    The number of rays in between is spread evenly over its logarithm, because near frames more often show the same object.
+    The number of rays in between is uniform in its logarithm, because near frames more often show the same object.
     """
     n = len(obs)
     first = rng.integers(n, size=count)
@@ -97,8 +90,7 @@ def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints
     second = first + reach * rng.choice([-1, 1], count)
     second = np.where((second < 0) | (second >= n), first - (second - first), second)
     order = np.argsort(obs.track, kind="stable")
-    sorted_tracks = obs.track[order]
-    begin, end = (np.searchsorted(sorted_tracks, obs.track[first], side=side) for side in ("left", "right"))
+    begin, end = (np.searchsorted(obs.track[order], obs.track[first], side=side) for side in ("left", "right"))
     mate = order[begin + (rng.random(count) * (end - begin)).astype(np.int64)]
     second = np.where((obs.track[first] >= 0) & (rng.random(count) < 0.5), mate, second)
     inside = (second >= 0) & (second < n)
@@ -106,14 +98,14 @@ def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints
 
 
 class _Scorer:
-    """Rays of one label, laid out so that the best ray of each frame is a running maximum over slices.
+    """Rays of one label, sorted so that the best ray of each frame is a running maximum over slices.
 
-    Slice k holds the k-th ray of every frame that has more than k rays, the frames with most rays first.
+    Slice k holds the k-th ray of every frame with more than k rays. Frames with more rays come first.
     """
 
     def __init__(self, obs: Observations, search: Search) -> None:
         _, frame, number = np.unique(obs.frame, return_inverse=True, return_counts=True)
-        rank = np.arange(len(obs)) - (np.cumsum(number) - number)[frame]  # the rays of a frame stand together
+        rank = np.arange(len(obs)) - (np.cumsum(number) - number)[frame]  # The rays of a frame are adjacent.
         self.slices = np.bincount(rank).tolist()
         obs = obs.take(np.lexsort((frame, -number[frame], rank)))
         self.centre = obs.origin.mean(axis=0)
@@ -128,30 +120,26 @@ class _Scorer:
         self.across = self._tensor(across.reshape(-1, 9))
         self.foot = self._tensor((across @ origin[:, :, None])[:, :, 0])
         self.range, self.doubt = None, 0.0
-        if np.isfinite(obs.range).any():
-            ranged = np.isfinite(obs.range)
+        ranged = np.isfinite(obs.range)
+        if ranged.any():
             precision = np.where(ranged, 1 / obs.range_sigma, 0.0)
             self.range = self._tensor(np.where(ranged, obs.range, 0.0)), self._tensor(precision)
-            self.doubt = 1 - _RANGE_SHARE  # below it a ray may have a wrong range, or be of something behind
+            self.doubt = 1 - _RANGE_SHARE  # A ray with less support may have a wrong range, or see an object behind.
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.as_tensor(values, dtype=self.dtype, device=self.device).contiguous()
 
     def load(self, points: Floats) -> Tensor:
-        """Points (H, 3) in map as a tensor relative to the middle of the cameras."""
+        """Convert points (H, 3) in map to a tensor relative to the mean camera position."""
         return self._tensor(points - self.centre)
 
-    def unload(self, points: Tensor) -> Floats:
-        """The inverse of `load`."""
-        return np.asarray(points.double().cpu().numpy() + self.centre)
-
     def supports(self, points: Tensor) -> Tensor:
-        """(H, R): 1 where a ray passes through a point, less with the squared deviation, 0 at the gate."""
+        """Return supports (H, R) of points by rays: 1 for a perfect fit, less with the squared deviation, 0 at the gate."""
         p = torch.cat([points, points.square().sum(1, keepdim=True), torch.ones_like(points[:, :1])], 1)
         out = torch.empty((len(p), self.ahead.shape[1]), dtype=self.dtype, device=self.device)
         step = max(1, _PAIRS_AT_ONCE // self.ahead.shape[1])
         for i in range(0, len(p), step):
-            depth = torch.mm(p[i : i + step], self.ahead).clamp_(min=1e-3)  # behind the camera nothing fits
+            depth = torch.mm(p[i : i + step], self.ahead).clamp_(min=1e-3)  # No ray supports a point behind its camera.
             depth2 = depth.square()
             part = torch.mm(p[i : i + step], self.apart2, out=out[i : i + step])
             part.sub_(depth2).div_(depth2.mul_(self.slope).add_(self.floor)).neg_().add_(1).clamp_(min=0, max=1)
@@ -161,7 +149,7 @@ class _Scorer:
         return out
 
     def per_frame(self, support: Tensor) -> Tensor:
-        """(H,) sums over the frames of the best support (H, R) in each."""
+        """Return the sums (H,) over the frames of the best support (H, R) in each frame."""
         best, at = support[:, : self.slices[0]].clone(), self.slices[0]
         for width in self.slices[1:]:
             torch.maximum(best[:, :width], support[:, at : at + width], out=best[:, :width])
@@ -169,7 +157,7 @@ class _Scorer:
         return best.sum(dim=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
-        """Points (H, 3) moved to the least squares of their supporters; what those do not fix stays."""
+        """Move points (H, 3) to the least-squares solution of their supporters, except along directions that stay free."""
         information = (support @ self.across).reshape(-1, 3, 3)
         damping = (1e-3 * information.diagonal(dim1=1, dim2=2).sum(dim=1) + 1e-6)[:, None]
         information = information + damping[:, :, None] * torch.eye(3, dtype=self.dtype, device=self.device)

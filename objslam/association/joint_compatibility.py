@@ -1,10 +1,7 @@
-"""Joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that come into view again after a long way.
+"""Joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-By then the gate around each is so wide that something unknown may stand in it. Several at once tell more: one error of the
-pose must explain all their offsets, and what the others say about it leaves little room for each.
+Unknown objects may lie in their wide gates. So one pose error must explain the offsets of all landmarks together.
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -15,21 +12,19 @@ from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import skew
 
-_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, against something unknown; larger trusts fewer.
-_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length and width, and the least height (m), of a room that holds objects.
-_MIN_SLOPE = 1e-6  # The least component of a direction that is divided by.
+_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object; larger trusts fewer landmarks.
+_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
+_MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
 
 def jointly_compatible(
     obs: Observations, landmarks: Landmarks, doubt: Floats, map_T_camera: Floats, unknown: Floats
 ) -> Bools:
-    """Which rays (n,) of one frame really are of the landmark (n,) that each one has.
+    """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
-    A landmark stays if it is much likelier than an unknown object, given all others that stay.
-
-    Args:
-        doubt: (6, 6) covariance of the camera's pose relative to these landmarks, in its own frame.
-        unknown: (n,) expected objects of the label, not known yet, per steradian where the ray looks.
+    A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay. doubt: (6, 6)
+    covariance of the camera's pose relative to the landmarks, in the camera frame. unknown: (n,) expected number of unknown
+    objects of the label per steradian along each ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)
@@ -58,10 +53,10 @@ def jointly_compatible(
 
 
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
-    """Expected objects (n,) per steradian along each ray that have the label of its landmark, rows (n,), and are not known.
+    """Return the expected number of unknown objects (n,) per steradian along each ray, of the label of landmark rows (n,).
 
-    novelty: boxes of something unknown for each box of a known object, of late. Unknown objects are taken to be to the known
-    ones as that, spread evenly over the room, and visible until the ray leaves it or things get too small.
+    novelty: the recent number of boxes of unknown objects per box of a known one. Unknown objects are assumed in the same
+    ratio to known ones, evenly spread over the room, and visible up to its end or the farthest distance of a seen landmark.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

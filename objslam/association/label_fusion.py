@@ -1,6 +1,4 @@
-"""Which other labels a detector gives to one thing now and then."""
-
-from __future__ import annotations
+"""Find the other labels that a detector sometimes gives to an object."""
 
 from dataclasses import replace
 
@@ -13,31 +11,29 @@ from objslam.core.arrays import Bools
 from objslam.core.statistics import grouped_median
 
 SIZE_RATIO = 2.0
-"""The greatest ratio of sizes between the boxes of two labels for them to show one thing."""
-_MIN_BOXES = 3  # The fewest boxes of another label for it to be accepted.
-_MOST_BY_CHANCE = 1e-3  # The number of labels accepted by chance in a whole log; larger fuses labels sooner.
+"""The largest ratio between the sizes of boxes of two labels that show one object."""
+_MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
+_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log; larger fuses labels sooner.
 
 
 def fused_labels(state: State, gate: float) -> Bools:
-    """Which labels each landmark accepts (N, L): its own, and those whose unassigned boxes it explains.
+    """Return which labels each landmark accepts (N, L): its own, and labels whose unassigned boxes the landmark explains.
 
-    Such boxes have its size and lie on it in frames in which it has no box. They are more than strays would be, and fewer
-    than its own boxes.
+    Explained boxes have the landmark's size and lie on it in frames without a box of its own. They must be more than strays
+    would be, and fewer than its own boxes.
     """
     from scipy.stats import poisson
 
     obs, accepts = state.obs, state.landmarks.accepts
     count, labels = accepts.shape
     free = obs.take(state.matched < 0)
-    everything = replace(state.landmarks, accepts=np.ones_like(accepts))
-    edges = gated_edges(free, everything, gate)
+    edges = gated_edges(free, replace(state.landmarks, accepts=np.ones_like(accepts)), gate)
     frames = int(obs.frame.max(initial=0)) + 1
-    taken = np.unique(state.owner * frames + obs.frame[state.assigned])
+    taken = state.owner * frames + obs.frame[state.assigned]
     missed = ~np.isin(edges.landmark * frames + free.frame[edges.ray], taken)
     ray, landmark = edges.ray[missed], edges.landmark[missed]
     pair = landmark * labels + free.label[ray]
     number = np.bincount(pair, minlength=count * labels).reshape(count, labels)
-
     away = np.linalg.norm(state.landmarks.position[landmark] - free.origin[ray], axis=1)
     size = grouped_median(np.sqrt(free.size[ray].prod(axis=1)) * away, pair, count * labels).reshape(count, labels)
     ratio = size / np.maximum(state.size, 1e-9)[:, None]

@@ -1,8 +1,4 @@
-"""Nearest-neighbour association: rays to known landmarks by predicted bearing, or every label as one object."""
-
-from __future__ import annotations
-
-from dataclasses import replace
+"""Nearest-neighbour association of rays with known landmarks by predicted bearing, or of each label with one object."""
 
 import numpy as np
 
@@ -22,26 +18,22 @@ def assign(
     map_T_camera: Floats,
     sigma: Floats,
     *,
-    position_sigma: float = 0.0,
     pose_covariance: Floats | None = None,
     gate: float = 0.999,
 ) -> Ints:
-    """The landmark of each ray (R,), -1 none: in each frame the most likely choice, with at most one ray a landmark.
+    """Return the most likely landmark (R,) of each ray, -1 for none, with at most one ray per landmark and frame.
 
-    A ray's range adds to the cost where it is known; a wrong one costs little.
+    A known range adds to the cost of a match, but a wrong range adds little.
 
     Args:
-        positions: (N, 3) m, NaN for a landmark to leave out.
-        covariances: (N, 3, 3) m^2.
-        accepts: (N, L) whether a box of a label may be the landmark's.
-        map_T_camera: (K, 4, 4) of the rays' keyframes.
-        sigma: (R,) rad, and position_sigma: m, of the rays.
-        pose_covariance: (K, 6, 6) of the cameras in their own frames, rotation first, as GTSAM's marginals are.
-        gate: the share of right matches that the gate on the bearing lets through.
+        positions, covariances: (N, 3) m, NaN to leave a landmark out, and (N, 3, 3) m^2.
+        accepts: (N, L) whether a box of a label may belong to the landmark.
+        map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, of the rays.
+        pose_covariance: (K, 6, 6) in the camera frames, rotation first, as in GTSAM's marginals.
+        gate: the share of correct matches that the bearing gate accepts.
     """
     origin, direction = rays.in_map(map_T_camera)
     obs = Observations.of_lines(origin, direction, sigma, rays.range, rays.range_sigma, rays.label)
-    obs = replace(obs, position_sigma=position_sigma)
     known = np.flatnonzero(np.isfinite(positions).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
     landmarks = Landmarks(positions[known], covariances[known], np.ones(len(known)), accepts[known])
     pose = None
@@ -51,21 +43,19 @@ def assign(
         pose = (turn @ pose_covariance @ np.swapaxes(turn, 1, 2))[rays.keyframe]
     limit = gate_limit(gate)
     edges = gated_edges(obs, landmarks, limit, pose)
-    chosen = best_assignment(
-        edges, edges.cost, rays.keyframe, limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
-    )
+    unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
+    chosen = best_assignment(edges, edges.cost, rays.keyframe, unmatched)
     return np.where(chosen >= 0, known[chosen], -1) if len(known) else chosen
 
 
 def associate_by_label(rays: Rays) -> Association:
-    """One object for each label that has a ray, in the order of label_names.
+    """Make one object for each label with a ray, in the order of label_names.
 
-    Of several boxes in a frame the one with the highest score counts, the first one of equals. The others have no object.
+    In each frame the box with the highest score gets the object, the first one if scores are equal. All others get none.
     """
     labels = np.unique(rays.label)
     best = np.lexsort((np.arange(len(rays)), -rays.score, rays.label, rays.keyframe))
     _, first = np.unique(np.stack([rays.keyframe[best], rays.label[best]]), axis=1, return_index=True)
     which = np.full(len(rays), -1, dtype=np.int64)
-    chosen = best[first]
-    which[chosen] = np.searchsorted(labels, rays.label[chosen])
+    which[best[first]] = np.searchsorted(labels, rays.label[best[first]])
     return Association(object=which, label=labels)

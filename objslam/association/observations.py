@@ -1,8 +1,6 @@
-"""Rays as lines in the map, which association works on, where two of them meet, and how large things are."""
+"""Rays as lines in the map for association, their closest approaches, and the sizes of what they observe."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Self
 
@@ -14,17 +12,16 @@ from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
-"""The least distance (m) of an object from a camera; larger loses things right in front of it."""
+"""The least distance (m) of an object from a camera; larger loses objects right in front of the camera."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """R boxes as lines in the map, sorted by frame, then by what the box says, never by the order in which they came.
+    """R boxes as lines in the map, sorted by frame, then by the content of the box, independent of the input order.
 
-    frame: (R,) number in the order of time. label: (R,). origin: (R, 3) m, direction: (R, 3) unit, in map. sigma: (R,) rad
-    along each of two axes across. position_sigma: m, the noise of the origins. range: (R,) m, NaN where unknown;
-    range_sigma: (R,) m. size: (R, 2) width and height of what the box holds for each metre of its distance. box: (R, 4) px.
-    track: (R,) -1 where unknown. score: (R,).
+    frame: (R,) index in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma: (R,) rad
+    along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown. range_sigma: (R,)
+    m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px. track: (R,) -1 if unknown.
     """
 
     frame: Ints
@@ -38,7 +35,6 @@ class Observations:
     size: Floats
     box: Floats
     track: Ints
-    score: Floats
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -47,45 +43,31 @@ class Observations:
     def of_lines(
         cls, origin: Floats, direction: Floats, sigma: Floats, range_: Floats, range_sigma: Floats, label: Ints | None = None
     ) -> Self:
-        """R lines in map as if of one frame, with nothing known but where they point, their ranges and labels."""
-        zero, minus, one, size, box = _nothing(len(origin))
-        return cls(
-            frame=zero,
-            label=zero if label is None else label,
-            origin=origin,
-            direction=direction,
-            sigma=sigma,
-            position_sigma=0.0,
-            range=range_,
-            range_sigma=range_sigma,
-            size=size,
-            box=box,
-            track=minus,
-            score=one,
-        )
+        """Make observations of R lines in map, all in one frame, without boxes and tracks."""
+        zero, minus, size, box = _nothing(len(origin))
+        label = zero if label is None else label
+        return cls(zero, label, origin, direction, sigma, 0.0, range_, range_sigma, size, box, minus)
 
     def take(self, rays: Bools | Ints) -> Self:
-        """Some of them, by a mask or increasing indices."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()}
+        """Select rays by a mask or by increasing indices."""
+        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
         return type(self)(**selected)
 
 
 @lru_cache(maxsize=256)
-def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats, Floats]:
+def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats]:
     zero = np.zeros(count, dtype=np.int64)
-    columns = zero, zero - 1, np.ones(count), np.zeros((count, 2)), np.zeros((count, 4))
+    columns = zero, zero - 1, np.zeros((count, 2)), np.zeros((count, 4))
     for column in columns:
         column.flags.writeable = False
     return columns
 
 
 def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Where P pairs of rays come closest.
+    """Return the closest approach of P pairs of rays.
 
-    Returns:
-        The way along the first and along the second (P,) m, the point in the middle (P, 3) m, the squared gap (P,) m^2, and
-        the squared sine of their angle (P,).
+    The values are the distances along the first and the second ray (P,) m, the midpoint (P, 3) m, the squared gap (P,) m^2,
+    and the squared sine of the angle between the rays (P,).
     """
     m, n, o, p = obs.origin[first], obs.direction[first], obs.origin[second], obs.direction[second]
     between, cos, normal = o - m, np.einsum("pi,pi->p", n, p), np.cross(n, p)
@@ -97,50 +79,31 @@ def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floa
 
 
 def observe(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
-    map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float,
+    rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...], map_T_camera: Floats, sigma: Floats, position_sigma: float
 ) -> tuple[Observations, Ints, Ints]:
-    """The rays as observations, the ray (R,) that each one is, and the keyframe (K,) that each frame is.
+    """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
-    Frames are in the order of time and camera, the boxes of a frame in the order of label and box: nothing depends on the
-    order in which they are given.
+    Frames are sorted by time and camera, and boxes within a frame by label and box. So nothing depends on the input order.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
-    number = np.empty(len(keyframe), dtype=np.int64)
-    number[keyframe] = np.arange(len(keyframe))
-    frame = number[rays.keyframe]
-    content = (*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame)
-    ray = np.lexsort(content)
+    frame = np.argsort(keyframe)[rays.keyframe]
+    ray = np.lexsort((*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame))
     rays, frame = rays.take(ray), frame[ray]
     origin, direction = rays.in_map(map_T_camera)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
-    observations = Observations(
-        frame=frame,
-        label=rays.label,
-        origin=origin,
-        direction=direction,
-        sigma=sigma[ray],
-        position_sigma=position_sigma,
-        range=np.where(known, rays.range, np.nan),
-        range_sigma=np.where(known, rays.range_sigma, np.nan),
-        size=size_per_metre(rays, keyframes, cameras),
-        box=rays.box,
-        track=rays.track_id,
-        score=rays.score,
-    )
-    return observations, ray, keyframe
+    range_, range_sigma = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
+    lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
+    size = size_per_metre(rays, keyframes, cameras)
+    obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
+    return obs, ray, keyframe
 
 
 def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
-    """Width and height (R, 2) of what each box holds, m for each m of its distance."""
+    """Return width and height (R, 2) of the object in each box, in m per m of its distance."""
     of = keyframes.camera[rays.keyframe]
     focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
     pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
-    depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # in a pinhole image size falls with z, not with distance
+    depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
     return np.asarray((rays.box[:, 2:] - rays.box[:, :2]) / focal * depth[:, None])
 
 
@@ -152,9 +115,9 @@ def extents(
     keyframes: Keyframes,
     cameras: tuple[Camera, ...],
 ) -> Floats:
-    """Width and height (N, 2) m of the objects at positions (N, 3) m: the median over their rays.
+    """Return the median width and height (N, 2) m of objects at positions (N, 3) m over their rays.
 
-    NaN where there is no ray or no position, or where half of the rays come from a camera that sees no sizes.
+    They are NaN without rays or position, and if half of the rays come from a camera that observes no sizes.
     map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)

@@ -1,11 +1,8 @@
-"""Place recognition: one constellation of landmarks found in another, by how the landmarks lie to each other.
+"""Place recognition: find one constellation of landmarks in another by their relative positions.
 
-A robot that comes back after a drift of metres finds no landmark where it expects it. A single one could be any of its
-class. Several that fit at once, under one shift and turn that the drift allows, are evidence. It is measured by the Bayes
-factor of "these landmarks are those" against "all of them are new".
+Several landmarks that fit under one shift and turn within the drift are evidence for the place. The evidence is the Bayes
+factor of "these landmarks are those" over "all of them are new".
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -18,23 +15,23 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import POSSIBLE_MOTION, SAME_POINT_WIDE
 
 MIN_LANDMARKS = 2
-"""The fewest landmarks by which a place is recognised."""
+"""The fewest common landmarks for recognising a place."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
-"""x, y (m) and yaw (rad): no pose is taken to be known better than that relative to another one."""
-_BENT, _BENT_PER_M = 0.07, 0.02  # How much a neighbourhood is bent in itself: m, and m per m from the robot.
-_MARGIN = 2.0  # The strip (m) around all landmarks that belongs to the area over which their density is taken.
-_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis, alone and with its assignment; all start close to the end.
-_CANDIDATES = 3000  # The most pairs of a landmark here and one there; every two of them are a hypothesis.
-_HYPOTHESES = 2000  # The most pairs of candidates that make a hypothesis, the longest bases first; larger costs time.
-_VERIFIED = 20  # The most hypotheses, by a quick score, whose best assignment is found; larger costs time.
-_GAINS_AT_ONCE = 200_000  # The gains computed together; larger needs more memory.
-_MIN_BASE = 0.3  # The least distance (m) of two landmarks that tell a heading.
-_SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The m and rad within which two corrections are one place, and do not compete.
+"""The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
+_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
+_MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
+_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment; few are enough from a close start.
+_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there, any two of which form a hypothesis.
+_HYPOTHESES = 2000  # The most hypotheses from two pairs, those with the longest bases first; larger costs time.
+_VERIFIED = 20  # The most hypotheses, by a quick score, that get a best assignment; larger costs time.
+_GAINS_AT_ONCE = 200_000  # The most gains computed together; larger needs more memory.
+_MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
+_SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
 
 
 @dataclass(frozen=True)
 class Constellation:
-    """Landmarks of one neighbourhood: position (N, 3) m, covariance (N, 3, 3) m^2 in that neighbourhood, label (N,)."""
+    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 within it. label: (N,)."""
 
     position: Floats
     covariance: Floats
@@ -42,13 +39,13 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """The landmarks as they lie around the pivot (2,) m; those further away are less certain relative to the rest."""
+    """Return landmarks with larger covariances farther from the pivot (2,) m, because neighbourhoods bend over distance."""
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 
 
 def label_densities(position: Floats, label: Ints) -> Floats:
-    """(N,) landmarks per m^2 that have the label of each one, over the area in which there are landmarks."""
+    """Return the number (N,) of landmarks with each landmark's label per m^2, over the area that contains landmarks."""
     extent = position[:, :2].max(axis=0) - position[:, :2].min(axis=0) + 2 * _MARGIN
     return np.asarray(np.bincount(label)[label] / float(np.prod(extent)))
 
@@ -57,8 +54,8 @@ def label_densities(position: Floats, label: Ints) -> Floats:
 class Recognition:
     """One constellation found in another.
 
-    correction: (4, 4) planar, takes the first to the second. pairs: (P, 2) indices of the same landmark in the first and in
-    the second. evidence: log Bayes factor against "all are new". lead: how much more that is than for the best other place.
+    correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
+    second. evidence: log Bayes factor over "all are new". lead: how much the evidence exceeds the best other place.
     """
 
     correction: Floats
@@ -67,7 +64,7 @@ class Recognition:
     lead: float
 
     def is_sure(self, settings: AssociationSettings) -> bool:
-        """Whether a loop may be closed by it."""
+        """Return whether the match may close a loop."""
         enough = self.evidence >= settings.loop_evidence and self.lead >= settings.loop_lead
         return enough and len(self.pairs) >= MIN_LANDMARKS
 
@@ -75,34 +72,48 @@ class Recognition:
 def recognise_place(
     here: Constellation, there: Constellation, pivot: Floats, prior: Floats, density: Floats, possible: Bools
 ) -> Recognition | None:
-    """The correction, within the drift, that makes landmarks `here` (N) some of those `there` (M); None where nothing fits.
+    """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M), None if nothing fits.
 
-    Args:
-        pivot: (2,) m, the point about which the correction turns.
-        prior: (3, 3) covariance of the correction, with mean zero: x, y (m), yaw (rad).
-        density: (N,) landmarks `there` per m^2 that have the label of each one here.
-        possible: (N, M) which of them may be the same.
+    pivot: (2,) m, the point about which the correction turns. prior: (3, 3) covariance of the correction in x, y (m) and yaw
+    (rad), with mean zero. density: (N,) landmarks `there` per m^2 with the label of each landmark `here`. possible: (N, M)
+    which pairs may be the same landmark.
     """
-    problem = _problem(here, there, pivot, prior, density, possible)
+    centre = np.append(pivot, 0.0)
+    total = here.covariance[:, None] + there.covariance
+    planar = total[:, :, :2, :2]  # The height of a landmark says little about its identity.
+    problem = _Problem(
+        offset=here.position - centre,
+        target=there.position - centre,
+        information=np.asarray(np.linalg.inv(total)),
+        spread=np.sqrt(np.trace(planar, axis1=2, axis2=3) / 2),
+        peak=-np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(planar)) - np.log(density)[:, None],
+        prior=prior,
+        weight=np.asarray(np.linalg.inv(prior)),
+        possible=possible,
+    )
     a, b = _candidates(problem)
     if len(a) == 0:
         return None
     x = _solve_seeds(problem, _seeds(problem, a, b))
     x = x[np.einsum("hi,ij,hj->h", x, problem.weight, x) <= POSSIBLE_MOTION]
-    # first rank all, where each landmark may take any partner; then only the best get a one-to-one assignment
+    # The quick score ignores that a landmark has one partner. Only the best hypotheses get a one-to-one assignment.
     order = np.argsort(-_quick_score(problem, a, b, x), kind="stable")[:_VERIFIED]
     found = [result for h in order.tolist() if (result := _evidence(problem, a, b, x[h])) is not None]
     if not found:
         return None
     evidence, best, pairs = max(found, key=lambda one: one[0])
-    others = [e for e, other, _ in found if not _is_same(best, other)]
-    return Recognition(_correction(best, pivot), pairs, evidence, evidence - max([0.0, *others]))
+    apart = [(score, np.abs(other - best)) for score, other, _ in found]
+    others = [score for score, d in apart if np.hypot(d[0], d[1]) >= _SAME_SHIFT or d[2] >= _SAME_TURN]
+    correction = lift_se2(best)
+    correction[:2, 3] += pivot - correction[:2, :2] @ pivot
+    return Recognition(correction, pairs, evidence, evidence - max([0.0, *others]))
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """offset, target: (N, 3) and (M, 3) m, landmarks here and there from the pivot. information: (N, M, 3, 3) of each pair.
-    spread: (N, M) m, its standard deviation. peak: (N, M) what it gains at best. weight: (3, 3) inverse of the prior."""
+    """A matching problem. offset, target: (N, 3) and (M, 3) m, landmarks here and there from the pivot. information:
+    (N, M, 3, 3) of each pair. spread: (N, M) m, its standard deviation. peak: (N, M) its largest gain. weight: (3, 3)
+    inverse of the prior."""
 
     offset: Floats
     target: Floats
@@ -114,43 +125,12 @@ class _Problem:
     possible: Bools
 
 
-def _problem(
-    here: Constellation, there: Constellation, pivot: Floats, prior: Floats, density: Floats, possible: Bools
-) -> _Problem:
-    centre = np.append(pivot, 0.0)
-    total = here.covariance[:, None] + there.covariance
-    # only in the plane, because the height of a landmark says little about which one it is
-    peak = -np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(total[:, :, :2, :2])) - np.log(density)[:, None]
-    return _Problem(
-        offset=here.position - centre,
-        target=there.position - centre,
-        information=np.asarray(np.linalg.inv(total)),
-        spread=np.sqrt(np.trace(total[:, :, :2, :2], axis1=2, axis2=3) / 2),
-        peak=peak,
-        prior=prior,
-        weight=np.asarray(np.linalg.inv(prior)),
-        possible=possible,
-    )
-
-
-def _is_same(one: Floats, other: Floats) -> bool:
-    return bool(np.hypot(*(one - other)[:2]) < _SAME_SHIFT and abs(one[2] - other[2]) < _SAME_TURN)
-
-
-def _correction(x: Floats, pivot: Floats) -> Floats:
-    """The pose (4, 4), in map, of a correction (3,) about the pivot."""
-    pose = lift_se2(x)
-    pose[:2, 3] += pivot - pose[:2, :2] @ pivot
-    return pose
-
-
 def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """Offsets (..., N, 3) under corrections (..., 3), and their Jacobians (..., N, 3, 3)."""
+    """Return offsets (..., N, 3) under corrections (..., 3), and their Jacobians (..., N, 3, 3)."""
     cos, sin = np.cos(x[..., 2, None]), np.sin(x[..., 2, None])
     turned_x, turned_y = cos * offset[..., 0] - sin * offset[..., 1], sin * offset[..., 0] + cos * offset[..., 1]
-    moved = np.stack(
-        [turned_x + x[..., 0, None], turned_y + x[..., 1, None], np.broadcast_to(offset[..., 2], turned_x.shape)], axis=-1
-    )
+    z = np.broadcast_to(offset[..., 2], turned_x.shape)
+    moved = np.stack([turned_x + x[..., 0, None], turned_y + x[..., 1, None], z], axis=-1)
     jacobian = np.zeros((*turned_x.shape, 3, 3))
     jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
     jacobian[..., 0, 2], jacobian[..., 1, 2] = -turned_y, turned_x
@@ -158,9 +138,9 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """The C pairs of landmarks (C,), (C,) that may be the same within the drift.
+    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift.
 
-    Of very many, those whose landmark here could be the fewest there: they tell most.
+    Of too many pairs it keeps those whose landmark here has the fewest partners, because they are the most distinctive.
     """
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
@@ -173,7 +153,7 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Hypotheses (H, 2, 2): each candidate alone (as twice the same), and every two candidates that fit each other."""
+    """Return hypotheses (H, 2, 2): each candidate twice, and every two candidates that fit each other."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])
@@ -182,7 +162,7 @@ def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
     two = np.linalg.norm(problem.target[b[i], :2] - problem.target[b[j], :2], axis=1)
     fits = (np.abs(one - two) <= 3 * np.hypot(problem.spread[a[i], b[i]], problem.spread[a[j], b[j]])) & (one > _MIN_BASE)
     i, j = i[fits], j[fits]
-    if len(i) > _HYPOTHESES:  # a longer base tells the heading better
+    if len(i) > _HYPOTHESES:  # A longer base determines the heading better.
         longest = np.argsort(-one[fits], kind="stable")[:_HYPOTHESES]
         i, j = i[longest], j[longest]
     pairs = np.concatenate([single, np.stack([i, j], axis=1)])
@@ -190,12 +170,12 @@ def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
 
 
 def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
-    """The corrections (H, 3) that best explain the seeds (H, 2, 2) and the prior."""
+    """Return the corrections (H, 3) that best explain the seeds (H, 2, 2) and the prior."""
     a, b = seeds[:, :, 0], seeds[:, :, 1]
     information = problem.information[a, b]
     alone = a[:, 0] == a[:, 1]
-    information[alone] /= 2  # a single candidate counts once
-    # a base of two gives the heading in closed form, so that Gauss-Newton starts close to the solution
+    information[alone] /= 2  # A single candidate is in its seed twice.
+    # A base of two gives the heading in closed form, so Gauss-Newton starts near the solution.
     base, other = problem.offset[a[:, 1]] - problem.offset[a[:, 0]], problem.target[b[:, 1]] - problem.target[b[:, 0]]
     angle = np.arctan2(other[:, 1], other[:, 0]) - np.arctan2(base[:, 1], base[:, 0])
     x = np.zeros((len(seeds), 3))
@@ -206,7 +186,7 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
 
 
 def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """One step for the corrections (..., 3) from pairs a, b (..., P), and the Hessian (..., 3, 3)."""
+    """Take one step for the corrections (..., 3) from pairs a, b (..., P), and return the Hessian (..., 3, 3) as well."""
     at, jacobian = _moved(problem.offset[a], x)
     weighted = np.swapaxes(jacobian, -1, -2) @ information
     hessian = problem.weight + (weighted @ jacobian).sum(axis=-3)
@@ -215,7 +195,7 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: F
 
 
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """The gain (H,) of corrections (H, 3) if each landmark takes its best partner; a, b: (C,) candidates, a increasing."""
+    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner among candidates (C,), a sorted."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
     first = np.flatnonzero(np.diff(a, prepend=-1))
     size = max(1, _GAINS_AT_ONCE // len(a))
@@ -227,14 +207,14 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Log likelihood ratio (..., C) of pairs (C,) against new landmarks under corrections (..., 3); -inf beyond the gate."""
+    """Return the log likelihood ratio (..., C) of pairs over new landmarks for corrections (..., 3), -inf beyond a gate."""
     miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
 def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """The log Bayes factor of a correction (3,) refined with the best assignment of candidates (C,), its pairs (P, 2)."""
+    """Return the log Bayes factor of a refined correction (3,), the correction, and its best assignment (P, 2)."""
     gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
         gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)
@@ -247,6 +227,6 @@ def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float
     final = _gains(problem, a, b, x)
     if not np.isfinite(final).all():
         return None
-    # Laplace's approximation: the prior's density at x times the volume that the landmarks leave open
+    # Laplace's approximation multiplies the prior density at x with the volume that the landmarks leave open.
     occam = 0.5 * (np.linalg.slogdet(problem.weight)[1] - np.linalg.slogdet(hessian)[1])
     return float(final.sum() - 0.5 * x @ problem.weight @ x + occam), x, np.stack([a, b], axis=1)

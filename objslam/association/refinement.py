@@ -1,6 +1,4 @@
-"""How far rays pass a point, and the points that they pass closest, by iterated weighted least squares."""
-
-from __future__ import annotations
+"""Residuals of rays at points, and points that fit rays best, by iterated weighted least squares."""
 
 import numpy as np
 
@@ -9,23 +7,23 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HALF_RAY, grouped_quantiles
 
 RANGE_GAIN = 6.0
-"""What a range that fits perfectly takes off a match's cost: something else has its range anywhere within some metres."""
+"""The cost reduction of a match by a perfect range, because another object's range may lie anywhere within some metres."""
 RANGE_LOSS = 4.0
-"""The most that a wrong range adds to a match's cost: one right box in ten or so has a wrong range."""
+"""The most that a wrong range adds to the cost of a match, because about one correct box in ten has a wrong range."""
 BEHIND = 1e6
-"""The standard deviations that stand for a point behind the camera where a finite number is needed."""
-_HALF_RANGE = 3.0  # The scale, in squared deviations, of the robust weight of a range; larger lets wrong ranges pull harder.
-_DAMPING = 1e-6  # The share of the information added to all directions: what rays do not fix stays where it is.
-_ITERATIONS = 6  # The Gauss-Newton steps of a refinement; association calls it again and again, so few are enough.
+"""The finite number of standard deviations that stands for a point behind the camera."""
+_HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations; larger lets wrong ranges pull harder.
+_DAMPING = 1e-6  # The share of the information added in all directions, so that unobserved directions stay unchanged.
+_ITERATIONS = 6  # The Gauss-Newton steps of a refinement; few are enough, because association refines repeatedly.
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
-    """Variance (E,) m^2 per axis across of a point's offset from its ray, `distance` (E,) m away; of: (E,) which rays."""
+    """Return the variance (E,) m^2 per perpendicular axis of the offsets of points at `distance` (E,) m from rays `of`."""
     return np.asarray(noise**2 * ((obs.sigma[of] * distance) ** 2 + obs.position_sigma**2))
 
 
 def squared_offsets(obs: Observations, position: Floats, of: Ints | slice = slice(None)) -> tuple[Floats, Floats]:
-    """How far each ray passes its point, (E, 3) or (3,), squared, inf where that is behind, and its distance (E,) m."""
+    """Return the squared offset (E,) of each point, (E, 3) or (3,), from its ray, inf if behind, and its distance (E,) m."""
     to = position - obs.origin[of]
     depth = np.einsum("ri,ri->r", to, obs.direction[of])
     distance2 = np.einsum("ri,ri->r", to, to)
@@ -33,19 +31,17 @@ def squared_offsets(obs: Observations, position: Floats, of: Ints | slice = slic
 
 
 def normalised_residuals(obs: Observations, position: Floats, slack: float = 0.0, of: Ints | slice = slice(None)) -> Floats:
-    """By how many standard deviations (E,) each ray passes its point, (E, 3) or (3,); inf where that is behind.
+    """Return the offset of each point, (E, 3) or (3,), from its ray in standard deviations (E,), inf if behind.
 
-    slack: m, a standard deviation of the origins besides their own.
+    slack: m, standard deviation of the origins in addition to their own.
     """
     off2, distance = squared_offsets(obs, position, of)
     return np.asarray(np.sqrt(off2 / (variance(obs, distance, 1.0, of) + slack**2)))
 
 
 def information(obs: Observations, point: Floats) -> Floats:
-    """The information (R, 3, 3) m^-2 of each ray about its point, (R, 3) or (3,)."""
-    to = point - obs.origin
-    distance = np.linalg.norm(to, axis=1)
-    n = obs.direction
+    """Return the information (R, 3, 3) m^-2 of each ray about its point, (R, 3) or (3,)."""
+    distance, n = np.linalg.norm(point - obs.origin, axis=1), obs.direction
     along = n[:, :, None] * n[:, None, :]
     across = (np.eye(3) - along) / (obs.sigma * np.maximum(distance, MIN_DEPTH))[:, None, None] ** 2
     weight = np.where(np.isfinite(obs.range), 1 / obs.range_sigma**2, 0.0)
@@ -55,7 +51,7 @@ def information(obs: Observations, point: Floats) -> Floats:
 def range_costs(
     obs: Observations, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
 ) -> Floats:
-    """What ranges add to the cost (E,) of points at `distance` (E,) m, 0 without a range; of: (E,) which rays."""
+    """Return the costs (E,) that the ranges of rays `of` (E,) add for points at `distance` (E,) m, 0 without a range."""
     measured = obs.range[of]
     if not np.isfinite(measured).any():
         return np.zeros(len(distance))
@@ -65,12 +61,10 @@ def range_costs(
 
 
 def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats) -> Floats:
-    """Positions (N, 3) m of points from P pairs of a ray and its point; a ray may be in several pairs.
+    """Refine positions (N, 3) m of points from P pairs of a ray and its point. A ray may be in several pairs.
 
-    Args:
-        ray, index: (P,) the observation and the point of each pair.
-        start: (N, 3) m; along directions that its rays do not fix, a point stays where it starts.
-        noise: (N,) factor on the noise of the rays.
+    ray, index: (P,) the observation and the point of each pair. start: (N, 3) m. A point keeps its start value in directions
+    that its rays do not observe. noise: (N,) factor on the noise of the rays.
     """
     count = len(start)
     order = np.argsort(index, kind="stable")
@@ -94,21 +88,18 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
         total = grouped_sums(each.reshape(-1, 9), index, count).reshape(-1, 3, 3)
         total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
         step = np.linalg.solve(total, grouped_sums(pull, index, count)[:, :, None])[:, :, 0]
-        # under little parallax a full step may go anywhere, so a step is never longer than the point is away
+        # Little parallax makes full steps unreliable, so no step is longer than the mean distance of the point.
         length, reach = np.linalg.norm(step, axis=1), np.bincount(index, distance, count) / number
         position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     return position
 
 
 def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Floats, steps: int) -> tuple[Floats, Floats]:
-    """Positions (N, 3) m of a few points, and covariances (N, 3, 3) m^2, in less time than `refine` takes.
+    """Refine a few points faster than `refine`, and return positions (N, 3) m and covariances (N, 3, 3) m^2.
 
-    Args:
-        obs: the rays of the first point, then those of the second, and so on.
-        number: (N,) how many rays each point has, at least one.
-        start: (N, 3) m.
-        damping: (N, 3, 3) m^-2 information that a point is where a step finds it.
-        steps: how many steps of Gauss-Newton.
+    obs: all rays of the first point, then all rays of the second point, and so on. number: (N,) number of rays of each
+    point, at least 1. start: (N, 3) m. damping: (N, 3, 3) m^-2, information that keeps a point at its place in each step.
+    steps: number of Gauss-Newton steps.
     """
     index, begin, position = np.repeat(np.arange(len(number)), number), np.cumsum(number) - number, start
     for _ in range(steps):
@@ -127,9 +118,9 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
 def velocity_gain(
     obs: Observations, ray: Ints, index: Ints, position: Floats, noise: Floats, stamps: Floats
 ) -> tuple[Floats, Floats]:
-    """The share (N,) of its rays' squared deviations that a velocity of each point explains, and how far it goes (N,) m.
+    """Fit a velocity to each point. Return the share (N,) of squared deviations that it explains, and its motion (N,) in m.
 
-    Pairs and points are as in `refine`; stamps: (P,) s of the rays.
+    Pairs and points are as in `refine`. stamps: (P,) s of the rays.
     """
     count = len(position)
     origin, direction = obs.origin[ray], obs.direction[ray]
@@ -155,9 +146,9 @@ def velocity_gain(
 
 
 def _across(to: Floats) -> tuple[Floats, Floats]:
-    """Distances (P,) m of points `to` (P, 3) m away, and the projections (P, 3, 3) across the lines of sight to them.
+    """Return the lengths (P,) m of offsets (P, 3) m from cameras, and projections (P, 3, 3) perpendicular to them.
 
-    Along that line, which the ray is only nearly, no angle changes: a point that drives along with the camera gains nothing.
+    Angles do not change along the line of sight. So a point that moves along with the camera explains nothing.
     """
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
     toward = to / distance[:, None]
@@ -165,7 +156,7 @@ def _across(to: Floats) -> tuple[Floats, Floats]:
 
 
 def _standard(time: Floats, index: Ints, count: int) -> Floats:
-    """Times (P,) with mean 0 and standard deviation 1 within each point."""
+    """Standardise times (P,) within each point to mean 0 and standard deviation 1."""
     number = np.maximum(np.bincount(index, minlength=count), 1)
     centred = time - (np.bincount(index, time, count) / number)[index]
     spread = np.sqrt(np.bincount(index, centred**2, count) / number)
@@ -173,5 +164,5 @@ def _standard(time: Floats, index: Ints, count: int) -> Floats:
 
 
 def grouped_sums(values: Floats, index: Ints, count: int) -> Floats:
-    """Sums (count, D) of the values (P, D) of each group; index: (P,) the group of each row."""
+    """Return the sums (count, D) of the values (P, D) of each group. index: (P,) the group of each row."""
     return np.stack([np.bincount(index, column, count) for column in values.T], axis=1).astype(np.float64)

@@ -1,6 +1,4 @@
-"""Which objects should have been seen in which frames, and whether they were."""
-
-from __future__ import annotations
+"""Determine in which frames each object should be detected, and in which frames it is."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,25 +6,25 @@ from functools import cached_property
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
+from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
 
-_PAIRS_AT_ONCE = 1 << 20  # The pairs of an object and a frame looked at together; larger needs more memory.
-_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of the distances at which a class is detected; outside a miss says nothing.
-_CORE_SHARE = (
-    0.8  # The share of a class's boxes, from its strongest objects, that tells its distances: others may be phantoms.
-)
-_FRONT_SHARE = 0.95  # The least share of an object's boxes from one half of the directions for it to have a front.
-_CLOSER = (0.3, 0.1)  # The metres, and the share of the distance, by which something must be closer to hide an object.
-_FILLED = 0.6  # The share of a box's width and height that its object surely fills; larger hides more.
+_PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together; larger needs more memory.
+_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances; outside them a miss tells nothing.
+_CORE_SHARE = 0.8  # The share of a class's boxes, strongest objects first, that sets its distances; others may be phantoms.
+_FRONT_SHARE = 0.95  # The least share of an object's boxes from one half space for the object to have a front.
+_CLOSER = (0.3, 0.1)  # The least depth gap of an occluder to the object, in m and as a share of the distance.
+_FILLED = 0.6  # The share of a box's width and height that its object certainly fills; larger occludes more.
 
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The frames that were looked at: stamps (F,) s, cameras, camera (F,) of each frame, map_T_camera (F, 4, 4).
+    """Observed frames: stamps (F,) s, cameras, the camera (F,) of each frame, map_T_camera (F, 4, 4).
 
-    margin (px), margin_share (of its size): how close to the image's edge a box is still used; a negative margin: anywhere.
+    A usable box is at least margin (px) and margin_share of its size away from the image edge. A negative margin allows any
+    box.
     """
 
     stamps: Floats
@@ -36,22 +34,19 @@ class CameraFrames:
     margin: float
     margin_share: float
 
-    def __len__(self) -> int:
-        return len(self.camera)
-
     @cached_property
     def solid_angle(self) -> float:
-        """sr, what a frame sees on average."""
+        """Mean solid angle (sr) of a frame."""
         each = np.array([camera.solid_angle for camera in self.cameras])
-        return float(each[self.camera].mean()) if len(self) else 1.0
+        return float(each[self.camera].mean()) if len(self.camera) else 1.0
 
 
 @dataclass(frozen=True)
 class DetectionHistory:
-    """The V pairs of an object and a frame where it was or should have been detected, by object, then frame.
+    """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame: (V,). detected: (V,). inside: (N,) frames in which each object's box lies in the image, no further away
-    than the furthest box of the object or of its class.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, at most as far away
+    as the farthest box of the object or of its class.
     """
 
     object: Ints
@@ -61,39 +56,34 @@ class DetectionHistory:
 
     @cached_property
     def expected(self) -> Ints:
-        """(N,) frames in which each object was or should have been detected."""
+        """Number (N,) of frames in which each object is or should be detected."""
         return np.bincount(self.object, minlength=len(self.inside))
 
     @cached_property
     def seen(self) -> Ints:
-        """(N,) frames in which each object was detected."""
+        """Number (N,) of frames in which each object is detected."""
         return np.bincount(self.object[self.detected], minlength=len(self.inside))
 
 
 def detection_history(
     obs: Observations, matched: Ints, position: Floats, label: Ints, view: CameraFrames
 ) -> DetectionHistory:
-    """Where the objects were or should have been detected.
+    """Return where the objects are or should be detected.
 
-    An object should be detected where its box lies in the image, at a usual distance of its class or of itself, from its
-    front if it has one, and where no box of something closer covers it.
-
-    Args:
-        matched: (R,) the object of each observation, -1 none.
-        position: (N, 3) m, and label: (N,), of the objects.
+    An object should be detected if its box lies in the image, at a usual distance of its class or of itself, is not occluded
+    by a closer box, and shows the object's front if it has one. matched: (R,) the object of each observation, -1 for none.
+    position, label: (N, 3) m and (N,), of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
     index = matched[held]
     distance, total = np.full(len(obs.frame), np.nan), len(view.camera)
     distance[held] = np.linalg.norm(position[index] - obs.origin[held], axis=1)
-    size = obs.size[held] * distance[held, None]
-    extent = np.nan_to_num(grouped_median(size, index, count))
+    extent = np.nan_to_num(grouped_median(obs.size[held] * distance[held, None], index, count))
     near, far = _usual_ranges(distance[held], index, label)
     own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(distance[held], index, count, (0.5, 1.0)))
     near, far = np.minimum(own, near[label]), np.maximum(own, far[label])
     reach = np.maximum(furthest, far)
-
     pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)))]
     for number, camera in enumerate(view.cameras):
         frames = np.flatnonzero(view.camera == number)
@@ -106,57 +96,49 @@ def detection_history(
     usual &= _from_the_front(obs.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
     clear = ~_hidden(frame, away, pixel, obs, np.where(np.isfinite(obs.range), obs.range, distance))
-    there = np.sort(index * total + obs.frame[held])
-    key = np.sort(np.concatenate([obj[clear] * total + frame[clear], there]))
-    key = key[np.append(True, np.diff(key) > 0)[: len(key)]]
-    at = np.minimum(np.searchsorted(there, key), max(len(there) - 1, 0))
-    detected = there[at] == key if len(there) else np.zeros(len(key), dtype=bool)
-    return DetectionHistory(key // total, key % total, detected, inside)
+    there = index * total + obs.frame[held]
+    key = np.union1d(obj[clear] * total + frame[clear], there)
+    return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
 
 
-def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> tuple[Floats, Floats]:
-    """The least and the greatest usual distance (C,) of each class; distance, index: (P,) m and object of each box."""
+def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
+    """Return the least and the greatest usual distance (C,) of each class, from the distances (P,) m of its boxes."""
     number = np.bincount(index, minlength=len(label))
     order = np.lexsort((-number, label))
     before = np.cumsum(number[order]) - number[order]
     before -= before[np.searchsorted(label[order], label[order])]
     core = np.zeros(len(label), dtype=bool)
     core[order] = before <= _CORE_SHARE * np.bincount(label, number)[label[order]]
-    told = core[index]
+    core_box = core[index]
     classes = int(label.max(initial=-1)) + 1
-    near, far = grouped_quantiles(distance[told], label[index[told]], classes, _USUAL_DISTANCES)
-    return near, far
+    return grouped_quantiles(distance[core_box], label[index[core_box]], classes, _USUAL_DISTANCES)
 
 
 def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
-    """Whether a camera at (V, 3) sees the front of its object (V,): a screen, for example, is only detected from one side.
+    """Return whether a camera at (V, 3) sees the front of its object (V,). A screen, for example, has a front.
 
-    An object has a front if nearly all its boxes were seen from one half of the directions. Then misses from the other half
-    say nothing. origin, index: (P, 3) m and (P,), where from and of what each box was seen.
+    An object has a front if nearly all its boxes come from one half space. Misses from the other half space then tell
+    nothing. origin, index: (P, 3) m and (P,), the camera position and the object of each box.
     """
-    count = len(position)
-    front = np.stack([np.bincount(index, c, count) for c in _unit(origin - position[index]).T], axis=1)
-    facing = np.einsum("pi,pi->p", _unit(origin - position[index]), front[index])
+    count, toward = len(position), origin - position[index]
+    toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    front = grouped_sums(toward, index, count)
+    facing = np.einsum("pi,pi->p", toward, front[index])
     one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FRONT_SHARE)) >= 0
     return ~one_sided[obj] | (np.einsum("vi,vi->v", camera - position[obj], front[obj]) >= 0)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Object, frame, distance (V,) and pixel (V, 2) where the boxes of the objects lie in the image, within reach (N,) m."""
+    """Return object, frame, distance (V,) and pixel (V, 2) of the object boxes inside images, within reach (N,) m."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]
     distance2 = (origin**2).sum(axis=1)[:, None] + (point**2).sum(axis=1) - 2 * origin @ point.T
     depth = ahead @ point.T - (ahead * origin).sum(axis=1)[:, None]
-    bound = (
-        np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
-    )  # most objects are beyond it: they need not be projected
+    # Most objects lie outside this cone and need no projection.
+    bound = np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
     in_cone = (depth > 0) & (depth * depth >= bound) & (distance2 > MIN_DEPTH**2)
     f, n = np.nonzero(in_cone & (distance2 <= (reach + 1e-6) ** 2))
     local = np.einsum("vji,vj->vi", poses[f, :3, :3], position[n] - poses[f, :3, 3])
@@ -169,7 +151,7 @@ def _in_image(
 
 
 def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, reach: Floats) -> Bools:
-    """Whether a box of something closer covers the pixel (V,); reach: (R,) m, the distance of each box's object, or NaN."""
+    """Return whether the box of a closer object covers the pixel (V,). reach: (R,) m, distances of the boxes' objects."""
     hidden = np.zeros(len(frame), dtype=bool)
     useful = np.flatnonzero(np.isfinite(reach))
     frames = np.arange(int(max(frame.max(initial=0), obs.frame.max(initial=0))) + 2)
@@ -180,8 +162,8 @@ def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, rea
     number = end - begin
     most = np.argsort(-number, kind="stable")
     fewer = -number[most]
-    for k in range(int(number.max(initial=0))):  # the k-th box of every frame at once
-        rows = most[: np.searchsorted(fewer, -k)]  # of the frames that have a k-th box
+    for k in range(int(number.max(initial=0))):  # Each step checks the k-th box of all frames that have one.
+        rows = most[: np.searchsorted(fewer, -k)]
         box = useful[begin[rows] + k]
         closer = reach[box] < front[rows]
         rows, box = rows[closer], box[closer]

@@ -1,6 +1,4 @@
-"""The command line, a file a command. Heavy imports happen inside the commands: --help must answer at once."""
-
-from __future__ import annotations
+"""Define the command line, with one file per command. Heavy imports are inside the commands, so that --help is fast."""
 
 import sys
 from typing import Annotated, NoReturn
@@ -25,7 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="A robot's log becomes a map of objects in 3D: poses and detector boxes in, positions with covariances out.",
+    help="Map objects in 3D from the log of a robot: from poses and detector boxes to positions with covariances.",
 )
 app.command()(run)
 app.command()(live)
@@ -36,7 +34,7 @@ app.command()(demo)
 app.command()(convert)
 app.command()(info)
 app.command()(export)
-config_app = typer.Typer(no_args_is_help=True, help="Look at the settings.")
+config_app = typer.Typer(no_args_is_help=True, help="Print the settings.")
 config_app.command("dump")(config_dump)
 app.add_typer(config_app, name="config")
 
@@ -60,7 +58,8 @@ def _options(
 
 
 def main() -> NoReturn:
-    """Entry point: exit code 0 done, 1 the work failed (one line on stderr), 2 wrong use; a traceback with --debug only."""
+    """Run a command. Exit codes: 0 success, 1 failure, 2 usage error. An error is one line on stderr unless --debug is
+    set."""
     debug = "--debug" in sys.argv
     try:
         app()
@@ -75,10 +74,10 @@ def main() -> NoReturn:
     except MemoryError:
         say("objslam: out of memory", stderr=True)
         sys.exit(1)
-    except Exception as error:  # the last resort: no traceback reaches a user
+    except Exception as error:  # hides the traceback of an internal error from the user
         if debug:
             raise
         said = f"{type(error).__name__}: {one_line(error)}"
-        say(f"objslam: internal error, {said} (please report it; objslam --debug shows where)", stderr=True)
+        say(f"objslam: internal error, {said} (please report it with the traceback from objslam --debug)", stderr=True)
         sys.exit(1)
     sys.exit(0)

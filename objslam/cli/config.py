@@ -1,13 +1,11 @@
-"""objslam config: look at the settings."""
-
-from __future__ import annotations
+"""The command `objslam config`, which prints the settings."""
 
 from objslam.cli.console import say
-from objslam.cli.options import Config, Set
+from objslam.cli.options import Config, Set, settings_of
 
 
 def config_dump(config: Config = None, set_: Set = None) -> None:
-    """Print every setting as YAML: the defaults, changed by --config and --set."""
-    from objslam.config import dump_settings, load_settings
+    """Print all settings as YAML, with the changes by --config and --set."""
+    from objslam.config import dump_settings
 
-    say(dump_settings(load_settings(config, tuple(set_ or ()))), end="")
+    say(dump_settings(settings_of(None, config, set_)), end="")

@@ -1,4 +1,4 @@
-"""What a command says: lines, a progress bar, warnings."""
+"""Terminal output of the commands: lines, warnings, tables and a progress bar."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar on stderr, where that is a terminal: called with the stage's name, what is done and the total."""
+    """Show a progress bar if stderr is a terminal. Yield a function of the stage name, the finished items and the total."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -26,18 +26,18 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
 
 def report(ledger: Ledger) -> None:
-    """Every drop and warning of a ledger, a line each on stderr."""
+    """Print each drop and warning of a ledger as one line on stderr."""
     for line in ledger.lines():
         say(f"warning: {line}", stderr=True)
 
 
 def console(stderr: bool = False) -> Console:
-    """Where tables and lines go: as wide as the terminal, 120 columns without one."""
+    """Return a console as wide as the terminal, or of 120 columns without a terminal."""
     from rich.console import Console
 
     return Console(stderr=stderr, highlight=False, width=None if sys.stdout.isatty() else 120)
 
 
 def say(text: str, *, stderr: bool = False, markup: bool = False, end: str = "\n") -> None:
-    """A line, not wrapped."""
+    """Print a text without wrapping."""
     console(stderr).print(text, markup=markup, end=end, soft_wrap=True)

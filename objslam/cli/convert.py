@@ -1,6 +1,4 @@
-"""objslam convert: any source becomes a log folder."""
-
-from __future__ import annotations
+"""The command `objslam convert`, which writes a recording as a log folder."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,14 +13,14 @@ from objslam.sources import SourceOptions
 @with_options
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="SRC", help="What to read: a ROS bag, UTIAS MRCLAM, TUM RGB-D, a log folder.")
+        Path, typer.Argument(metavar="SRC", help="The recording: a ROS bag, UTIAS MRCLAM, TUM RGB-D, or a log folder.")
     ],
     log: Annotated[Path, typer.Argument(metavar="LOG", help="The log folder to write.")],
     *,
     options: SourceOptions,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log folder that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing log folder.")] = False,
 ) -> None:
-    """Write a recording as a log folder, its images and depth images too."""
+    """Write a recording as a log folder, including its images and depth images."""
     from objslam.core.diagnostics import Ledger
     from objslam.sources import convert
 

@@ -1,7 +1,6 @@
-"""objslam demo: make a drive, map it, compare it with the truth."""
+"""The command `objslam demo`, which simulates a drive, maps it, and evaluates the map."""
 
-from __future__ import annotations
-
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,14 +15,14 @@ from objslam.cli.run import run_log
 
 def demo(
     out: Out = Path("demo_out"),
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Another seed is another room and drive.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random room and drive.")] = 0,
     boxes: Annotated[
-        bool, typer.Option("--boxes", help="Simulate the detector's boxes too, without rendering images: done in seconds.")
+        bool, typer.Option("--boxes", help="Simulate detector boxes instead of rendered images, which takes seconds only.")
     ] = False,
 ) -> None:
-    """Make a drive, map it with the poses as they are and together with them, and compare both with the truth.
+    """Simulate a drive, map it with fixed poses and with joint estimation, and compare both maps with the truth.
 
-    The drive is rendered: a furnished room, RGB-D images, seven objects that the detector shipped with objslam knows.
+    The drive is rendered as RGB-D images of a furnished room with seven objects of the detector shipped with objslam.
     """
     from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError
@@ -34,9 +33,11 @@ def demo(
 
     prepare_output(out)
     log, model = out / "log", None
-    mark = out / ".objslam-demo"  # whoever finds it may replace the log
+    mark = out / ".objslam-demo"  # marks a log that the demo may replace
     if log.exists() and not mark.exists():
-        raise OutputError("there is a log that no demo made", where=str(log), hint="name another folder with -o")
+        raise OutputError(
+            "this log is not from a demo and is not replaced", where=str(log), hint="choose another folder with -o"
+        )
     mark.touch()
     if boxes:
         write_log_folder(simulate(preset("demo"), seed), log, overwrite=True)
@@ -45,18 +46,16 @@ def demo(
 
         model = Path(objslam.__file__).parent / "models" / "ssd7.onnx"
         with progress_bar() as show:
-            render_drive(
-                RenderSettings(), seed, log, overwrite=True, progress=lambda done, total: show("rendering", done, total)
-            )
-    say(f"made a drive: {log}")
+            render_drive(RenderSettings(), seed, log, overwrite=True, progress=partial(show, "rendering"))
+    say(f"wrote the simulated drive: {log}")
     for mode, poses in (("fixed", "localization"), ("joint", "odometry")):
         ledger = Ledger()
-        # the shipped detector's box centres are off by 0.9 px in the median
+        # The median error of the box centres of the shipped detector is 0.9 px.
         changes = [f"poses.use={poses}", *(["rays.pixel_sigma=1.5"] if model else [])]
         settings = settings_of(mode, None, changes)
         shown = " ".join(["objslam run", str(log), "-o", str(out / mode), "--mode", mode, *(f"--set {c}" for c in changes)])
         say(f"\n[bold]{shown}{f' --detector {model}' if model else ''}[/]", markup=True)
         run_log(read(log, ledger), settings, ledger, out / mode, model)
-        # a map from odometry alone begins where the odometry does: how it lies in the room is not its to say
+        # A map from odometry alone starts at the first odometry pose, so its pose in the room is unknown.
         print_evaluation(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
-    say(f"\nlook at {out / 'joint' / 'map.png'}, or open the recording: objslam view {out / 'joint'}")
+    say(f"\nopen {out / 'joint' / 'map.png'}, or run: objslam view {out / 'joint'}")

@@ -1,4 +1,4 @@
-"""objslam eval: a result against the truth."""
+"""The command `objslam eval`, which compares a result with the truth."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ def evaluate_result(
     out: Annotated[Path, typer.Argument(help="A result folder.")],
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="objects.json, or a groundtruth or log folder; what the log brought if not given."),
+        typer.Option("--truth", help="objects.json, or a groundtruth or log folder. Default: the truth of the log."),
     ] = None,
     align: Align = "none",
     radius: Radius = 0.5,
 ) -> None:
-    """Compare a result with ground truth: matched, missed and false objects, position errors, path error."""
+    """Compare a result with the ground truth: matched, missed and false objects, position errors, path error."""
     print_evaluation(out, truth, align, radius)
 
 
 def print_evaluation(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
-    """Evaluate a result folder, write evaluation.json into it and print the table."""
+    """Evaluate a result folder, write evaluation.json into it, and print the table."""
     from objslam.evaluation.evaluate import evaluate_folder, write_evaluation
     from objslam.evaluation.table import evaluation_table
 

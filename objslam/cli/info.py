@@ -1,4 +1,4 @@
-"""objslam info: what is inside a recording, and what a run would make of it."""
+"""The command `objslam info`, which describes a recording and what a run needs from it."""
 
 from __future__ import annotations
 
@@ -16,21 +16,19 @@ from objslam.sources import SourceOptions, choose, read
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.core.camera import Camera
-    from objslam.sources import SourceOptions
-    from objslam.sources.ros_bag.info import BagInfo
     from objslam.sources.summary import Contents, Timing
 
-_EPOCH = 1e8  # s; stamps above it count from 1970: no drive lasts 3 years, and no recording is of 1973
-_NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # the columns of numbers, which are flush right
+_EPOCH = 1e8  # The timestamp in s above which timestamps count from 1970. No drive takes 3 years, no recording is from 1973.
+_NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
 
 
 @with_options
 def info(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or a data set that is read.")],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or another recording.")],
     *,
     options: SourceOptions,
 ) -> None:
-    """Say what is inside a recording: streams, rates, gaps, times, the role of each topic, and what a run would miss."""
+    """Describe a recording: streams, rates, gaps, times, the role of each topic, and missing parts for a run."""
     from objslam.core.diagnostics import Ledger
     from objslam.sources.summary import contents
 
@@ -39,8 +37,7 @@ def info(
         _show_bag(source, options)
         return
     ledger = Ledger()
-    log = read(source, ledger, options)
-    _show_log(contents(log), kind.name)
+    _show_log(contents(read(source, ledger, options)), kind.name)
     report(ledger)
 
 
@@ -48,9 +45,7 @@ def _show_log(found: Contents, kind: str) -> None:
     starts, ends = ([getattr(s.timing, end) for s in found.streams] for end in ("start", "end"))
     begin = min(starts, default=0.0)
     say(f"{found.name}: {kind}; {_span(begin, max(ends, default=0.0))}")
-    rows = [
-        (stream.role, str(stream.timing.count), *_numbers(stream.timing, begin), stream.detail) for stream in found.streams
-    ]
+    rows = [(s.role, str(s.timing.count), *_numbers(s.timing, begin), s.detail) for s in found.streams]
     _table(("role", *_NUMERIC, "what"), rows)
     _show_cameras(found.cameras)
     _list("missing for a run", found.missing, "nothing is missing for a run")
@@ -72,7 +67,9 @@ def _show_bag(source: Path, options: SourceOptions) -> None:
     ]
     _table(("topic", "role", "type", *_NUMERIC, "frame", "what"), rows)
     _show_cameras(bag.cameras)
-    _show_places(bag)
+    for place in bag.places:
+        where = "moves" if place.base_T_frame is None else _place(place.base_T_frame)
+        say(f"{' -> '.join(place.chain)}: {where}")
     refused = [f"{topic.name}: {reason}" for topic in bag.topics for reason in topic.refused]
     _list("messages that cannot be used", refused)
     _list("damage", bag.damage)
@@ -89,12 +86,6 @@ def _show_cameras(cameras: Iterable[Camera]) -> None:
         )
 
 
-def _show_places(bag: BagInfo) -> None:
-    for place in bag.places:
-        where = "moves" if place.base_T_frame is None else _place(place.base_T_frame)
-        say(f"{' -> '.join(place.chain)}: {where}")
-
-
 def _place(pose: Floats) -> str:
     from objslam.core.geometry import quaternion
 
@@ -109,14 +100,13 @@ def _numbers(when: Timing, begin: float) -> tuple[str, ...]:
 
 
 def _span(start: float, end: float) -> str:
-    if start > _EPOCH:
-        first = datetime.fromtimestamp(start, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-        return f"{end - start:.1f} s from {first}"
-    return f"{end - start:.1f} s from {start:.3f} s"
+    epoch = start > _EPOCH
+    first = datetime.fromtimestamp(start, UTC).strftime("%Y-%m-%d %H:%M:%S UTC") if epoch else f"{start:.3f} s"
+    return f"{end - start:.1f} s from {first}"
 
 
 def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Columns of text, none of it cut off, however long a topic's name is."""
+    """Print columns of text without truncation."""
     widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
     for row in (names, *rows):
         cells = (c.rjust(w) if name in _NUMERIC else c.ljust(w) for c, w, name in zip(row, widths, names, strict=True))

@@ -1,4 +1,4 @@
-"""objslam live: the map while the robot drives."""
+"""The command `objslam live`, which maps objects while the robot drives."""
 
 from __future__ import annotations
 
@@ -12,31 +12,25 @@ import typer
 from objslam.cli.console import say
 from objslam.cli.live_drive import LatestObjects, drive, finish
 from objslam.cli.options import Config, Out, Set, settings_of, with_options
-from objslam.live.adapters import ADAPTERS, LiveOptions, NetworkOptions
+from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
 
 if TYPE_CHECKING:
-    from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
-    from objslam.core.types import Log, Truth
-    from objslam.live.adapters import Feed
-    from objslam.live.session.session import Session
+    from objslam.core.types import Log
 
 
-Speed = Annotated[
-    float, typer.Option("--speed", min=0.0, help="Replay so many times as fast as it was driven; 0: as fast as it can be.")
-]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the journal of a session that was killed.")]
-Interval = Annotated[float, typer.Option("--interval", min=0.1, help="s between two writings of objects.json.")]
+Speed = Annotated[float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0: as fast as possible.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
+Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[
-    bool, typer.Option("--publish", help="Send objects, markers and the path over DDS, for RViz and Nav2, every --interval.")
+    bool, typer.Option("--publish", help="Publish objects, markers and path over DDS for RViz and Nav2, every --interval.")
 ]
 View = Annotated[
-    str | None,
-    typer.Option("--view", help="Look at it: window, web (a browser on this machine), FILE.rrd, or a viewer's address."),
+    str | None, typer.Option("--view", help="Show the map: window, web (a local browser), FILE.rrd, or a viewer's address.")
 ]
-WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Keep what comes on the disk.")]
+WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Record all messages on the disk.")]
 
 
 @with_options
@@ -45,7 +39,7 @@ def live(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help=", ".join(f"{name} ({it.says})" for name, it in ADAPTERS.items()) + ", or a recording: replayed.",
+            help=", ".join(f"{name} ({it.says})" for name, it in ADAPTERS.items()) + ", or a recording to replay.",
         ),
     ],
     out: Out = Path("out"),
@@ -60,20 +54,22 @@ def live(
     publish: Publish = False,
     view: View = None,
 ) -> None:
-    """Map objects while the robot drives: objects.json follows, and at the end (Ctrl-C) there is a whole result folder."""
+    """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C)."""
     from objslam.errors import ConfigError, OutputError
+    from objslam.live.adapters.replay import ReplayAdapter
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
     from objslam.sources.journal.file import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
-        raise OutputError("the recording of the result goes there", where=view, hint="name another file with --view")
+        raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")
     if resume and not journal:
-        raise ConfigError("--resume goes on with the journal that --no-journal does without", hint="leave out one of them")
+        raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
     settings = settings_of("joint", config, set_)
     _say_what_is_not_used(source, options, speed, publish)
-    recording = None if source in ADAPTERS else _read(Path(source), options)  # first, for it may be the journal in OUT
+    # The recording is read first, because it may be the journal in OUT.
+    recording = None if source in ADAPTERS else _read(Path(source), options)
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)
@@ -84,7 +80,9 @@ def live(
         if recording is None:
             feed = ADAPTERS[source].opens(session, settings, options)
         else:
-            feed, truth = _replay(recording, session, settings, speed or None)
+            (log, ledger), newest = recording, lambda: session.newest
+            adapter = ReplayAdapter(session, log, speed or None, session.wait, newest, ledger=ledger, settings=settings)
+            feed, truth = Feed(adapter), log.truth
         for close in feed.close:
             stack.callback(close)
         if publish:
@@ -101,14 +99,14 @@ def live(
         session.start()
         if resume:
             kept = session.counters.accepted()
-            say(f"{out / NAME} gone on with: {', '.join(f'{n} {kind}' for kind, n in kept.items())}", stderr=True)
+            say(f"continued {out / NAME}: {', '.join(f'{n} {kind}' for kind, n in kept.items())}", stderr=True)
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval)
         finish(session, feed, out, latest, truth, broken)
 
 
 def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publish: bool) -> None:
-    """Warn of options that mean nothing for a source; `sources.read` does so for what concerns recordings alone."""
+    """Warn of options without effect for a source. `sources.read` warns of the options of recordings."""
     adapter = ADAPTERS.get(source)
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
     for flag in unused(options, LiveOptions, taken) + (["--speed"] if adapter and speed != 1.0 else []):
@@ -121,45 +119,32 @@ def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
     from objslam.sources import read
 
     if not path.exists():
-        hint = f"SOURCE is {', '.join(ADAPTERS)}, or a log or bag"
+        hint = f"SOURCE is {', '.join(ADAPTERS)}, a log or a bag"
         raise LogError("there is no such recording", where=str(path), hint=hint)
     ledger = Ledger()
     return read(path, ledger, options), ledger
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """Nothing that a session kept is lost: what is there is gone on with, or set aside until the new one holds anything."""
+    """Check the journal for --resume. Without --resume, rename it, and restore it if the new session has no message."""
     from objslam.errors import OutputError
     from objslam.sources.journal.file import put_back, set_aside
 
     if resume:
         if not file.is_file():
-            raise OutputError("there is no journal to go on with", where=str(file), hint="leave out --resume")
+            raise OutputError("there is no journal to resume", where=str(file), hint="leave out --resume")
         return
     aside = set_aside(file)
     if aside is None:
         return
     say(
-        f"warning: kept the journal of an earlier session as {aside} (`objslam run` maps it; to go on with it, name it "
-        f"{file.name} again and --resume)",
+        f"warning: renamed the journal of an earlier session to {aside} (`objslam run` maps it; to resume it, rename it to "
+        f"{file.name} and use --resume)",
         stderr=True,
     )
 
     def end() -> None:
         if put_back(aside, file):
-            say(f"nothing came: {file} is the journal of the earlier session again", stderr=True)
+            say(f"no message came: restored {file} of the earlier session", stderr=True)
 
     stack.callback(end)
-
-
-def _replay(
-    recording: tuple[Log, Ledger], session: Session, settings: Settings, speed: float | None
-) -> tuple[Feed, Truth | None]:
-    from objslam.live.adapters import Feed
-    from objslam.live.adapters.replay import ReplayAdapter
-
-    log, ledger = recording
-    adapter = ReplayAdapter(
-        session, log, speed, session.wait, after=lambda: session.newest, ledger=ledger, settings=settings
-    )
-    return Feed(adapter), log.truth

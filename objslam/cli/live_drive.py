@@ -1,4 +1,5 @@
-"""The drive of `objslam live`: the source runs, objects.json follows, and whatever happens, a map is written."""
+"""The main loop of `objslam live`. It runs the source, updates objects.json, and writes the map in the end, even after
+errors."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from objslam.cli.console import console, report, say
+from objslam.cli.console import report, say
 from objslam.cli.live_status import status_line, times
 from objslam.errors import ObjslamError, one_line
 
@@ -20,17 +21,17 @@ if TYPE_CHECKING:
     from objslam.live.adapters import Feed
     from objslam.live.session.session import Session
 
-_POLL = 0.1  # s; how soon the end of a source is seen
+_POLL = 0.1  # The time in s between two checks for the end of the source.
 
 
 class LatestObjects:
-    """objects.json of a session that has not ended yet; the first one takes the place of an older result."""
+    """Write objects.json during a session. The first write removes an older result."""
 
     def __init__(self, out: Path) -> None:
         self._out, self._begun = out, False
 
     def write(self, snapshot: Snapshot) -> None:
-        """Write a snapshot's objects, once there is a keyframe."""
+        """Write the objects of a snapshot, unless the session has no keyframe yet."""
         from objslam.io.atomic_files import write_file
         from objslam.io.objects_json import dump_objects
         from objslam.output.result_folder import clear_result
@@ -39,16 +40,14 @@ class LatestObjects:
         if snapshot.keyframes and not self._begun:
             self._begun = True
             if removed := clear_result(self._out):
-                say(f"removed from {self._out}, for it was of an older result: {', '.join(removed)}", stderr=True)
+                say(f"removed the older result from {self._out}: {', '.join(removed)}", stderr=True)
         if self._begun:
             write_file(self._out / OBJECTS, dump_objects(snapshot.map).encode())
 
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
-    """Run the adapter until it ends, the session does, or Ctrl-C comes, with a status line and objects.json.
-
-    Returns the error that broke off the watching (of a view, or a disk that refuses), for the map is to be written first.
-    """
+    """Run the adapter until it ends, the session ends, or the user presses Ctrl-C. Update the status line and objects.json.
+    Return an error of a view or of the disk, so that `finish` can write the map before it raises the error."""
     from objslam.live.session import low_latency
 
     low_latency.configure()
@@ -57,19 +56,19 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
     def bring() -> None:
         try:
             feed.adapter.run(stop)
-        except Exception as error:  # noqa: BLE001 - told below, in the thread that can tell it
+        except Exception as error:  # noqa: BLE001 - reported below by the main thread
             ended.append(error)
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
-    told = 0
+    shown = 0
     with _ends_by_signal(stop), status_line() as show:
         bringing.start()
         due = time.monotonic() + interval
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
                 bringing.join(_POLL)
-                for warning in feed.adapter.ledger.warnings[told:]:
-                    told += 1
+                for warning in feed.adapter.ledger.warnings[shown:]:
+                    shown += 1
                     say(f"warning: {warning}", stderr=True)
                 if time.monotonic() >= due:
                     due = time.monotonic() + interval
@@ -78,7 +77,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
                     for view in feed.views:
                         view(snapshot)
                     show(snapshot)
-        except Exception as error:  # noqa: BLE001 - raised by `finish`, once the map is written
+        except Exception as error:  # noqa: BLE001 - raised by `finish` after the map is written
             broken = error
         stop.set()
         bringing.join()
@@ -90,12 +89,9 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 def finish(
     session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
 ) -> None:
-    """End the session, write its result, and say what came of it.
-
-    What ended the session early or broke off the watching is raised after that, as an ObjslamError where it was the session.
-    Where no result can be made, objects.json is that of the last snapshot.
-    """
-    from objslam.cli.run import objects_table, say_written
+    """End the session, write its result, and print a summary. Then raise the error that ended the session or a view early.
+    An error of the session becomes an ObjslamError. If there is no result, objects.json holds the last snapshot."""
+    from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
 
     session.counters.ledger.add(feed.adapter.ledger)
@@ -106,25 +102,17 @@ def finish(
         if session.failure is None:
             raise
         report(session.counters.ledger)
-        raise _ended_early(session.failure, out, "there is no more of the map than objects.json, if that") from error
+        raise _ended_early(session.failure, out, "the map is in objects.json only, if at all") from error
     removed = write_result(result, out, truth)
     last = session.snapshot()
-    ledger = session.counters.ledger
-    report(ledger)
-    console().print(objects_table(result.map))
-    counts = result.summary["counts"]
-    resolved, thinned = counts["objects"] - counts["unresolved"], last.counters.get("keyframes left out", 0)
+    report(session.counters.ledger)
+    thinned = last.counters.get("keyframes left out", 0)
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
-    say(
-        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}; {times(last, ', ')}"
-        f"{last.rebuilds} rebuilds"
-    )
-    say_written(out, removed)
+    say_result(result, f"{more}; {times(last, ', ')}{last.rebuilds} rebuilds", out, removed)
     for view in feed.views if broken is None else ():
         view(last)
     if session.failure is not None:
-        raise _ended_early(session.failure, out, "the map is of what came until then") from session.failure
+        raise _ended_early(session.failure, out, "the map holds the messages until then") from session.failure
     if broken is not None:
         raise broken
 
@@ -132,16 +120,14 @@ def finish(
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
     from objslam.sources.journal.file import NAME
 
-    said = one_line(failure)
-    if not isinstance(failure, ObjslamError):
-        said = f"internal error, {type(failure).__name__}: {said}"
-    more = f"; `objslam run {out}` maps all that came" if (out / NAME).is_file() else ""
-    return ObjslamError(f"the session ended early: {said}", hint=map_ + more)
+    internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
+    more = f"; `objslam run {out}` maps all received messages" if (out / NAME).is_file() else ""
+    return ObjslamError(f"the session ended early: {internal}{one_line(failure)}", hint=map_ + more)
 
 
 @contextmanager
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM set stop; a second Ctrl-C ends at once."""
+    """Set `stop` at Ctrl-C or SIGTERM. A second signal interrupts immediately."""
 
     def end(number: int, frame: object) -> None:
         if stop.is_set():

@@ -12,33 +12,33 @@ from objslam.cli.console import console, say
 if TYPE_CHECKING:
     from objslam.core.snapshot import Snapshot
 
-_LINES = 10.0  # s between status lines where there is no terminal
+_LINES = 10.0  # The time in s between status lines without a terminal.
 
 
 @contextmanager
 def status_line() -> Iterator[Callable[[Snapshot], None]]:
-    """A line that is kept up to date on stderr; where that is no terminal, one line every ten seconds."""
+    """Yield a function that updates the status line on stderr, or prints a line every ten seconds without a terminal."""
     from rich.live import Live as Line
 
     screen = console(stderr=True)
-    counts = _Rates()
+    rates = _Rates()
     if screen.is_terminal:
         with Line(console=screen, refresh_per_second=4, transient=True) as line:
-            yield lambda snapshot: line.update(counts.line(snapshot))
+            yield lambda snapshot: line.update(rates.line(snapshot))
         return
-    told = time.monotonic()
+    printed = time.monotonic()
 
-    def tell(snapshot: Snapshot) -> None:
-        nonlocal told
-        if time.monotonic() - told >= _LINES:
-            told = time.monotonic()
-            say(counts.line(snapshot), stderr=True)
+    def print_line(snapshot: Snapshot) -> None:
+        nonlocal printed
+        if time.monotonic() - printed >= _LINES:
+            printed = time.monotonic()
+            say(rates.line(snapshot), stderr=True)
 
-    yield tell
+    yield print_line
 
 
 class _Rates:
-    """The status line, with rates since the last one."""
+    """Format the status line with the message rates since the previous status line."""
 
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
@@ -61,6 +61,6 @@ class _Rates:
 
 
 def times(snapshot: Snapshot, then: str) -> str:
-    """How long updates took, and what stands between that and the rest; nothing where none was measured."""
+    """Return the update times followed by `then`, or an empty text if no update was measured."""
     median, most = snapshot.update
     return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""

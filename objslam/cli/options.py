@@ -1,11 +1,10 @@
-"""Options that several commands take. Those of the sources are declared with the sources, and come in by `with_options`."""
+"""The options shared by several commands, and the conversion of the sources' options to flags."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import GenericAlias
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -19,66 +18,67 @@ if TYPE_CHECKING:
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting; may be repeated.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting. May be repeated.")]
 Mode = Annotated[
     Literal["fixed", "joint"] | None,
-    typer.Option("--mode", help="fixed: the poses as they are. joint: poses and objects together. [default: fixed]"),
+    typer.Option("--mode", help="fixed (the default): keep the poses. joint: estimate poses and objects together."),
 ]
 Align = Annotated[
     Literal["none", "se2", "sim2"],
-    typer.Option("--align", help="Move the map onto the truth first: not at all, rigidly in the plane, or with a scale."),
+    typer.Option("--align", help="Align the map with the truth: not, by a rigid motion in the plane, or also by a scale."),
 ]
 Radius = Annotated[
-    float, typer.Option("--radius", min=0.0, help="An object within this many metres of the truth matches it.")
+    float, typer.Option("--radius", min=0.0, help="Maximum distance in m between an object and its true object.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
 
 
 def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -> Settings:
-    """The settings that --mode, --config and --set ask for, the last the strongest."""
+    """Load the settings from --config, --set and --mode. --set overrides --mode, and --mode overrides --config."""
     from objslam.config import load_settings
 
     return load_settings(config, ((f"mode={mode}",) if mode else ()) + tuple(set_ or ()))
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Spread the parameter `options` of a command, a class of options, into a flag for each field that has an `Option`."""
+    """Replace the parameter `options` of a command by one flag for each field of its class that has an `Option`."""
     signature = inspect.signature(command, eval_str=True)
     kind = signature.parameters["options"].annotation
-    declared = [_Flag(name, type_, option, getattr(kind, name)) for name, (type_, option) in flags(kind).items()]
+    declared = flags(kind)
 
     @functools.wraps(command)
     def call(**given: Any) -> None:
-        said = {flag.name: flag.value(given.pop(flag.name)) for flag in declared}
-        command(**given, options=kind(**said))
+        values: dict[str, Any] = {}
+        for name, (_, option) in declared.items():
+            value, default = given.pop(name), getattr(kind, name)
+            if isinstance(default, tuple):
+                values[name] = tuple(value or ())
+            else:
+                values[name] = not value if _is_negated(option, default) else value
+        command(**given, options=kind(**values))
 
     parameters: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
-        parameters += [flag.parameter() for flag in declared] if parameter.name == "options" else [parameter]
+        if parameter.name == "options":
+            parameters += [
+                _parameter(name, type_, option, getattr(kind, name)) for name, (type_, option) in declared.items()
+            ]
+        else:
+            parameters.append(parameter)
     vars(call)["__signature__"] = signature.replace(parameters=parameters)
     return call
 
 
-@dataclass(frozen=True)
-class _Flag:
-    """A field of a class of options as a parameter that typer understands, and the value that it stands for."""
+def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.Parameter:
+    """Return the typer parameter of an option with this default."""
+    if isinstance(default, tuple):  # typer repeats an option only if its type is a list
+        type_, default = GenericAlias(list, get_args(type_)[0]) | None, None
+    elif _is_negated(option, default):
+        default = False
+    declared = typer.Option(default, option.flag, help=option.help, metavar=option.metavar)
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=declared, annotation=type_)
 
-    name: str
-    type: Any
-    option: Option
-    default: Any
 
-    def parameter(self) -> inspect.Parameter:
-        annotation, default = self.type, False if self._says_no() else self.default
-        if isinstance(default, tuple):  # typer repeats lists alone
-            annotation, default = GenericAlias(list, get_args(annotation)[0]) | None, None
-        said = typer.Option(default, self.option.flag, help=self.option.help, metavar=self.option.metavar)
-        return inspect.Parameter(self.name, inspect.Parameter.KEYWORD_ONLY, default=said, annotation=annotation)
-
-    def value(self, given: Any) -> Any:
-        if isinstance(self.default, tuple):
-            return tuple(given or ())
-        return not given if self._says_no() else given
-
-    def _says_no(self) -> bool:
-        return self.default is True and "/" not in self.option.flag
+def _is_negated(option: Option, default: Any) -> bool:
+    """Return whether the flag stands for the opposite of its default True, as in --without-range."""
+    return default is True and "/" not in option.flag

@@ -1,6 +1,4 @@
-"""objslam report: a result as one HTML page."""
-
-from __future__ import annotations
+"""The command `objslam report`, which writes a result as one HTML page."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,12 +11,11 @@ from objslam.cli.console import progress_bar, say
 def report_result(
     out: Annotated[Path, typer.Argument(help="A result folder.")],
     log: Annotated[
-        Path | None,
-        typer.Option("--log", help="The log, for the pictures; by default where it was when it was mapped."),
+        Path | None, typer.Option("--log", help="The log with the images. Default: the path of the log during the run.")
     ] = None,
-    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Pictures of each object.")] = 4,
+    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Number of image crops of each object.")] = 4,
 ) -> None:
-    """Write report.html into a result folder: map, objects, residuals, evaluation, settings; one file, no network needed."""
+    """Write report.html with the map, objects, residuals, evaluation and settings of a result. The page works offline."""
     from objslam.output.report import write_report
 
     with progress_bar() as show:

@@ -1,4 +1,4 @@
-"""objslam run: a log becomes a result folder."""
+"""The command `objslam run`, which maps a log into a result folder."""
 
 from __future__ import annotations
 
@@ -12,17 +12,15 @@ from objslam.cli.options import Config, DetectorModel, Mode, Out, Set, settings_
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
-    from objslam.core.object_map import ObjectMap
+    from objslam.core.result import RunResult
     from objslam.core.types import Log
 
 
 @with_options
 def run(
-    log: Annotated[Path, typer.Argument(help="A log folder, a ROS bag, or anything that `objslam info` knows.")],
+    log: Annotated[Path, typer.Argument(help="A log folder, a ROS bag, or another recording that `objslam info` reads.")],
     out: Out = Path("out"),
     mode: Mode = None,
     config: Config = None,
@@ -31,7 +29,7 @@ def run(
     options: SourceOptions,
     detector: DetectorModel = None,
 ) -> None:
-    """Map the objects of a log and write the result to a folder."""
+    """Map the objects of a log and write a result folder."""
     from objslam.core.diagnostics import Ledger
     from objslam.output.result_folder import output_folder
 
@@ -42,7 +40,7 @@ def run(
 
 
 def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
-    """Map the objects of a log, write the result folder, and say what came of it."""
+    """Map the objects of a log, write the result folder, and print a summary."""
     import time
 
     from objslam.mapping import pipeline
@@ -58,35 +56,31 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
         show("writing", 0, 0)
         begin = time.perf_counter()
         removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
-        writing = time.perf_counter() - begin
+        seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
-    counts, seconds = result.summary["counts"], {**result.summary["seconds"], "write": writing}
-    console().print(objects_table(result.map))
-    resolved = counts["objects"] - counts["unresolved"]
-    say(
-        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
-        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes, {settings.mode} mode; "
-        + ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
-    )
-    say_written(out, removed)
+    times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
+    say_result(result, f", {settings.mode} mode; {times}", out, removed)
 
 
-def say_written(out: Path, removed: tuple[str, ...]) -> None:
-    """Where the result is, and what of an older one there went without a successor."""
-    if removed:
-        say(f"removed from {out}, for it was of the older result: {', '.join(removed)}")
-    say(f"wrote {out}")
-
-
-def objects_table(objects: ObjectMap) -> Table:
+def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
+    """Print the objects, the counts followed by `more`, the removed files of the previous result, and the result folder."""
     from rich.table import Table
 
     table = Table(title="objects")
     for name in ("id", "label", "x m", "y m", "z m", "sigma m", "rays", "parallax deg", "rms deg", "status"):
         table.add_column(name, justify="left" if name in ("label", "status") else "right")
-    for o in objects.objects:
+    for o in result.map.objects:
         sigma = "" if o.sigma is None else f"{o.sigma:.3f}"
         place = (f"{x:.3f}" for x in o.position)
         numbers = (str(o.rays), f"{o.parallax_deg:.1f}", f"{o.rms_deg:.2f}")
         table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")
-    return table
+    console().print(table)
+    counts = result.summary["counts"]
+    resolved = counts["objects"] - counts["unresolved"]
+    say(
+        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}"
+    )
+    if removed:
+        say(f"removed the older result from {out}: {', '.join(removed)}")
+    say(f"wrote {out}")

@@ -1,6 +1,4 @@
-"""objslam view: open a result in the viewer."""
-
-from __future__ import annotations
+"""The command `objslam view`, which opens a result in the viewer."""
 
 import signal
 import tempfile
@@ -16,23 +14,25 @@ def view(
     out: Annotated[Path, typer.Argument(help="A result folder, or a recording (.rrd).")],
     object_: Annotated[
         int | None,
-        typer.Option("--object", help="Show the proximity field of the object with this id, and what pulls on it."),
+        typer.Option("--object", help="Show the proximity field of the object with this id, and the rays that attract it."),
     ] = None,
     web: Annotated[
-        bool, typer.Option("--web", help="Serve it to a browser on this machine instead of opening a window.")
+        bool, typer.Option("--web", help="Serve the viewer to a browser on this machine, without a window.")
     ] = False,
     screenshot: Annotated[
-        Path | None, typer.Option("--screenshot", metavar="FILE.png", help="Write a picture instead; needs no screen.")
+        Path | None, typer.Option("--screenshot", metavar="FILE.png", help="Write a picture instead. It needs no display.")
     ] = None,
-    at: Annotated[float, typer.Option("--at", min=0.0, max=1.0, help="For a picture: when, as a share of the drive.")] = 0.5,
+    at: Annotated[
+        float, typer.Option("--at", min=0.0, max=1.0, help="Time of the picture as a share of the drive, from 0 to 1.")
+    ] = 0.5,
 ) -> None:
-    """Look at a result: the drive, its objects, and how they came about."""
+    """Show the drive and the objects of a result in the viewer."""
     from objslam.errors import ConfigError
     from objslam.output.viewer import application
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the viewer must not outlive us
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the viewer together with this process
     if web and screenshot is not None:
-        raise ConfigError("--web and --screenshot at a time")
+        raise ConfigError("--web and --screenshot cannot be combined", hint="leave out one of them")
     with tempfile.TemporaryDirectory(prefix="objslam-view-") as folder:
         if object_ is None:
             recording = application.find_rrd(out)

@@ -1,14 +1,12 @@
 """The settings of the calibration: which errors that all measurements share are estimated, and how large they may be."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from objslam.config.section import NotNegative, Positive, Section
 
 
 class CalibrationSettings(Section):
-    """Errors that all measurements of a robot share; each number is a prior standard deviation, and 0 holds its error at 0."""
+    """Errors that all measurements of a robot share. A number is a prior standard deviation, and 0 holds its error at 0."""
 
     use: Literal["auto"] | bool = "auto"
     """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off."""

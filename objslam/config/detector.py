@@ -1,12 +1,10 @@
 """The settings of the CNN detector."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from objslam.config.section import Device, Finite, Positive, Section, Share
+from objslam.config.section import Count, Device, Finite, Positive, Section, Share
 
 Layout = Literal["ssd", "yolov8", "yolov5", "end_to_end", "yolox", "yolox_decoded", "detr"]
 Role = Literal["boxes", "labels", "scores", "logits", "predictions"]
@@ -18,55 +16,54 @@ Activation = Literal["none", "sigmoid", "softmax"]
 
 
 class Detector(Section):
-    """The CNN detector, an ONNX model, that finds the boxes in a log's images. What is null is taken from the model: its
-    metadata, the shapes of its outputs, the habits of its family."""
+    """Configure the ONNX model that detects boxes in the images of a log. A setting of null is inferred from the model's
+    metadata, from the shapes of its outputs, or from its model family."""
 
     layout: Layout | None = None
-    """what the outputs are. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow; boxes and scores may be one output).
-    yolov8: box and classes (v8, v11, v12). yolov5: box, objectness and classes (v5, v7). end_to_end: corners, score, class
-    (v10, v26). yolox: the raw grid; yolox_decoded: exported with the decoding inside. detr: boxes and logits."""
+    """Layout of the outputs. ssd: boxes, labels, scores (SSD, torchvision, TensorFlow). In ssd, one output may hold boxes
+    and scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score,
+    class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
     outputs: dict[Role, str] | None = None
-    """the name of the output that holds each role: boxes, labels and scores (ssd), boxes and logits (detr), predictions (the
-    others)."""
+    """Output name of each role. ssd has boxes, labels, scores. detr has boxes, logits. Other layouts have predictions."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
-    """the classes in the model's order: a list, a file (one a line, or YAML with `names`; beside the settings or the model),
-    coco (80) or coco91 (numbered with its gaps)."""
+    """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
+    one name per line, or is YAML with the key `names`. It lies beside the settings file or beside the model."""
     first_label: Annotated[int, Field(ge=0)] | None = None
-    """the number that the model gives to the first name: 1 where 0 is the background and the names leave it out."""
+    """Class number of the first name. It is 1 if class 0 is the background and the names omit the background."""
     classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """the classes that count; null: all."""
+    """Names of the classes to keep. null keeps all classes."""
     min_score: Share = 0.25
-    """score below which a box is not taken."""
+    """Lowest score of a box that is kept."""
     iou: Share = 0.5
-    """overlap (intersection over union) above which the less sure of two boxes of one class is dropped (see nms)."""
+    """Intersection over union above which non-maximum suppression drops the lower-scored of two boxes of one class."""
     nms: bool | None = None
-    """whether overlapping boxes are dropped; null: where the family needs it, which is every YOLO except end_to_end."""
-    max_boxes: Annotated[int, Field(ge=1)] = 300
-    """boxes of an image at the most; the surest are kept."""
-    size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
-    """width and height, px, that an image is fitted into, for models that take any."""
+    """Apply non-maximum suppression. null applies it to every YOLO layout except end_to_end."""
+    max_boxes: Count = 300
+    """Maximum number of boxes per image. The boxes with the highest scores are kept."""
+    size: tuple[Count, Count] | None = None
+    """Width and height of the input in px, for a model that accepts any size."""
     resize: Resize | None = None
-    """how an image is fitted: letterbox keeps its shape and pads all round, corner pads right and below, stretch changes its
-    shape, none leaves it as it is."""
+    """How an image is fitted into the input. letterbox keeps the aspect ratio and pads all sides. corner keeps the aspect
+    ratio and pads right and bottom. stretch changes the aspect ratio. none keeps the image size."""
     pad: Annotated[int, Field(ge=0, le=255)] | None = None
-    """the grey that is padded with; null: 114."""
+    """Grey value of the padding. null is 114."""
     colour: Colour | None = None
-    """the order of the channels."""
+    """Order of the colour channels of the input."""
     divide_by: Positive | None = None
-    """values of 0 to 255 are divided by it, then by mean and std: (value / divide_by - mean) / std."""
+    """Divisor of the pixel values (0 to 255). The input is (value / divide_by - mean) / std."""
     mean: tuple[Finite, Finite, Finite] | None = None
-    """for each channel, in the network's order."""
+    """Mean of each channel, in the channel order of the input."""
     std: tuple[Positive, Positive, Positive] | None = None
-    """for each channel."""
+    """Standard deviation of each channel, in the channel order of the input."""
     box_form: BoxForm | None = None
-    """two corners, or centre and size."""
+    """Coordinates of a box in the outputs: two corners, or centre and size."""
     box_units: BoxUnits | None = None
-    """pixels or fractions of the network's input."""
+    """Units of a box in the outputs: pixels or fractions of the input size."""
     activation: Activation | None = None
-    """what makes scores of the outputs. After softmax the last class is "nothing"."""
+    """Function that turns outputs into scores. With softmax, the last class means "no object"."""
     device: Device = "auto"
-    """auto: CUDA where this onnxruntime has it, else the CPU."""
+    """Device of the model. auto uses CUDA if onnxruntime supports CUDA, else the CPU."""
     threads: Annotated[int, Field(ge=0)] = 0
-    """threads of onnxruntime on the CPU; 0: one for each core."""
-    batch: Annotated[int, Field(ge=1)] = 1
-    """images at a time, for models that take any number."""
+    """Number of onnxruntime threads on the CPU. 0 uses one thread per core."""
+    batch: Count = 1
+    """Number of images per batch, for a model that accepts any batch size."""

@@ -1,6 +1,4 @@
-"""What every part of the settings is, and the kinds of values in it."""
-
-from __future__ import annotations
+"""The base class of all settings, and the value types of settings."""
 
 from typing import Annotated, Literal
 
@@ -10,10 +8,11 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
 Device = Literal["auto", "cpu", "cuda"]
 
 
 class Section(BaseModel):
-    """A part of the settings: frozen, unknown keys refused."""
+    """Hold one section of the settings. A section is immutable and rejects unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)

@@ -1,6 +1,4 @@
-"""All settings in one, loaded from YAML and overrides and dumped as YAML."""
-
-from __future__ import annotations
+"""The class of all settings, which loads from YAML files and overrides and is dumped as YAML."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,61 +7,59 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
+from objslam.config import mapping
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector
-from objslam.config.estimation import AssociationSettings, Fixed, Joint, Triangulation
-from objslam.config.live import Live
-from objslam.config.measurements import Depth, Localization, Odometry, Planar, Poses, RayNoise
-from objslam.config.output import Output, Reconstruction
 from objslam.config.section import Section
 from objslam.errors import ConfigError
 
 
 class Settings(Section):
-    """All settings of a run."""
+    """Hold all settings of a run."""
 
     mode: Literal["fixed", "joint"] = "fixed"
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
-    poses: Poses = Poses()
-    rays: RayNoise = RayNoise()
-    depth: Depth = Depth()
-    odometry: Odometry = Odometry()
-    planar: Planar = Planar()
-    localization: Localization = Localization()
+    poses: mapping.Poses = mapping.Poses()
+    rays: mapping.RayNoise = mapping.RayNoise()
+    depth: mapping.Depth = mapping.Depth()
+    odometry: mapping.Odometry = mapping.Odometry()
+    planar: mapping.Planar = mapping.Planar()
+    localization: mapping.Localization = mapping.Localization()
     calibration: CalibrationSettings = CalibrationSettings()
-    association: AssociationSettings = AssociationSettings()
-    triangulation: Triangulation = Triangulation()
-    fixed: Fixed = Fixed()
-    joint: Joint = Joint()
-    live: Live = Live()
-    reconstruction: Reconstruction = Reconstruction()
-    output: Output = Output()
+    association: mapping.AssociationSettings = mapping.AssociationSettings()
+    triangulation: mapping.Triangulation = mapping.Triangulation()
+    fixed: mapping.Fixed = mapping.Fixed()
+    joint: mapping.Joint = mapping.Joint()
+    live: mapping.Live = mapping.Live()
+    reconstruction: mapping.Reconstruction = mapping.Reconstruction()
+    output: mapping.Output = mapping.Output()
 
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
-    """Settings from the defaults, then a YAML file, then `key=value` overrides (dotted keys, YAML values).
-
-    A later source replaces the values of an earlier one. ConfigError names the file or override, the key and the problem.
-    """
+    """Load settings from a YAML file and from `key=value` overrides (dotted keys, YAML values), which replace values of the
+    file. ConfigError names the file or the override, the key and the problem."""
     data: dict[str, Any] = {}
     if file is not None:
         data = _read_yaml(file)
-        _find_names(_validate(data, str(file)), data, file.parent)
+        # A relative names file beside the settings file is made absolute, so that any working directory finds it.
+        names = _validate(data, str(file)).detector.names
+        if isinstance(names, str) and is_file(file.parent / names):
+            data["detector"]["names"] = str((file.parent / names).resolve())
     for text in overrides:
         key, sign, value = text.partition("=")
         if not sign or not key:
             raise ConfigError(f"--set {text!r} is not key=value", hint="for example --set joint.loss=cauchy")
         try:
             _put(data, key.strip().split("."), yaml.safe_load(value))
-        except (yaml.YAMLError, ValueError) as error:  # PyYAML lets the ValueError of an impossible date through
+        except (yaml.YAMLError, ValueError) as error:  # PyYAML raises ValueError for an impossible date
             raise ConfigError(f"the value of --set {text!r} is not YAML") from error
         _validate(data, f"--set {text}")
     return _validate(data, "settings")
 
 
 def dump_settings(settings: Settings) -> str:
-    """The settings as YAML that `load_settings` reads back."""
+    """Return the settings as YAML text for `load_settings`."""
     return yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False)
 
 
@@ -72,7 +68,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
         data = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the settings: {error}", where=str(file)) from error
-    except (yaml.YAMLError, ValueError) as error:  # as above
+    except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{file}:{mark.line + 1}" if mark else str(file)
         raise ConfigError(f"not YAML: {getattr(error, 'problem', error)}", where=where) from error
@@ -83,18 +79,11 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     return data
 
 
-def _find_names(settings: Settings, data: dict[str, Any], folder: Path) -> None:
-    """A names file that lies beside the settings file is meant, wherever the run is started."""
-    names = settings.detector.names
-    if isinstance(names, str) and is_file(folder / names):
-        data["detector"]["names"] = str((folder / names).resolve())
-
-
 def is_file(path: Path) -> bool:
-    """Whether there is a file that can be looked at; no text that is no path at all is an error."""
+    """Return whether a path is an accessible file. Any text is allowed as a path."""
     try:
         return path.is_file()
-    except OSError:  # too long for a name, or in a folder that is closed to us
+    except OSError:  # the name is too long, or the folder is not accessible
         return False
 
 
@@ -121,7 +110,7 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
 
 
 def _meant(key: str) -> str:
-    """The setting that a mistyped key may stand for, as a question; nothing where none is like it."""
+    """Return the setting closest to a mistyped key as a question, or an empty text."""
     import difflib
 
     def names(section: type[BaseModel], prefix: str) -> Iterator[str]:
@@ -131,5 +120,4 @@ def _meant(key: str) -> str:
             else:
                 yield f"{prefix}{name}"
 
-    near = difflib.get_close_matches(key, list(names(Settings, "")), 1, 0.75)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return "".join(f" (did you mean {name}?)" for name in difflib.get_close_matches(key, list(names(Settings, "")), 1, 0.75))

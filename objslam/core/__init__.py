@@ -1,4 +1,4 @@
-"""The data types that every room shares, and the mathematics on them: poses, rays, objects, results, statistics.
+"""The data types that every room shares, and the mathematics of poses, rays, objects and statistics.
 
-Nothing here reads or writes a file, and nothing here knows a solver or a message; files are in `io`.
+Nothing here reads or writes a file, runs a solver or handles messages.
 """

@@ -1,6 +1,4 @@
-"""The array types that every room speaks of."""
-
-from __future__ import annotations
+"""Short names of the array types."""
 
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Errors that all measurements of a robot share: what they are called, and what a solve found of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

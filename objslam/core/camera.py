@@ -1,6 +1,4 @@
-"""A calibrated camera: which pixel shows which direction, and what lies in its image at all."""
-
-from __future__ import annotations
+"""A calibrated camera with its projection, undistortion and field of view."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,20 +17,20 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
     "rational_polynomial": (8, 12, 14),
     "equidistant": (4,),
 }
-"""How many distortion coefficients each model takes."""
+"""The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # angles tried to find where a lens model folds back, and how often the steps become finer
-_ALONG = 200  # pieces of each side of the image
-_LEAST = 1e-9  # sr; no camera sees less
-_TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # iterations at the most, rad, and the least divisor
+_STEPS, _FINER = 2000, 4  # The grid of angles in the search for the fold of a lens model, and its refinements.
+_ALONG = 200  # The pieces of each side of the image in the solid angle. More pieces are more exact and slower.
+_LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
+_TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera (ROS camera_info keys) and its place on the robot.
+    """A calibrated camera with the keys of ROS camera_info, and its pose on the robot.
 
     matrix: (3, 3) px. distortion: (D,). base_T_camera: (4, 4), the optical frame in base. depth_scale: units per metre.
-    sees_size: whether its boxes are as large as what they hold, and not drawn around bearings, which have no size.
+    sees_size: whether its boxes have the size of the objects. Boxes around bare bearings have no meaningful size.
     """
 
     name: str
@@ -57,41 +55,65 @@ class Camera:
 
     @cached_property
     def inverse_matrix(self) -> Floats:
-        """(3, 3), from homogeneous pixels to directions with z = 1."""
+        """(3, 3) matrix from homogeneous pixels to directions with z = 1."""
         return np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
 
     @cached_property
     def fisheye(self) -> bool:
-        """Whether its image grows with the angle off the axis, and not with the tangent of it."""
+        """Whether the image radius grows with the angle to the optical axis, instead of its tangent."""
         return self.distortion_model == "equidistant"
 
     @cached_property
     def lens_angle(self) -> float:
-        """How far off the optical axis the lens model holds, rad: up to where it folds back, 90 degrees at the most.
+        """The angle to the optical axis, rad, at which the lens model folds back, at most 90 degrees.
 
-        Further out, the model projects into the image what is out of sight. A fisheye may see beyond 90 degrees, but its
-        calibration does not say so: OpenCV fits the polynomial to points with z > 0 alone, and nothing tells how much of the
-        image's corners the lens fills.
+        Beyond this angle the model projects invisible points into the image. A fisheye may see beyond 90 degrees, but OpenCV
+        calibrates it with points of z > 0 only. The calibration does not say how much of the image corners the lens fills.
         """
-        return _fold(self)
+        if not self.distortion.any():
+            return np.pi / 2
+        angle = np.linspace(0.0, np.pi / 2, _STEPS, endpoint=False)
+        for _ in range(_FINER):
+            grows = _growth(self, angle) > 0
+            if grows.all():
+                return np.pi / 2
+            first = int(np.argmin(grows))
+            angle = np.linspace(angle[first - 1], angle[first], _STEPS)
+        return float(angle[0])
 
     @cached_property
     def view_angle(self) -> float:
-        """The angle off the optical axis of the furthest point of the image's edge, rad; never more than `lens_angle`."""
+        """The largest angle between the optical axis and a point on the image edge, rad, at most `lens_angle`."""
         directions, valid = undistort(self, _edge(0.0, self.width - 1, self.height - 1, 32))
         return float(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)).max()) if valid.all() else self.lens_angle
 
     @cached_property
     def solid_angle(self) -> float:
-        """What its image shows, sr."""
-        return _solid_angle(self)
+        """The solid angle of the image, sr.
+
+        It is the sum of the spherical triangles between the optical axis and the image edge, or the bounding cone.
+        """
+        edge = _edge(-0.5, self.width - 0.5, self.height - 0.5, _ALONG)
+        here, valid = undistort(self, edge)
+        flat = edge - self.matrix[:2, 2]
+        around = np.arctan2(flat[:, 1] / self.matrix[1, 1], flat[:, 0] / self.matrix[0, 0])
+        sin, cos = np.sin(self.lens_angle), np.cos(self.lens_angle)
+        rim = np.column_stack([sin * np.cos(around), sin * np.sin(around), np.full(len(edge), cos)])
+        here = np.where(valid[:, None], here, rim)
+        then = np.roll(here, -1, axis=0)
+        turned = (np.roll(around, -1) - around + np.pi) % (2 * np.pi) - np.pi
+        volume = here[:, 0] * then[:, 1] - here[:, 1] * then[:, 0]
+        triangles = 2 * np.arctan2(volume, 1 + here[:, 2] + then[:, 2] + (here * then).sum(axis=1))
+        outside = ~valid & ~np.roll(valid, -1)
+        return max(abs(float(np.where(outside, turned * (1 - cos), triangles).sum())), _LEAST)
 
 
 def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
-    """Unit directions (N, 3) in the camera frame of raw pixels (N, 2), and which of them (N,) lie in the lens' field.
+    """Return the unit directions (N, 3) in the camera frame of raw pixels (N, 2), and which (N,) are valid.
 
-    plumb_bob and rational_polynomial by cv2.undistortPoints, iterated to the end; a pixel that does not come back to itself
-    within 0.1 px has no ray either. equidistant (Kannala-Brandt) by Newton's method.
+    A direction is valid inside the lens field. cv2.undistortPoints, iterated to convergence, inverts plumb_bob and
+    rational_polynomial. Their directions must also project to within 0.1 px of the pixel. Newton's method inverts
+    equidistant (Kannala-Brandt).
     """
     import cv2
 
@@ -117,7 +139,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def _undistort_fisheye(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
-    # cv2.fisheye.undistortPoints gives up where the distorted angle, not the angle itself, is beyond 90 degrees
+    # cv2.fisheye.undistortPoints fails when the distorted angle is beyond 90 degrees, even if the angle itself is not.
     grows = _fisheye_radius(camera)
     slope = polyder(grows)
     flat = (pixels - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]
@@ -139,9 +161,9 @@ def _undistort_fisheye(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def project(camera: Camera, points: Floats) -> Floats:
-    """Raw (distorted) pixels (N, 2) of points (N, 3), m, in the camera frame, in front of the camera.
+    """Return the raw (distorted) pixels (N, 2) of points (N, 3), m, in the camera frame and in front of the camera.
 
-    Outside the lens' field they mean nothing: see `in_field`.
+    A pixel has no meaning if its point is outside the lens field, which `in_field` tests.
     """
     import cv2
 
@@ -158,7 +180,7 @@ def project(camera: Camera, points: Floats) -> Floats:
 
 
 def in_field(camera: Camera, points: Floats) -> Bools:
-    """Which points (N, 3), m, in the camera frame lie in front of the camera, where its lens model holds."""
+    """Return which points (N, 3), m, in the camera frame are in front of the camera and inside its `lens_angle`."""
     x, y, z = points.T
     ahead: Bools = z > 0
     if camera.lens_angle < np.pi / 2:
@@ -167,10 +189,10 @@ def in_field(camera: Camera, points: Floats) -> Bools:
 
 
 def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Floats | None = None) -> tuple[Ints, Floats]:
-    """Which points (N, 3), m, in the camera frame its image shows, indices (n,), and their raw pixels (n, 2).
+    """Return the indices (n,) and raw pixels (n, 2) of the points (N, 3), m, in the camera frame that the image shows.
 
-    A point is shown that lies in the lens' field and whose pixel lies between low and high, (2,) or (N, 2), px: without
-    them, in the image.
+    The image shows a point inside the lens field if its pixel is between low and high, (2,) or (N, 2), px. The default is
+    the whole image.
     """
     low = np.zeros(2) if low is None else low
     high = camera.size - 1 if high is None else high
@@ -183,82 +205,36 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """By what (N,), m, the image of things at points (N, 3) in the camera frame is smaller: z, or a fisheye's distance."""
+    """Return the depth (N,), m, of points (N, 3) that scales their image size: z, or the distance for a fisheye."""
     return np.asarray(np.linalg.norm(points, axis=1) if camera.fisheye else points[:, 2])
 
 
 def _fisheye_radius(camera: Camera) -> Floats:
-    """The coefficients (10,) of a fisheye's radius as a polynomial of the angle off the axis (rad), lowest power first.
-
-    The radius is the distance from the principal point in the image, in focal lengths.
-    """
+    """Return the image radius in focal lengths as a polynomial (10,) of the angle, rad, lowest power first."""
     radius = np.zeros(10)
     radius[1::2] = 1.0, *camera.distortion
     return radius
 
 
 def _growth(camera: Camera, angle: Floats) -> Floats:
-    """How fast (A,) the image's radius grows at angles off the axis (A,), rad, with the angle or its tangent t.
-
-    It is zero or less where the lens model has folded back.
-    """
-    with np.errstate(all="ignore"):  # a calibration may be nonsense
-        return _fisheye_growth(camera, angle) if camera.fisheye else _pinhole_growth(camera, np.tan(angle))
-
-
-def _fisheye_growth(camera: Camera, angle: Floats) -> Floats:
-    return np.asarray(polyval(angle, polyder(_fisheye_radius(camera))))
-
-
-def _pinhole_growth(camera: Camera, t: Floats) -> Floats:
-    k = np.zeros(14)
-    k[: len(camera.distortion)] = camera.distortion
-    radius, divisor = np.zeros(8), np.zeros(7)
-    radius[1::2] = 1.0, k[0], k[1], k[4]
-    divisor[::2] = 1.0, *k[5:8]
-    below = polyval(t, divisor)
-    radial = (polyval(t, polyder(radius)) * below - polyval(t, radius) * polyval(t, polyder(divisor))) / below**2
-    # the most that decentering, and then a thin prism, can take from it in any direction
-    across = (6 * np.hypot(k[2], k[3]) + 2 * np.hypot(k[8], k[10])) * t + 4 * np.hypot(k[9], k[11]) * t**3
-    return np.asarray(np.where(below > 0, radial - across, 0.0))
-
-
-def _fold(camera: Camera) -> float:
-    """The first angle, rad, at which the image's radius no longer grows; 90 degrees where there is none below."""
-    if not camera.distortion.any():
-        return np.pi / 2
-    angle = np.linspace(0.0, np.pi / 2, _STEPS, endpoint=False)
-    for _ in range(_FINER):
-        grows = _growth(camera, angle) > 0
-        if grows.all():
-            return np.pi / 2
-        first = int(np.argmin(grows))
-        angle = np.linspace(angle[first - 1], angle[first], _STEPS)
-    return float(angle[0])
+    """Return the derivative (A,) of the image radius by the angle (A,), rad, or its tangent. It is <= 0 beyond the fold."""
+    with np.errstate(all="ignore"):  # A wrong calibration may overflow.
+        if camera.fisheye:
+            return np.asarray(polyval(angle, polyder(_fisheye_radius(camera))))
+        t, k = np.tan(angle), np.zeros(14)
+        k[: len(camera.distortion)] = camera.distortion
+        radius, divisor = np.zeros(8), np.zeros(7)
+        radius[1::2] = 1.0, k[0], k[1], k[4]
+        divisor[::2] = 1.0, *k[5:8]
+        below = polyval(t, divisor)
+        radial = (polyval(t, polyder(radius)) * below - polyval(t, radius) * polyval(t, polyder(divisor))) / below**2
+        # Decentering and thin prisms reduce the radial growth by at most this much in any direction.
+        across = (6 * np.hypot(k[2], k[3]) + 2 * np.hypot(k[8], k[10])) * t + 4 * np.hypot(k[9], k[11]) * t**3
+        return np.asarray(np.where(below > 0, radial - across, 0.0))
 
 
 def _edge(low: float, right: float, bottom: float, pieces: int) -> Floats:
-    """Pixels (4 * pieces, 2) along the edge of the image, once around, from the corner (low, low)."""
+    """Return pixels (4 * pieces, 2) around the edge of the image, from the corner (low, low)."""
     along = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
     corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
     return np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-
-
-def _solid_angle(camera: Camera) -> float:
-    """The sum of the spherical triangles between the optical axis and the pieces of the image's edge.
-
-    A piece outside the lens' field counts as the sector of the cone that the field is.
-    """
-    edge = _edge(-0.5, camera.width - 0.5, camera.height - 0.5, _ALONG)
-    here, valid = undistort(camera, edge)
-    flat = edge - camera.matrix[:2, 2]
-    around = np.arctan2(flat[:, 1] / camera.matrix[1, 1], flat[:, 0] / camera.matrix[0, 0])
-    sin, cos = np.sin(camera.lens_angle), np.cos(camera.lens_angle)
-    rim = np.column_stack([sin * np.cos(around), sin * np.sin(around), np.full(len(edge), cos)])
-    here = np.where(valid[:, None], here, rim)
-    then = np.roll(here, -1, axis=0)
-    turned = (np.roll(around, -1) - around + np.pi) % (2 * np.pi) - np.pi
-    volume = here[:, 0] * then[:, 1] - here[:, 1] * then[:, 0]
-    triangles = 2 * np.arctan2(volume, 1 + here[:, 2] + then[:, 2] + (here * then).sum(axis=1))
-    outside = ~valid & ~np.roll(valid, -1)
-    return max(abs(float(np.where(outside, turned * (1 - cos), triangles).sum())), _LEAST)

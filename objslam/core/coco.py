@@ -1,6 +1,4 @@
-"""The 80 class names of COCO, in the order that detectors trained on it number them (Lin et al., ECCV 2014)."""
-
-from __future__ import annotations
+"""The 80 class names of COCO, in the order of their numbers in COCO detectors (Lin et al., ECCV 2014)."""
 
 COCO_NAMES: tuple[str, ...] = tuple(
     """

@@ -1,4 +1,4 @@
-"""What was dropped and why, and what a user should know: counted while the work goes on, written into summary.json."""
+"""The ledger of a run: counts of dropped data and warnings to the user. It ends in summary.json."""
 
 from __future__ import annotations
 
@@ -6,22 +6,19 @@ from dataclasses import dataclass, field
 
 from objslam.errors import one_line
 
-_EXAMPLES = 3
+_EXAMPLES = 3  # The number of places that are kept for each reason. A larger number makes the lines longer.
 
 
 @dataclass
 class Ledger:
-    """Counts of what was dropped (by reason, with the first few places) and warnings in plain words, one line each."""
+    """Counts of drops by reason, the first places of each reason, and warnings of one line each."""
 
     dropped: dict[str, int] = field(default_factory=dict)
     examples: dict[str, list[str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None) -> None:
-        """Add `count` to the number of things dropped for `reason`.
-
-        where: the place (file:line or stamp); only the first few places of each reason are kept.
-        """
+        """Add `count` drops to a reason. where: the place as file:line or stamp, kept for the first few drops only."""
         if count <= 0:
             return
         reason = one_line(reason)
@@ -31,21 +28,20 @@ class Ledger:
             places.append(place)
 
     def warn(self, message: str) -> None:
-        """Keep a warning once."""
+        """Add a warning, unless the ledger has it already."""
         message = one_line(message)
         if message not in self.warnings:
             self.warnings.append(message)
 
     def add(self, other: Ledger) -> None:
-        """Take over what another ledger counted."""
+        """Add the counts and warnings of another ledger, with the first place of each reason."""
         for reason, count in other.dropped.items():
-            places = other.examples.get(reason, [])
-            self.drop(reason, count, places[0] if places else None)
+            self.drop(reason, count, next(iter(other.examples.get(reason, [])), None))
         for message in other.warnings:
             self.warn(message)
 
     def lines(self) -> list[str]:
-        """Every drop and warning as one line of text each, drops first."""
+        """Return each drop and then each warning as one line of text."""
         lines = []
         for reason, count in self.dropped.items():
             places = self.examples.get(reason)

@@ -1,6 +1,4 @@
-"""What a solve found: poses, objects, weights and costs."""
-
-from __future__ import annotations
+"""The result type of every solver."""
 
 from dataclasses import dataclass
 
@@ -10,14 +8,14 @@ from objslam.core.calibration import Calibration
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a solve found.
+    """The result of a solve with K keyframes, N objects and R rays.
 
-    map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN where not solved. solved: (N,) whether the
-    object was part of the graph. seen_sigma: (N,) m, the largest standard deviation of its place as seen from a camera that
-    saw it: the map's own drift up to there is not in it. NaN where not solved. weight: (R,) each ray's robust weight in
-    [0, 1], 0 without object or when rejected. The costs are the graph's error at the first start and at the last optimum;
-    for Eq. 1 its sum of distances, m. calibration: the shared errors that were estimated, None if none were. The keyframes and
-    rays that belong to the estimate have them taken out.
+    map_T_base: (K, 4, 4). positions: (N, 3) m. covariance: (N, 3, 3) m^2, NaN for an object that was not solved. solved:
+    (N,) whether the object was part of the graph. seen_sigma: (N,) m, the largest standard deviation of a position relative
+    to a camera that saw the object, without the drift of the map up to this camera, NaN for an object that was not solved.
+    weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has no object weighs 0. cost_before,
+    cost_after: error of the graph at the first start and at the last optimum. For Eq. 1 it is the sum of distances, m.
+    calibration: the shared errors that were estimated, or None. The poses belong to measurements without these errors.
     """
 
     map_T_base: Floats

@@ -1,9 +1,7 @@
-"""Rigid geometry on arrays: poses are (..., 4, 4) homogeneous matrices, all functions work on whole batches.
+"""Rigid geometry on batches of poses, which are homogeneous matrices (..., 4, 4).
 
-Twists are ordered rotation first, (wx, wy, wz, vx, vy, vz), as GTSAM orders them.
+Twists have the order of GTSAM, rotation first: (wx, wy, wz, vx, vy, vz).
 """
-
-from __future__ import annotations
 
 import math
 from typing import Literal
@@ -15,7 +13,7 @@ from objslam.core.arrays import Bools, Floats
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
-    """Poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), m."""
+    """Make poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), m."""
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     pose = np.zeros((*shape, 4, 4))
     pose[..., :3, :3] = rotation
@@ -25,7 +23,7 @@ def make_pose(rotation: Floats, translation: Floats) -> Floats:
 
 
 def inverse(pose: Floats) -> Floats:
-    """The inverse of rigid poses (..., 4, 4)."""
+    """Return the inverse of rigid poses (..., 4, 4)."""
     back = np.zeros(pose.shape)
     back[..., :3, :3] = np.swapaxes(pose[..., :3, :3], -1, -2)
     back[..., :3, 3:] = -(back[..., :3, :3] @ pose[..., :3, 3:])
@@ -34,17 +32,17 @@ def inverse(pose: Floats) -> Floats:
 
 
 def pose_from_quaternion(translation: Floats, xyzw: Floats) -> Floats:
-    """Poses (N, 4, 4) from translations (N, 3), m, and quaternions (N, 4) x, y, z, w of any length but zero."""
+    """Make poses (N, 4, 4) from translations (N, 3), m, and quaternions (N, 4) x, y, z, w of any length above zero."""
     return make_pose(Rotation.from_quat(xyzw).as_matrix(), translation)
 
 
 def quaternion(pose: Floats) -> Floats:
-    """Unit quaternions (N, 4) x, y, z, w with w >= 0 of poses (N, 4, 4)."""
+    """Return the unit quaternions (N, 4) x, y, z, w with w >= 0 of poses (N, 4, 4)."""
     return np.asarray(Rotation.from_matrix(pose[..., :3, :3]).as_quat(canonical=True))
 
 
 def lift_se2(xy_yaw: Floats) -> Floats:
-    """SE(2) poses (..., 3) x, y (m), yaw (rad) lifted to 3D, (..., 4, 4), with z = roll = pitch = 0."""
+    """Lift SE(2) poses (..., 3) x, y (m), yaw (rad) to SE(3) poses (..., 4, 4) with z = roll = pitch = 0."""
     cos, sin = np.cos(xy_yaw[..., 2]), np.sin(xy_yaw[..., 2])
     pose = np.zeros((*xy_yaw.shape[:-1], 4, 4))
     pose[..., 0, 0] = pose[..., 1, 1] = cos
@@ -58,8 +56,7 @@ def lift_se2(xy_yaw: Floats) -> Floats:
 def split_se2(pose: Floats) -> tuple[Floats, Floats]:
     """Split SE(3) poses (..., 4, 4) into their SE(2) part (..., 3) x, y, yaw and the remainder (..., 4, 4).
 
-    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis seen from above (undefined, then 0, when
-    the x axis is vertical).
+    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis from above, and 0 for a vertical x axis.
     """
     yaw = np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
     part = np.stack([pose[..., 0, 3], pose[..., 1, 3], yaw], axis=-1)
@@ -67,20 +64,19 @@ def split_se2(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
-    """Whether poses (N, 4, 4) keep one height, roll and pitch: an SE(2) path, perhaps on a constant offset."""
+    """Return whether poses (N, 4, 4) keep one height, roll and pitch, as an SE(2) path with a constant offset does."""
     _, remainder = split_se2(poses)
     return bool(len(poses) == 0 or np.abs(remainder - remainder[:1]).max() <= tolerance)
 
 
 def log_se3(pose: Floats) -> Floats:
-    """Logarithm (N, 6) of poses (N, 4, 4): the twist whose exponential is the pose, rotation first."""
+    """Return the logarithm (N, 6) of poses (N, 4, 4), the twist whose exponential is the pose."""
     omega = Rotation.from_matrix(pose[..., :3, :3]).as_rotvec()
     return np.concatenate([omega, (_left_jacobian_inverse(omega) @ pose[..., :3, 3:])[..., 0]], axis=-1)
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """By how much (N,), rad, poses (N, 4, 4) turn, and how long (N,), m, the arc is that they move along: the lengths of the
-    two halves of `log_se3`."""
+    """Return the norms (N,), rad, and (N,), m, of the two halves of `log_se3` of poses (N, 4, 4)."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))
@@ -91,12 +87,12 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
-    """`twist_lengths` of the one step between two poses (4, 4), in a tenth of its time."""
+    """Return `twist_lengths` of the single step between two poses (4, 4), ten times faster."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
-    x, y, z = dx - ax, ey - by, fz - cz  # the way in the common frame, where the axis of the turn is sought as well
+    x, y, z = dx - ax, ey - by, fz - cz  # The step and the axis are in the common frame of both poses.
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
-    # sum of the cross products of the axes before with those after: twice the axis, times the sine of the turn
+    # Half the sum of the cross products of the axes before and after is the rotation axis times the sine of the angle.
     u = (b0 * f0 - c0 * e0 + b1 * f1 - c1 * e1 + b2 * f2 - c2 * e2) / 2
     v = (c0 * d0 - a0 * f0 + c1 * d1 - a1 * f1 + c2 * d2 - a2 * f2) / 2
     w = (a0 * e0 - b0 * d0 + a1 * e1 - b1 * d1 + a2 * e2 - b2 * d2) / 2
@@ -110,26 +106,30 @@ def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
 
 
 def exp_se3(twist: Floats) -> Floats:
-    """Exponential (N, 4, 4) of twists (N, 6), rotation first (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
+    """Return the exponential (N, 4, 4) of twists (N, 6) (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
     omega = twist[..., :3]
-    rotation = Rotation.from_rotvec(omega).as_matrix()
-    return make_pose(rotation, (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
+    return make_pose(Rotation.from_rotvec(omega).as_matrix(), (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
 
 
-_CROSS = np.zeros((3, 9))  # what each of x, y, z adds to the nine entries of the matrix
+_CROSS = np.zeros((3, 9))  # The linear map from x, y, z to the nine entries of the cross-product matrix.
 _CROSS[[1, 2, 0], [2, 3, 7]] = 1.0
 _CROSS[[2, 0, 1], [1, 5, 6]] = -1.0
 
 
 def skew(v: Floats) -> Floats:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     return np.asarray(v @ _CROSS).reshape(*v.shape, 3)
 
 
-def _left_jacobian(omega: Floats) -> Floats:
+def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
+    """Return the rotation angles, whether they need a series expansion, and angles that are safe as divisors."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
+    return angle, small, np.where(small, 1.0, angle)
+
+
+def _left_jacobian(omega: Floats) -> Floats:
+    angle, small, safe = _angles(omega)
     a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     w = skew(omega)
@@ -137,9 +137,7 @@ def _left_jacobian(omega: Floats) -> Floats:
 
 
 def _left_jacobian_inverse(omega: Floats) -> Floats:
-    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
+    angle, small, safe = _angles(omega)
     half = safe / 2
     b = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
     w = skew(omega)
@@ -147,7 +145,7 @@ def _left_jacobian_inverse(omega: Floats) -> Floats:
 
 
 def adjoint(pose: Floats) -> Floats:
-    """Adjoint matrices (..., 6, 6) of poses (..., 4, 4) for twists with the rotation first."""
+    """Return the adjoint matrices (..., 6, 6) of poses (..., 4, 4)."""
     rotation = pose[..., :3, :3]
     result = np.zeros((*pose.shape[:-2], 6, 6))
     result[..., :3, :3] = result[..., 3:, 3:] = rotation
@@ -156,10 +154,11 @@ def adjoint(pose: Floats) -> Floats:
 
 
 def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) -> tuple[Floats, Bools]:
-    """Poses at the query stamps, by constant twist between the two neighbours (for planar poses: in SE(2), along an arc).
+    """Interpolate poses by a constant twist between the two neighbours, without extrapolation. Planar poses stay planar.
 
-    stamps (N,) s, increasing; poses (N, 4, 4); query (Q,) s; max_gap s. Returns poses (Q, 4, 4) and valid (Q,): False, and
-    the identity, where the query lies outside the path or in a gap longer than max_gap. Nothing is extrapolated.
+    stamps: (N,) s, increasing. poses: (N, 4, 4) at the stamps. query: (Q,) s. max_gap: s, the longest gap between two
+    neighbours. Returns poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or in a longer gap gives
+    the identity and is not valid.
     """
     result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
     if len(stamps) == 0:
@@ -178,10 +177,10 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
 
 
 def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "se3"]) -> tuple[Floats, float]:
-    """The pose (4, 4) and scale that take source points (N, 3) best onto target points (N, 3), least squares (Umeyama 1991).
+    """Return the pose (4, 4) and scale that align source points (N, 3) with target points (N, 3) (Umeyama 1991).
 
-    se2: yaw and translation (height included) in the plane; sim2: with a scale; se3: full rotation. Applied as
-    scale * R @ source + t. Fewer than 2 points (3 for se3) fix no rotation: then only the translation is aligned.
+    The least-squares alignment is scale * R @ source + t. `se2` estimates yaw and the whole translation. `sim2` adds a
+    scale. `se3` estimates the full rotation. Fewer than 2 points (3 for se3) align the translation only.
     """
     if kind == "none" or len(source) == 0:
         return np.eye(4), 1.0
@@ -203,13 +202,13 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 
 
 def widest_angle(directions: Floats) -> float:
-    """The widest angle (rad) between any two of the lines with unit directions (N, 3), bounded from the spread of N > 400.
+    """Return the widest angle (rad) between any two lines with unit directions (N, 3).
 
-    Two opposite directions are one line: their angle is 0.
+    Two opposite directions have the angle 0. More than 400 lines are reduced to the extremes along their main axes.
     """
     if len(directions) < 2:
         return 0.0
-    if len(directions) > 400:  # all pairs would grow with the square: the extremes along the main axes hold the widest
+    if len(directions) > 400:
         _, _, axes = np.linalg.svd(directions - directions.mean(axis=0), full_matrices=False)
         order = np.argsort(directions @ axes.T, axis=0)
         directions = directions[np.unique(np.concatenate([order[:60].ravel(), order[-60:].ravel()]))]
@@ -217,6 +216,6 @@ def widest_angle(directions: Floats) -> float:
 
 
 def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """The angle (R,), rad in [0, pi], between each ray, (R, 3) and (R, 3) unit, and the way to its point (R, 3)."""
+    """Return the angles (R,), rad in [0, pi], between unit directions (R, 3) and points (R, 3), seen from origins (R, 3)."""
     to = points - origins
     return np.arctan2(np.linalg.norm(np.cross(to, directions), axis=1), np.einsum("ri,ri->r", to, directions))

@@ -1,6 +1,4 @@
-"""What a run has to show, as one value that every output is made from."""
-
-from __future__ import annotations
+"""The result of a run, from which every output is made."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,14 +13,14 @@ from objslam.core.types import Association, Images, Keyframes, Rays, Surface, Tr
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run has to show.
+    """The result of a run with K keyframes and R rays.
 
-    keyframes: before estimation. map_T_base: (K, 4, 4) after it (the keyframes' own in fixed mode). association: ray ->
-    index into map.objects, -1 none. origins, directions: (R, 3) in map at the solved poses. residual: (R,) rad, the angle of
-    the object off its ray, NaN without object. weight: (R,) robust weight in [0, 1]. summary: what summary.json gets.
-    path: the full path that the log brought, at its own rate, before estimation; path_after: the same path after it.
-    trace: the rounds of the estimation, and images: those of each camera, for the recording. surface: the room, where the
-    log has depth images; surface_before: the same at the poses as the log brought them, where the settings ask for it.
+    keyframes: before the estimation. map_T_base: (K, 4, 4) after the estimation. The mode `fixed` keeps the poses.
+    association: its objects are indices into map.objects. origins, directions: (R, 3) rays in map at the solved poses.
+    residual: (R,) rad, the angle between each ray and its object, NaN without an object. weight: (R,) robust weight in
+    [0, 1]. summary: the content of summary.json. path, path_after: the path of the log at its full rate, before and after
+    the estimation. trace: the rounds of the estimation. images: of each camera. surface: of the room, if the log has depth
+    images. surface_before: the surface at the poses before the estimation, if the settings ask for it.
     """
 
     map: ObjectMap

@@ -1,7 +1,5 @@
 """The state of a live session at one moment."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,10 +13,10 @@ from objslam.core.types import Trajectory
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """What a camera saw at one keyframe.
+    """The boxes of one camera at one keyframe.
 
-    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) ids, -1 where none explains a box. rejected: (B,)
-    whether the robust loss rejected it. image: (H, W, 3) uint8 BGR or JPEG, as the camera has it; None without.
+    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) the id of each box's object, or -1. rejected: (B,)
+    whether the robust loss rejected the box. image: (H, W, 3) uint8 BGR or JPEG bytes, None without an image.
     """
 
     stamp: float
@@ -34,10 +32,11 @@ class CameraFrame:
 class Snapshot:
     """The state of a session at one moment.
 
-    stamp: of the newest keyframe, s (NaN before the first). map: the objects, as offline gives them. path: map_T_base of all
-    keyframes. lag: s between a message's arrival and its place in the map, the newest. update: (p50, p99) s from push to
-    updated. counters: accepted messages by kind; dropped: by reason. keyframes, rebuilds: how many.
-    frames: the newest keyframe of each camera, without its image, which no session sees.
+    stamp: of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns them. path:
+    map_T_base of all keyframes. keyframes, rebuilds: the number of keyframes, and of rebuilds of the graph. lag: s from the
+    arrival of the newest message to its place in the map. update: median and 99th percentile of the time from push to
+    updated map, s. counters: accepted messages by kind. dropped: drops by reason. frames: the newest keyframe of each
+    camera, without its image.
     """
 
     stamp: float

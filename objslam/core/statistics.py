@@ -1,9 +1,7 @@
-"""The numbers of statistics that several parts ask, each in its one home, and medians of groups.
+"""Statistical thresholds that several rooms share, and medians of groups.
 
-Deviations are in standard deviations. A ray's is the norm of two, one along each axis across it.
+Deviations are in standard deviations. The deviation of a ray is the norm of two components across the ray.
 """
-
-from __future__ import annotations
 
 import math
 
@@ -12,58 +10,53 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 SAME_POINT = 11.345
-"""The squared Mahalanobis distance below which 99 % of the pairs of estimates of one point in space lie (chi-squared, 3
-degrees of freedom); larger takes more pairs for one point."""
+"""The squared Mahalanobis distance of 99 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
+larger distance takes more pairs for one point."""
 SAME_POINT_WIDE = 16.266
-"""The squared Mahalanobis distance below which 99.9 % of the pairs of estimates of one point in space lie (chi-squared, 3
-degrees of freedom); larger lets more pairs compete."""
+"""The squared Mahalanobis distance of 99.9 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
+larger distance lets more pairs compete."""
 POSSIBLE_MOTION = 14.156
-"""The squared deviation below which 99.73 % of planar motions lie (chi-squared, 3 degrees of freedom, x, y and yaw: as many
-as lie within 3 standard deviations of one number); larger tries motions that are less likely."""
+"""The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
+This is the share of a single number within 3 standard deviations. A larger deviation tries less likely motions."""
 STRAY_RAY = 13.816
-"""The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom), and what a ray
-that fits nothing costs; larger makes a stray ray pull harder on the solution."""
+"""The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
+cost of a ray that fits no object. A larger deviation gives stray rays more influence on the solution."""
 OUTLIER_RAY = 4.0
-"""The deviation above which a ray is rejected, as 3e-4 of an object's own rays are (Rayleigh, exp(-4^2 / 2)); larger keeps
-more false boxes."""
+"""The deviation above which a ray is rejected, as 3e-4 of an object's own rays are (Rayleigh, exp(-4^2 / 2)). A larger
+deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""The most that the deviation of one ray counts in an object's own noise; larger lets a false box make it noisier."""
+"""The limit on the deviation of one ray in the noise of its object. A larger limit lets a false box raise the noise more."""
 HALF_RAY = 6.0
-"""The squared deviation at which a ray counts half in a fit of points (Cauchy's weight, about `CAUCHY_K` squared); larger
-lets stray rays pull harder."""
-
+"""The squared deviation at which a ray has half its weight in a fit of points (Cauchy's weight, about `CAUCHY_K` squared).
+A larger deviation gives stray rays more influence."""
 HUBER_K = 1.345
-"""The deviation from which Huber's loss grows linearly: 95 % efficient on Gaussian noise (Huber, Robust Statistics, 1981);
-larger is more efficient and less robust."""
+"""The deviation above which Huber's loss grows linearly: 95 % efficient on Gaussian noise (Huber, Robust Statistics, 1981).
+A larger deviation is more efficient and less robust."""
 CAUCHY_K = 2.385
-"""The scale of Cauchy's loss, in deviations: 95 % efficient on Gaussian noise (Holland & Welsch 1977); larger is more
+"""The scale of Cauchy's loss in deviations: 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger scale is more
 efficient and less robust."""
-
 RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
-"""The median norm of a standard Gaussian in the plane: the median miss of rays divided by it is their standard deviation."""
+"""The median norm of a standard Gaussian in the plane. It scales the median residual of rays to a standard deviation."""
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
-"""The mean norm of a standard Gaussian in the plane: the mean miss of rays divided by it is their standard deviation."""
+"""The mean norm of a standard Gaussian in the plane. It scales the mean residual of rays to a standard deviation."""
 NORMAL_MEDIAN = 0.6745
-"""The median absolute value of a standard Gaussian: a median absolute deviation divided by it is the standard deviation."""
-
+"""The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
 NOISE_FACTORS = (1.0, 3.0)
-"""The least and the most factor on the promised noise of an object's rays where boxes are associated: never below 1, for the
-tails of box noise are heavy; a larger most gives noisy objects rays that are farther off."""
+"""The least and the largest factor on the nominal noise of an object's rays in association. The least factor is 1, because
+box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
 MOST_NOISE_FACTOR = 5.0
-"""The most factor on the promised noise of an object's rays where outliers are rejected (the box centres of a large object
-wander); larger keeps more rays of noisy objects."""
+"""The largest factor on the nominal noise of an object's rays in outlier rejection, since the box centres of a large object
+vary. A larger factor keeps more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
-"""The number of rays with which an object's own noise weighs as much as that of its class, where a log is associated as a
-whole; larger trusts the class for longer."""
+"""The number of rays at which an object's noise weighs as much as its class's, offline. More trust the class for longer."""
 POOLED_WITH_PROMISE = 20.0
-"""The number of rays with which an object's own noise weighs as much as the promised one, in a session; larger trusts the
-promise for longer."""
+"""The number of rays at which an object's noise weighs as much as the nominal noise, live. More trust the latter longer."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
-    """Factors (N,) >= 1 on the promised noise of the rays of each group, by the median of their deviations (R,).
+    """Return the factor (N,) >= 1 on the nominal ray noise of each group, from the median of its deviations (R,).
 
-    index: (R,) group of each ray. A group of fewer rays than `fewest` is as promised.
+    index: (R,) group of each ray. A group with fewer rays than `fewest` has the factor 1.
     """
     number = np.bincount(index, minlength=count)
     median = np.where(number >= fewest, grouped_median(deviations, index, count), 0.0)
@@ -71,7 +64,7 @@ def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) 
 
 
 def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
-    """The upper median of the values in each group; NaN for a group without values.
+    """Return the upper median of the values in each group. NaN for a group without values.
 
     index: (R,) the group of each value. Values (R,) give medians (N,). Values (R, D) give the medians of each column (N, D).
     """
@@ -81,17 +74,17 @@ def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
 
 
 def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> Floats:
-    """The value (N,) of each group with `share` of its values below; NaN where there is none."""
+    """Return the value (N,) in each group that exceeds a `share` of the group's values. NaN for a group without values."""
     return grouped_quantiles(values, index, count, (share,))[0]
 
 
 def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[float, ...]) -> list[Floats]:
-    """The same for each of several shares."""
-    order = np.lexsort((values, index))
+    """Return the result of `grouped_quantile` for each share."""
+    ordered = values[np.lexsort((values, index))]
     number = np.bincount(index, minlength=count)
-    begin, some = np.cumsum(number) - number, number > 0
+    some = number > 0
+    begin, number = (np.cumsum(number) - number)[some], number[some]
     results = [np.full(count, np.nan) for _ in shares]
     for share, result in zip(shares, results, strict=True):
-        at = begin + np.minimum((share * number).astype(np.int64), np.maximum(number - 1, 0))
-        result[some] = values[order[at[some]]]
+        result[some] = ordered[begin + np.minimum((share * number).astype(np.int64), number - 1)]
     return results

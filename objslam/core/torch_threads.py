@@ -1,6 +1,4 @@
-"""How many threads torch may use, and on which device it works."""
-
-from __future__ import annotations
+"""The number of threads and the device of torch."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,9 +8,9 @@ from objslam.errors import ConfigError
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """One thread for torch: our batches are small or cut to fit the cache, and a pool spins beside other busy processes.
+    """Restrict torch to one thread, because a thread pool waits actively while other processes need the cores.
 
-    On a machine of two cores with one of them busy, a run that one thread does in 4 s took two threads up to 18 s.
+    On two cores, one of them busy, a run took 4 s with one thread and up to 18 s with two. The batches are small anyway.
     """
     import torch
 
@@ -25,14 +23,14 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def torch_device(device: str, worth: bool = True) -> str:
-    """ "cpu" or "cuda", as the setting `triangulation.device` says; "auto" takes CUDA where it is there and worth it.
+    """Return "cpu" or "cuda" for the setting `triangulation.device`.
 
-    Raises:
-        ConfigError: when CUDA is asked for and is not there.
+    The setting "auto" gives CUDA if torch sees a CUDA device and `worth` says that the work is large enough for it. The
+    setting "cuda" raises ConfigError if torch sees no CUDA device.
     """
     import torch
 
-    there = torch.cuda.is_available()
-    if device == "cuda" and not there:
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
         raise ConfigError("torch sees no CUDA device", hint="set triangulation.device=auto")
-    return ("cuda" if there and worth else "cpu") if device == "auto" else device
+    return ("cuda" if available and worth else "cpu") if device == "auto" else device

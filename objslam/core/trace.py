@@ -1,4 +1,4 @@
-"""What the estimation went through, kept so that one can step through it: a round is one association and its solve."""
+"""The record of an estimation, round by round. A round is one association and its solve."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ Stage = Literal["grow", "solve"]
 
 @dataclass(frozen=True)
 class Iteration:
-    """The state after one step of a solver: `grow`, the graph grown by some keyframes; `solve`, one of Levenberg-Marquardt.
+    """The state after one step of a solver.
 
-    cost: the error of the graph as it then was. path: (k, 3) m, the robot in map at the first k keyframes, those in the
-    graph. positions: (N, 3) m, NaN where an object is not in the graph.
+    stage: `grow` adds keyframes to the graph, `solve` is one step of Levenberg-Marquardt. cost: the error of the graph.
+    path: (k, 3) m, the robot in map at the first k keyframes, which are in the graph.
+    positions: (N, 3) m, NaN for an object that is not in the graph.
     """
 
     stage: Stage
@@ -33,10 +34,10 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Round:
-    """One association and what its solve made of it.
+    """One association and the estimate from it.
 
-    why: `fixed` poses, every label taken for one object (`labels`), a new `association` at the poses so far, or a `merge`
-    of two visits. map_T_base (K, 4, 4), positions (N, 3) and weight (R,): as in the estimate.
+    why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
+    poses, `merge` for merged visits to one place. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
     """
 
     why: Why
@@ -49,27 +50,26 @@ class Round:
 
 @dataclass
 class Trace:
-    """Collects the rounds; base_T_camera (K, 4, 4) turns the solver's camera poses into the robot's."""
+    """Collects the rounds of an estimation. base_T_camera: (K, 4, 4) of the keyframes."""
 
     base_T_camera: Floats
     rounds: list[Round] = field(default_factory=list)
     _iterations: list[Iteration] = field(default_factory=list)
 
     def iteration(self, stage: Stage, cost: float, map_T_camera: Floats, positions: Floats) -> None:
-        """One step, with the camera poses (k, 4, 4) of the first k keyframes and the objects (N, 3)."""
+        """Add one step with the camera poses (k, 4, 4) of the first k keyframes and the objects (N, 3)."""
         path = (map_T_camera @ inverse(self.base_T_camera[: len(map_T_camera)]))[:, :3, 3]
         self._iterations.append(Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32)))
 
     def aside(self) -> Trace:
-        """A trace for an attempt that may come to nothing."""
+        """Return an empty trace for an attempt that may be discarded."""
         return Trace(self.base_T_camera)
 
     def take(self, attempt: Trace) -> None:
-        """The iterations of an attempt that was worth it."""
+        """Add the iterations of a successful attempt."""
         self._iterations += attempt._iterations
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
-        """The round that the iterations since the last one made."""
-        iterations = tuple(self._iterations)
-        self._iterations.clear()
+        """End a round, which gets all iterations since the end of the last round."""
+        iterations, self._iterations = tuple(self._iterations), []
         self.rounds.append(Round(why, association, iterations, estimate.map_T_base, estimate.positions, estimate.weight))

@@ -1,6 +1,4 @@
-"""A path moved as its keyframes were."""
-
-from __future__ import annotations
+"""Corrections of a path by the corrections of its keyframes."""
 
 import numpy as np
 
@@ -10,14 +8,14 @@ from objslam.core.types import Trajectory
 
 
 def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats) -> Trajectory:
-    """The whole path, moved as its keyframes were: at their stamps (K,) from poses before to poses after, (K, 4, 4) each."""
+    """Correct a whole path by keyframes at stamps (K,) that moved from poses before to poses after, (K, 4, 4) each."""
     return Trajectory(path.stamps, correct_poses(path.stamps, path.poses, stamps, before, after))
 
 
 def correct_poses(stamps: Floats, poses: Floats, keyframe_stamps: Floats, before: Floats, after: Floats) -> Floats:
-    """Poses (N, 4, 4) at stamps (N,), moved as the keyframes at theirs (K,) were: from before to after, (K, 4, 4) each.
+    """Correct poses (N, 4, 4) at stamps (N,) by keyframes that moved from poses before to poses after, (K, 4, 4) each.
 
-    Between two keyframes the correction goes over from the one's to the other's; beyond the first and last it stays.
+    The correction is interpolated between keyframes, and constant outside of them.
     """
     known, first = np.unique(keyframe_stamps, return_index=True)
     correction = after[first] @ inverse(before[first])

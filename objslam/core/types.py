@@ -1,13 +1,11 @@
-"""The data that travels down the line: arrays in frozen dataclasses, validated where they are made.
+"""The data types of the pipeline: frozen dataclasses of arrays that check their shapes when they are made.
 
 Frames follow REP 103/105: `map`, `odom`, `base` (x forward, y left, z up), `camera` (optical: x right, y down, z
 forward). `a_T_b` is the pose of b in a: it takes b coordinates to a coordinates. SI units, radians, seconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,17 +15,20 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 
+MAX_BOXES = 10_000
+"""The most boxes of a frame. A frame with more is rejected, since no detector finds so many and association is too slow."""
 
-def _need(condition: bool, message: str) -> None:
+
+def _need(condition: Any, message: str) -> None:
     if not condition:
         raise ValueError(message)
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of one frame in another over time.
+    """Poses of one frame in another frame over time.
 
-    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. ValueError otherwise.
+    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. Other values raise ValueError.
     """
 
     stamps: Floats
@@ -35,22 +36,26 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         n = len(self.stamps)
-        _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N,4,4) poses")
-        _need(bool(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all()), "a trajectory has values not finite")
-        _need(bool((np.diff(self.stamps) > 0).all()), "the stamps of a trajectory must increase")
+        _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N, 4, 4) poses")
+        _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
+        _need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
 
     def __len__(self) -> int:
         return len(self.stamps)
 
 
+_BOX_COLUMNS = ("frame", "label", "scores", "depths", "track_ids")  # The fields of Detections with one number per box.
+
+
 @dataclass(frozen=True)
 class Detections:
-    """All boxes of one camera, struct of arrays; frames without a box are kept (they say what was not seen).
+    """All boxes of one camera. Frames without a box are kept, because they show what the camera did not see.
 
-    frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4)
-    x1, y1, x2, y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1].
-    depths: (M,) z along the optical axis, m, NaN where unknown. track_ids: (M,) -1 where unknown. whole: a box that the
-    image cuts off is never among them (fiducials are found by all their corners), so that centres hold up to the edge.
+    frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
+    y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether no box is cut off by the edge of the
+    image. Then box centres are valid up to the edge. This holds for fiducials, which need all their corners. Wrong shapes,
+    indices or orders raise ValueError.
     """
 
     frame_stamps: Floats
@@ -66,13 +71,13 @@ class Detections:
     def __post_init__(self) -> None:
         m = len(self.frame)
         _need(self.boxes.shape == (m, 4), "boxes must be (M, 4)")
-        for name in ("frame", "label", "scores", "depths", "track_ids"):
+        for name in _BOX_COLUMNS:
             _need(getattr(self, name).shape == (m,), f"{name} must be (M,) like the boxes")
-        _need(bool((np.diff(self.frame_stamps) > 0).all()), "the stamps of the frames must increase")
-        _need(bool((np.diff(self.frame) >= 0).all()), "boxes must come in the order of their frames")
+        _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
+        _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
-            _need(0 <= int(self.frame.min()) and int(self.frame.max()) < len(self.frame_stamps), "frame out of range")
-            _need(0 <= int(self.label.min()) and int(self.label.max()) < len(self.label_names), "label out of range")
+            _need(0 <= self.frame.min() and self.frame.max() < len(self.frame_stamps), "frame must index frame_stamps")
+            _need(0 <= self.label.min() and self.label.max() < len(self.label_names), "label must index label_names")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -83,30 +88,28 @@ class Detections:
         return self.frame_stamps[self.frame]
 
     def take(self, boxes: Bools | Ints) -> Self:
-        """The same frames with a selection of the boxes (mask or increasing indices)."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name in ("frame", "boxes", "label", "scores", "depths", "track_ids"):
-            values[name] = values[name][boxes]
-        return type(self)(**values)
+        """Select boxes by a mask or increasing indices. All frames stay."""
+        values: dict[str, Any] = {name: getattr(self, name)[boxes] for name in ("boxes", *_BOX_COLUMNS)}
+        return replace(self, **values)
 
 
 @dataclass(frozen=True)
 class Images:
-    """Image files of one stream: stamps (N,) s, strictly increasing; paths, one each."""
+    """The image files of one stream. stamps: (N,) s, strictly increasing. paths: one for each stamp."""
 
     stamps: Floats
     paths: tuple[Path, ...]
 
     def __post_init__(self) -> None:
-        _need(self.stamps.shape == (len(self.paths),), "one stamp an image")
-        _need(bool((np.diff(self.stamps) > 0).all()), "the stamps of images must increase")
+        _need(self.stamps.shape == (len(self.paths),), "images need one stamp for each path")
+        _need((np.diff(self.stamps) > 0).all(), "the stamps of images must increase")
 
 
 @dataclass(frozen=True)
 class CameraLog:
-    """What one camera brings: its calibration, and any of boxes, images, depth images and a moving mount.
+    """The data of one camera.
 
-    mount: base_T_camera over time (a camera on an arm); None where the camera's own base_T_camera holds throughout.
+    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds throughout.
     """
 
     camera: Camera
@@ -118,7 +121,7 @@ class CameraLog:
 
 @dataclass(frozen=True)
 class TruthObject:
-    """One object of the ground truth: id, label, position (3,) in map, m."""
+    """One object of the ground truth. position: (3,) m in map."""
 
     id: int
     label: str
@@ -127,7 +130,7 @@ class TruthObject:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth for evaluation: objects, and map_T_base where known."""
+    """Ground truth for evaluation: the objects, and map_T_base if it is known."""
 
     objects: tuple[TruthObject, ...] = ()
     trajectory: Trajectory | None = None
@@ -135,9 +138,9 @@ class Truth:
 
 @dataclass(frozen=True)
 class Log:
-    """A robot's log: odometry is odom_T_base, localization is map_T_base; at least one of the two is there.
+    """The log of a robot, with odometry, localisation or both.
 
-    path: the recording that it was read from, absolute; None where it was not.
+    odometry: odom_T_base. localization: map_T_base. path: the absolute path of the recording. None without a recording.
     """
 
     name: str
@@ -150,15 +153,15 @@ class Log:
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Camera frames with a pose, in the order of time (any camera), before estimation.
+    """Camera frames of any camera with a pose before estimation, in the order of time.
 
-    stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into that camera's
-    detections.frame_stamps. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4), the path to start from (localisation, else
-    odometry). localized_every: how many keyframes share one absolute pose measurement (>= 1; they are interpolated), or 0
-    when map_T_base is odometry. odom_T_base: (K, 4, 4) poses in a frame that starts with the odometry, None without it;
-    drift: (K, 6, 6), the covariance that the odometry has gathered by then, as a sum in that same frame. stretch: (K,) the
-    number of the odometry's stretch without a gap, -1 where there is none, whose odom_T_base and drift tell nothing; None
-    where all are on one.
+    stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of
+    this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4), the initial path by localisation, or by odometry without
+    localisation. localized_every: number of keyframes (>= 1) that share one absolute pose measurement by interpolation, 0 if
+    map_T_base is odometry. odom_T_base: (K, 4, 4) in a frame that starts with the odometry, None without odometry. drift:
+    (K, 6, 6) covariance that the odometry has accumulated since its start, in the frame of odom_T_base. stretch: (K,) number
+    of the odometry's stretch without a gap, None if all keyframes are on one stretch. -1 marks a keyframe without odometry,
+    whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats
@@ -183,8 +186,7 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        Across a gap of it the robot may have been moved, and the odometry begun elsewhere. Without a localisation nothing
-        else tells, and its word counts there, too.
+        It did not across a gap, since the robot may have been moved. Without localisation it counts across gaps, too.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:
@@ -194,20 +196,16 @@ class Keyframes:
         return (self.stretch[1:] == self.stretch[:-1]) & (self.stretch[1:] >= 0)
 
     def take(self, keyframes: Bools | Ints) -> Self:
-        """A selection of the keyframes (mask or increasing indices)."""
-        values: dict[str, Any] = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            values[f.name] = value[keyframes] if isinstance(value, np.ndarray) else value
-        return type(self)(**values)
+        """Select keyframes by a mask or increasing indices."""
+        return replace(self, **_rows(self, keyframes))
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Bearing rays, one a box: where each box's undistorted centre points from its keyframe.
+    """Bearing rays, one for each box, from the keyframe through the undistorted centre of the box.
 
-    keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, camera frame. sigma: (R,) rad, one standard
-    deviation of the angle along each of the two axes across the ray. range: (R,) m along the ray, NaN where unknown;
+    keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, camera frame. sigma: (R,) rad, standard
+    deviation of the angle along each of the two axes across the ray. range: (R,) m along the ray, NaN if unknown.
     range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id: (R,) -1 if unknown.
     """
 
@@ -226,23 +224,26 @@ class Rays:
         return len(self.keyframe)
 
     def in_map(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
-        """Origins (R, 3) and unit directions (R, 3) in map for camera poses (K, 4, 4)."""
+        """Return origins (R, 3) and unit directions (R, 3) in map for camera poses (K, 4, 4)."""
         poses = map_T_camera[self.keyframe]
         return poses[:, :3, 3], np.einsum("rij,rj->ri", poses[:, :3, :3], self.direction)
 
     def take(self, rays: Bools | Ints) -> Self:
-        """A selection of the rays (mask or increasing indices)."""
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in values.items()}
-        return type(self)(**selected)
+        """Select rays by a mask or increasing indices."""
+        return replace(self, **_rows(self, rays))
+
+
+def _rows(data: Keyframes | Rays, rows: Bools | Ints) -> dict[str, Any]:
+    """Return the selected rows of every array of a dataclass."""
+    return {name: value[rows] for name, value in vars(data).items() if isinstance(value, np.ndarray)}
 
 
 @dataclass(frozen=True)
 class Association:
-    """Which ray belongs to which object: object (R,) index or -1; label: (N,) index into the rays' label_names.
+    """The object of each ray.
 
-    label_weights: (N, L) share of each label in an object's boxes. existence: (N,) probability that there is such an object.
-    Both None where nobody asked.
+    object: (R,) index of the object, or -1. label: (N,) index into the rays' label_names. label_weights: (N, L) share of
+    each label in an object's boxes, None if unknown. existence: (N,) probability that the object exists, None if unknown.
     """
 
     object: Ints
@@ -258,8 +259,10 @@ class Association:
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh in map: vertices (V, 3) m and their normals (V, 3), float32; colours (V, 3) uint8 RGB, None where
-    unknown; triangles (T, 3) int32, indices of vertices."""
+    """A triangle mesh in map.
+
+    vertices: (V, 3) m. normals: (V, 3). colours: (V, 3) RGB, None if unknown. triangles: (T, 3) indices of vertices.
+    """
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -268,11 +271,7 @@ class Surface:
 
 
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
-    """Distinct names in sorted order, and each name's index (len(names),) into them."""
+    """Return the distinct names in sorted order, and the index of each name (len(names),) into them."""
     table = tuple(sorted(set(names)))
     index = {name: i for i, name in enumerate(table)}
     return table, np.array([index[name] for name in names], dtype=np.int64)
-
-
-MAX_BOXES = 10_000
-"""The most boxes of a frame; one with more is refused, for no detector finds them and association would take too long."""

@@ -1,6 +1,4 @@
-"""Detection: a CNN detector, any ONNX model, on a log's images. The only room that knows onnxruntime."""
-
-from __future__ import annotations
+"""Run a CNN detector, which may be any ONNX model, on the images of a log. Only this folder imports onnxruntime."""
 
 from objslam.detection.cache import default_cache
 from objslam.detection.detect_log import detect_log

@@ -1,12 +1,10 @@
-"""What a detector found in an image, kept on disk: a second run does not detect again.
+"""A cache on disk of the boxes that a detector found, so that a second run does not detect again.
 
-One file a detector (its key: model and recipe), one line an image: a checksum, and as JSON the SHA-256 of the image file's
-content and what was found. The content names the image, not its path or time: a log that was moved, copied or rendered again
-gets the boxes that are its own. Lines are only ever appended, each in one write, so that processes may share the file;
-what a killed one left half is told by its checksum and passed over.
+Each detector has one file, named by its key (model and recipe). Each line holds a checksum and one image as JSON: the
+SHA-256 of the image content and the boxes. The content identifies an image even if the log is moved, copied or rendered
+again. Each line is appended in one write, so processes can share the file. A line without its checksum is incomplete and is
+skipped.
 """
-
-from __future__ import annotations
 
 import errno
 import json
@@ -24,7 +22,7 @@ from objslam.detection.detector import Boxes
 
 @dataclass(frozen=True)
 class Entry:
-    """The size of an image, px, and what is in it."""
+    """Hold the size of an image in px and its boxes."""
 
     width: int
     height: int
@@ -32,13 +30,11 @@ class Entry:
 
 
 class DetectionCache:
-    """The entries of one detector. To be used in a `with` block; one thread may read while another writes."""
+    """Store the entries of one detector, as a context manager. One thread may read while another thread writes."""
 
     def __init__(self, folder: Path, key: str, ledger: Ledger) -> None:
-        """Open the cache of the detector with this key; lines that are damaged are dropped and counted.
-
-        A cache that cannot be opened or, later, written is told in a warning and does without.
-        """
+        """Open the cache of the detector with this key. Drop and count damaged lines. If the cache cannot be opened or
+        written, warn in the ledger and continue without the cache."""
         self._file = folder / f"{key}.jsonl"
         self._ledger = ledger
         self._lines: dict[str, bytes] = {}
@@ -68,12 +64,17 @@ class DetectionCache:
             self._handle = -1
 
     def read(self, digest: str) -> Entry | None:
-        """What is known of the image whose content has this SHA-256, None if nothing is."""
+        """Return the entry of the image whose content has this SHA-256. Return None if the cache has no such entry."""
         line = self._lines.get(digest)
-        return None if line is None else _parse(line)
+        if line is None:
+            return None
+        found = json.loads(line.partition(b" ")[2])
+        boxes = np.array(found["boxes"], dtype=np.float64).reshape(-1, 4)
+        width, height = found["size"]
+        return Entry(width, height, Boxes(boxes, tuple(found["labels"]), np.array(found["scores"], dtype=np.float64)))
 
     def write(self, digest: str, entry: Entry) -> None:
-        """Keep what was found in an image."""
+        """Append the entry of an image to the file."""
         if self._handle < 0:
             return
         found = {
@@ -97,9 +98,9 @@ class DetectionCache:
 
 
 def default_cache() -> Path | None:
-    """The user's folder for detection caches: below XDG_CACHE_HOME, else ~/.cache; None where there is no home."""
+    """Return the user's folder for detection caches, below XDG_CACHE_HOME or ~/.cache. Return None without a home folder."""
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not base.is_absolute():  # the specification has relative paths ignored
+    if not base.is_absolute():  # the XDG specification ignores relative paths
         try:
             base = Path.home() / ".cache"
         except RuntimeError:
@@ -108,17 +109,9 @@ def default_cache() -> Path | None:
 
 
 def _digest_of(line: bytes) -> str | None:
-    """The image's digest in a line, None if the line is not what was written."""
+    """Return the image digest in a line, or None if the line is damaged."""
     check, _, text = line.partition(b" ")
     start, end = b'{"image": "', b'", "size": '
     if check != b"%08x" % zlib.crc32(text) or not text.startswith(start):
         return None
     return text[len(start) : text.index(end)].decode()
-
-
-def _parse(line: bytes) -> Entry:
-    found = json.loads(line.partition(b" ")[2])
-    boxes = np.array(found["boxes"], dtype=np.float64).reshape(-1, 4)
-    scores = np.array(found["scores"], dtype=np.float64)
-    width, height = found["size"]
-    return Entry(width, height, Boxes(boxes, tuple(found["labels"]), scores))

@@ -1,6 +1,5 @@
-"""Class names: as the settings give them, as the model's metadata tells them, or COCO's where their number fits."""
-
-from __future__ import annotations
+"""The class names of a model: from the settings, from the model's metadata, or from COCO if the number of classes
+matches."""
 
 import ast
 import json
@@ -13,9 +12,9 @@ from objslam import config
 from objslam.core.coco import COCO_NAMES
 from objslam.errors import ConfigError, DetectorError
 
-_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # numbers of COCO's 91 that no class has
-_BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})
-_MOST = 100_000
+_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers without a class among the 91 of COCO.
+_BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
+_MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
 
 
 def _coco91() -> tuple[str, ...]:
@@ -24,18 +23,17 @@ def _coco91() -> tuple[str, ...]:
 
 
 KNOWN = {"coco": COCO_NAMES, "coco91": _coco91()}
+"""The lists of class names that `detector.names` accepts by name."""
 
 
 def is_background(name: str) -> bool:
-    """Whether the name stands for no object at all."""
+    """Return whether a class name means that there is no object."""
     return name.strip().lower() in _BACKGROUND
 
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
-    """The names that the settings give: a list, coco, coco91, or a file, as it stands or beside the model.
-
-    ConfigError where there is no such file, or something in it is not a name.
-    """
+    """Return the class names that the setting `detector.names` defines: a list, coco, coco91 or a file. A file is looked up
+    as given, then beside the model. ConfigError if the file is missing, unreadable or has a wrong name."""
     if given is None:
         return None
     if isinstance(given, tuple):
@@ -64,10 +62,8 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
 
 
 def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
-    """The names in a model's metadata, a Python or JSON list or dictionary; None where there are none.
-
-    DetectorError where there is something else.
-    """
+    """Parse the names in a model's metadata, a list or dictionary in Python or JSON. Return None if there is no text.
+    DetectorError if the text is something else."""
     if not text:
         return None
     try:
@@ -80,15 +76,15 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
     names = _as_names(data)
     if names is None:
         message = f"the names in the model's metadata are no list of names: {text[:60]!r}"
-        raise DetectorError(message, where=str(model), hint="give them in detector.names")
+        raise DetectorError(message, where=str(model), hint="set detector.names")
     return _checked(names, f"{model}, metadata")
 
 
 def default_names(count: int) -> tuple[tuple[str, ...], str] | None:
-    """COCO's names for a model that brings none, if their number is its, and a warning that says so."""
+    """Return the COCO list with `count` names and a warning that the list is a guess. Return None if no list matches."""
     for key, names in KNOWN.items():
         if len(names) == count:
-            return names, f"the model names no classes but has {count} of them, as {key} has: its names are taken"
+            return names, f"the model names no classes: the {count} names of {key} are used, because it has {count} classes"
     return None
 
 

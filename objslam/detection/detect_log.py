@@ -1,31 +1,33 @@
-"""A detector on a log: every rgb image becomes a frame with boxes."""
+"""Detection in a log: each rgb image becomes a frame with boxes."""
 
-from __future__ import annotations
-
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Array, Floats
+from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Images, Log, label_table
 from objslam.detection.cache import DetectionCache, Entry
 from objslam.detection.detector import Boxes, Detector
-from objslam.detection.image_loader import load_frame
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
+from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
+from objslam.io.text import read_bytes
 
-_AHEAD = 8  # images that may be decoded ahead of the network, besides its batch
+_AHEAD = 8  # The number of images decoded ahead of the network in addition to a batch.
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage's name, what is done and the total (0 when it is not known)."""
+"""A callback with the name of the stage, the number of finished items, and the total (0 if unknown)."""
 
 
 def detect_log(
@@ -37,36 +39,41 @@ def detect_log(
     cache: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Log:
-    """The log with the detections of each camera that has rgb images, in place of those it may have brought.
+    """Return the log with detections from the rgb images, which replace the detections of the log.
 
-    Images that cannot be read or decoded, or have another size than the camera, are no frames: dropped and counted. With
-    depth.use, boxes get their depth from the depth images, where there are some. cache: a folder that remembers what was
-    found in which image (see `DetectionCache`). LogError where no image can be used; DetectorError where the network fails.
+    An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
+    box gets its depth from a depth image if the camera has depth images. `cache` is the folder of a `DetectionCache`, if
+    any. LogError if no image can be used. DetectorError if the network fails.
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
         raise LogError("no camera has rgb images for the detector", where=log.name, hint="rgb.txt lists them")
     for warning in detector.warnings:
         ledger.warn(warning)
-    meter = _Meter(total, progress)
+    done, begin = count(1), time.perf_counter()
+
+    def step() -> None:
+        number = next(done)
+        rate = number / max(time.perf_counter() - begin, 1e-6)
+        progress(f"detecting, {rate:.1f} frames/s", number, total)
+
+    progress("detecting", 0, total)
     with nullcontext() if cache is None else DetectionCache(cache, detector.key, ledger) as store:
-        run = partial(_detect_images, detector=detector, store=store, ledger=ledger, meter=meter)
-        found = [None if c.rgb is None else run(c, c.rgb) for c in log.cameras]
+        run = partial(_detect_images, detector=detector, store=store, ledger=ledger, step=step)
+        found = [None if c.rgb is None else run(c.camera, c.rgb) for c in log.cameras]
     frames = sum(len(d.frame_stamps) for d in found if d is not None)
     if not frames:
         reasons = "; ".join(line for line in ledger.lines() if "rgb image" in line)
         raise LogError(f"none of the {total} rgb images can be used", where=log.name, hint=reasons)
     if not any(len(d) for d in found if d is not None):
-        ledger.warn(
-            f"the detector found nothing in {frames} images: does detector.min_score suit the model, and its layout?"
-        )
-    cameras = []
+        ledger.warn(f"the detector found nothing in {frames} images: check detector.min_score and detector.layout")
+    cameras: list[CameraLog] = []
     for camera_log, detections in zip(log.cameras, found, strict=True):
         if detections is None:
             cameras.append(camera_log)
             continue
         if camera_log.detections is not None:
-            ledger.warn(f"camera {camera_log.camera.name}: the detector's boxes replace those that the log brought")
+            ledger.warn(f"camera {camera_log.camera.name}: the boxes of the detector replace the boxes of the log")
         if camera_log.depth is not None and settings.depth.use:
             progress("depths at the boxes", 0, 0)
             detections = depths_at_boxes(detections, camera_log.depth, camera_log.camera, ledger)
@@ -74,26 +81,56 @@ def detect_log(
     return replace(log, cameras=tuple(cameras))
 
 
-class _Meter:
-    """Tells the progress, with the rate."""
+@dataclass(frozen=True)
+class Frame:
+    """Hold one image file: its pixels, its boxes from the cache, or its problem with the place of the problem."""
 
-    def __init__(self, total: int, progress: Progress) -> None:
-        self._total, self._progress = total, progress
-        self._done, self._begin = 0, time.perf_counter()
-        progress("detecting", 0, total)
+    digest: str = ""
+    image: Array | None = None
+    known: Boxes | None = None
+    problem: str | None = None
+    where: str = ""
 
-    def step(self) -> None:
-        self._done += 1
-        rate = self._done / max(time.perf_counter() - self._begin, 1e-6)
-        self._progress(f"detecting, {rate:.1f} frames/s", self._done, self._total)
+
+def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Frame:
+    """Read an image file, and decode it to 8 bit BGR without EXIF rotation unless the cache has its boxes."""
+    try:
+        data = read_bytes(path)
+    except LogError as error:
+        return Frame(problem="rgb image that cannot be read", where=str(error))
+    digest = hashlib.sha256(data).hexdigest()
+    image, entry = None, None if cache is None else cache.read(digest)
+    if entry is not None:
+        width, height = entry.width, entry.height
+    elif (image := decode_colour(data)) is not None:
+        height, width = image.shape[:2]
+    else:
+        return Frame(digest, problem="rgb image that cannot be decoded", where=str(path))
+    if (width, height) != (camera.width, camera.height):
+        where = f"{path} is {width}x{height}, the camera {camera.width}x{camera.height}"
+        return Frame(digest, problem="rgb image that has not the camera's size", where=where)
+    return Frame(digest, image, None if entry is None else entry.boxes)
 
 
 def _detect_images(
-    camera_log: CameraLog, images: Images, *, detector: Detector, store: DetectionCache | None, ledger: Ledger, meter: _Meter
+    camera: Camera,
+    images: Images,
+    *,
+    detector: Detector,
+    store: DetectionCache | None,
+    ledger: Ledger,
+    step: Callable[[], None],
 ) -> Detections:
-    camera = camera_log.camera
     found: list[Boxes | None] = [None] * len(images.paths)
     waiting: list[tuple[int, str, Array]] = []
+
+    def detect_waiting() -> None:
+        for (index, digest, image), boxes in zip(waiting, detector.detect([image for *_, image in waiting]), strict=True):
+            found[index] = boxes
+            if store is not None:
+                store.write(digest, Entry(image.shape[1], image.shape[0], boxes))
+        waiting.clear()
+
     load = partial(load_frame, camera=camera, cache=store)
     for index, frame in enumerate(ahead(load, images.paths, _AHEAD + detector.batch)):
         if frame.problem is not None:
@@ -103,24 +140,10 @@ def _detect_images(
         elif frame.image is not None:
             waiting.append((index, frame.digest, frame.image))
         if len(waiting) == detector.batch:
-            _detect_batch(waiting, found, detector, store)
-        meter.step()
-    _detect_batch(waiting, found, detector, store)
+            detect_waiting()
+        step()
+    detect_waiting()
     return _as_detections(images.stamps, found)
-
-
-def _detect_batch(
-    waiting: list[tuple[int, str, Array]], found: list[Boxes | None], detector: Detector, store: DetectionCache | None
-) -> None:
-    """Run the detector on the waiting images (index, digest, pixels), and empty `waiting`.
-
-    The boxes of an image go to found[index], and into the cache if there is one.
-    """
-    for (index, digest, image), boxes in zip(waiting, detector.detect([image for _, _, image in waiting]), strict=True):
-        found[index] = boxes
-        if store is not None:
-            store.write(digest, Entry(image.shape[1], image.shape[0], boxes))
-    waiting.clear()
 
 
 def _as_detections(stamps: Floats, found: Sequence[Boxes | None]) -> Detections:

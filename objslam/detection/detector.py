@@ -1,17 +1,16 @@
-"""A detector: images in, boxes with labels and scores out."""
-
-from __future__ import annotations
+"""The detector, which finds boxes with labels and scores in images."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from objslam import config
-from objslam.config import Role
+from objslam.config.detector import Role
 from objslam.core.arrays import Array, Floats
 from objslam.detection.infer_recipe import input_size, settle, with_description
 from objslam.detection.onnx_model import Network, open_network
@@ -21,11 +20,11 @@ from objslam.detection.preprocess import Fit, fill, fit
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_DECODING = 1  # raised when the same outputs come to give other boxes
+_DECODING = 1  # The version of the decoding. A changed decoding raises it, so that old cache files are ignored.
 
 
 class Boxes(NamedTuple):
-    """What was found in one image: boxes (N, 4) x1, y1, x2, y2 in px of the raw image, labels, scores (N,), best first."""
+    """Hold the boxes (N, 4) x1, y1, x2, y2 in px of the raw image, labels and scores (N,) of one image, best score first."""
 
     boxes: Floats
     labels: tuple[str, ...]
@@ -34,10 +33,7 @@ class Boxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Detector:
-    """A network with its recipe.
-
-    batch: images that go in at a time. warnings: what a user should know about the model.
-    """
+    """Hold a network with its recipe, the number of images per batch, and warnings about the model for the user."""
 
     network: Network
     recipe: Recipe
@@ -46,38 +42,39 @@ class Detector:
 
     @property
     def key(self) -> str:
-        """Names the model with its recipe: the same key, the same boxes for an image."""
+        """Return a hash of the model and its recipe. Two detectors with one key find the same boxes in an image."""
         text = f"{_DECODING}\n{self.network.digest}\n{self.recipe.as_text()}"
         return hashlib.sha256(text.encode()).hexdigest()
 
     def detect(self, images: Sequence[Array]) -> list[Boxes]:
-        """The boxes in each of the images (H, W, 3), uint8, BGR.
-
-        ValueError for something else. DetectorError where the network fails or gives what cannot be boxes.
-        """
+        """Return the boxes of each image (H, W, 3), uint8, BGR. ValueError if an image has another form. DetectorError if
+        the network fails or its outputs cannot be boxes."""
         for image in images:
             if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
                 raise ValueError(f"an image must be (H, W, 3) uint8, got {image.shape} {image.dtype}")
         results: list[Boxes] = []
-        for group in _groups(images, self.batch):
-            blob, where = self.prepare(group)
-            results += self.read(self.network.run(blob), where, len(group))
+        for _, same_size in groupby(images, key=lambda image: image.shape):
+            alike = list(same_size)
+            for start in range(0, len(alike), self.batch):
+                group = alike[start : start + self.batch]
+                blob, where = self.prepare(group)
+                results += self.read(self.network.run(blob), where, len(group))
         return results
 
     def prepare(self, images: Sequence[Array]) -> tuple[Array, Fit]:
-        """What goes into the network for images of one size, at most a batch of them, and where they lie in it."""
+        """Return the network input for at most a batch of images of one size, and the place of the images in the input."""
         height, width = images[0].shape[:2]
         where = fit(self.recipe, width, height)
         return fill(self.recipe, images, where, self.network.image.batch or len(images)), where
 
     def read(self, outputs: Sequence[Array], where: Fit, count: int) -> list[Boxes]:
-        """The boxes of the first `count` images from the network's outputs."""
+        """Return the boxes of the first `count` images from the outputs of the network."""
         named = _by_role(self.network, self.recipe, outputs)
         if not _has_batch(named):
             return [self._boxes(named, where)]
         if any(len(values) < count for values in named.values()):
             saw = ", ".join(f"{role} {list(values.shape)}" for role, values in named.items())
-            message = f"{count} images went in, but not as many results came out: {saw}"
+            message = f"the outputs have fewer results than the {count} images of the batch: {saw}"
             raise DetectorError(message, where=str(self.network.path), hint="detector.batch=1")
         return [self._boxes({role: values[i] for role, values in named.items()}, where) for i in range(count)]
 
@@ -87,16 +84,16 @@ class Detector:
         except DetectorError as error:
             raise DetectorError(error.message, where=str(self.network.path), hint=error.hint) from error
         boxes = where.to_raw(found.boxes)
-        inside = np.flatnonzero((boxes[:, 2:] > boxes[:, :2]).all(axis=1))  # not in the padding alone
+        inside = np.flatnonzero((boxes[:, 2:] > boxes[:, :2]).all(axis=1))  # drops a box that lies in the padding
         names, label = self.recipe.names, found.label[inside].tolist()
         return Boxes(boxes[inside], tuple(names[i] if names else f"class_{i}" for i in label), found.scores[inside])
 
 
 def load_detector(model: Path, settings: config.Detector) -> Detector:
-    """Load an ONNX detector, run it once and settle how images go in and boxes come out.
+    """Load an ONNX detector, run it once, and determine its recipe. ConfigError if the settings do not fit the model.
 
-    DetectorError where the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of a layout
-    that is not known (the message has them and says how to describe them); ConfigError where the settings do not fit it.
+    DetectorError if the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of an unknown
+    layout. Its message lists the outputs and says how to describe them.
     """
     network = open_network(model, settings)
     settings = with_description(network, settings)
@@ -108,7 +105,7 @@ def load_detector(model: Path, settings: config.Detector) -> Detector:
     several = _has_batch(_by_role(network, recipe, values))
     fixed = network.image.batch
     if fixed is not None and fixed > 1 and not several:
-        message = f"the model takes {fixed} images at a time, but does not say which boxes are whose"
+        message = f"the model takes {fixed} images per run, but its outputs do not assign boxes to images"
         raise DetectorError(message, where=str(model), hint="export it for one image")
     batch = (settings.batch if fixed is None else max(fixed, 1)) if several else 1
     return Detector(network, recipe, batch, (f"{model}: {warning}",) if warning else ())
@@ -120,14 +117,5 @@ def _by_role(network: Network, recipe: Recipe, outputs: Sequence[Array]) -> dict
 
 
 def _has_batch(named: dict[Role, Array]) -> bool:
-    """Whether the outputs have an axis for the images: boxes are (B, N, 4) then, not (N, 4)."""
+    """Return whether the outputs have a batch axis, so that boxes are (B, N, 4) and not (N, 4)."""
     return named["boxes" if "boxes" in named else "predictions"].ndim == 3
-
-
-def _groups(images: Sequence[Array], batch: int) -> Iterator[Sequence[Array]]:
-    """Runs of images of one size, at most a batch long."""
-    start = 0
-    for end in range(1, len(images) + 1):
-        if end == len(images) or end - start == batch or images[end].shape != images[start].shape:
-            yield images[start:end]
-            start = end

@@ -1,59 +1,54 @@
-"""Settling a model's recipe: the settings go before the model's own description, that before its family's habits."""
-
-from __future__ import annotations
+"""Inference of a model's recipe. The settings override the model's own description, which overrides the layout's habits."""
 
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from difflib import get_close_matches
 
 from objslam import config
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array
 from objslam.detection.class_names import default_names, is_background, names_from_metadata, names_from_settings
 from objslam.detection.onnx_model import Network
 from objslam.detection.output_layouts import Facts, Output, Roles, count_classes, recognise, rows_are_boxes
-from objslam.detection.recipe import HABITS, PLAIN, Habits, InputSize, Recipe
+from objslam.detection.recipe import HABITS, NO_MEAN, UNIT_STD, Habits, InputSize, Recipe
 from objslam.errors import ConfigError, DetectorError
 
 DESCRIPTION = "objslam.detector"
-"""Key of a model's metadata under which it may describe itself: JSON with keys of the settings' detector section."""
+"""The metadata key of a model's own description, which is JSON with keys of the `detector` settings."""
 
-_NOT_A_MODELS = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
-_SIZE, _LARGEST, _STRIDE, _PAD = 640, 8192, 32, 114
-_QUERIES = 300  # of the newer ones of the DETR family; DETR itself and its close kin have 100
-_UNNAMED = "the model names no classes: they are numbered (give detector.names)"
+_USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
+_SIZE = 640  # The width and height of a free input in px if settings and metadata have no size.
+_LARGEST = 8192  # The largest width or height in px that is accepted from the metadata.
+_STRIDE = 32  # The stride of a free input in px if the metadata has no stride.
+_PAD = 114  # The grey value of the padding if the settings have none.
+_QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
+_UNNAMED = "the model names no classes: they are numbered (set detector.names)"
 
 
 def with_description(network: Network, settings: config.Detector) -> config.Detector:
-    """The settings, with what is left open in them filled from the model's own description, where it brings one.
-
-    DetectorError where that is wrong.
-    """
+    """Return the settings with unset values taken from the model's own description in its metadata, if it has one.
+    DetectorError if the description is invalid."""
     text = network.metadata.get(DESCRIPTION)
     if text is None:
         return settings
     try:
-        told = config.Detector.model_validate(json.loads(text))
-        beyond = told.model_fields_set & _NOT_A_MODELS
-        if beyond:
-            raise ValueError(f"{min(beyond)} is not for a model to say")
-    except (ValueError, RecursionError) as error:  # pydantic's and json's errors are ValueErrors
+        described = config.Detector.model_validate(json.loads(text))
+        if beyond := described.model_fields_set & _USER_ONLY:
+            raise ValueError(f"only the user can set {min(beyond)}")
+    except (ValueError, RecursionError) as error:  # The errors of pydantic and json are ValueErrors.
         message = f"{DESCRIPTION} in the model's metadata is wrong: {'; '.join(str(error).splitlines()[:3])}"
         raise DetectorError(message, where=str(network.path)) from error
-    return settings.model_copy(
-        update={key: getattr(told, key) for key in told.model_fields_set if getattr(settings, key) is None}
-    )
+    unset = (key for key in described.model_fields_set if getattr(settings, key) is None)
+    return settings.model_copy(update={key: getattr(described, key) for key in unset})
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
-    """The model's own size, else the settings', else that of the training (in the metadata), else 640.
-
-    ConfigError where the settings want another than the model's.
-    """
+    """Return the input size of the model, or of the settings, or of the training in the metadata, or 640 px, in this order.
+    ConfigError if the settings have another size than the model."""
     image = network.image
-    width, height = settings.size or _told_size(network.metadata) or (_SIZE, _SIZE)
+    width, height = settings.size or _training_size(network.metadata) or (_SIZE, _SIZE)
     if settings.size is not None and (width, height) != (image.width or width, image.height or height):
         takes = f"{image.width or 'any'}x{image.height or 'any'}"
         raise ConfigError(f"detector.size is {width}x{height}, the model takes {takes}", where=str(network.path))
@@ -70,49 +65,44 @@ def input_size(network: Network, settings: config.Detector) -> InputSize:
 def settle(
     network: Network, settings: config.Detector, size: InputSize, outputs: Sequence[Output]
 ) -> tuple[Recipe, str | None]:
-    """The recipe for a model that gave these outputs on one image of the size, and a warning where names were made up.
-
-    ConfigError or DetectorError where none can be: a layout that is not known, another task, names that do not fit.
-    """
+    """Infer the recipe from the outputs for one image of this size, with a warning if the names are a guess. ConfigError or
+    DetectorError if the layout is unknown, the task is no detection, or the names do not match the model."""
     task = network.metadata.get("task", "detect")
     if task in ("classify", "obb"):
-        message = f"the model's task is {task}: it gives no boxes along the image's axes"
-        raise DetectorError(message, where=str(network.path), hint="a detection model is needed")
-    given = names_from_settings(settings.names, network.path)
-    known = given or names_from_metadata(network.metadata.get("names"), network.path)
+        message = f"the model's task is {task}, which gives no axis-aligned boxes"
+        raise DetectorError(message, where=str(network.path), hint="use a detection model")
+    own_names = names_from_settings(settings.names, network.path)
+    known = own_names or names_from_metadata(network.metadata.get("names"), network.path)
     facts = Facts(size.height, size.width, len(known) if known else None, network.metadata)
     layout, roles = recognise(outputs, settings, facts, network.path)
     values = {output.name: output.values for output in outputs}
     named = {role: values[name] for role, name in roles.items()}
     bytes_in = network.image.tensor.kind == "uint8"
     if bytes_in and not (settings.divide_by is None and settings.mean is None and settings.std is None):
-        message = "the model takes bytes as they are: detector.divide_by, mean and std cannot be set"
+        message = "the model takes bytes as they are, so detector.divide_by, mean and std cannot be set"
         raise ConfigError(message, where=str(network.path))
     habits = _habits(layout, roles, named, facts, free_size=size.free_width or size.free_height, bytes_in=bytes_in)
-    activation = settings.activation or habits.activation
+    if settings.size is not None and habits.resize == "none":
+        habits = replace(habits, resize="stretch")
+    given = {field.name: getattr(settings, field.name) for field in fields(Habits)}
+    habits = replace(habits, **{name: value for name, value in given.items() if value is not None})
+    softmax = habits.activation == "softmax"
     channels = count_classes(layout, named, facts)
-    names, warning = _fit_names(network, known, channels, softmax=activation == "softmax", exact=given is not None)
-    from_1 = layout == "ssd" and (network.image.batch == 0 or _is_tensorflow(roles))  # as torchvision and TensorFlow count
+    names, warning = _fit_names(network, known, channels, softmax=softmax, exact=own_names is not None)
+    # Class 0 is the background in torchvision and TensorFlow.
+    from_1 = layout == "ssd" and (network.image.batch == 0 or _is_tensorflow(roles))
     from_1 = from_1 and bool(names) and not is_background(names[0])
     recipe = Recipe(
+        **vars(habits),
         layout=layout,
         outputs=dict(roles),
         size=size,
-        resize=settings.resize or ("stretch" if settings.size and habits.resize == "none" else habits.resize),
         pad=_PAD if settings.pad is None else settings.pad,
-        colour=settings.colour or habits.colour,
-        divide_by=settings.divide_by or habits.divide_by,
-        mean=settings.mean or habits.normalise[0],
-        std=settings.std or habits.normalise[1],
         names=names,
         first_label=int(from_1) if settings.first_label is None else settings.first_label,
         taken=_taken(settings.classes, names, network),
-        channels=channels if channels is None or activation == "softmax" else len(names),
+        channels=channels if channels is None or softmax else len(names),
         row_boxes=layout != "yolov8" or rows_are_boxes(named["predictions"], facts.classes),
-        box_form=settings.box_form or habits.box_form,
-        box_units=settings.box_units or habits.box_units,
-        activation=activation,
-        nms=habits.nms if settings.nms is None else settings.nms,
         min_score=settings.min_score,
         iou=settings.iou,
         max_boxes=settings.max_boxes,
@@ -123,27 +113,27 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """The habits of the layout, and where some of its models have others, theirs."""
+    """Return the habits of the layout, changed for models of the layout with other habits."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
-        habits = replace(habits, resize="none")  # such models resize inside
+        habits = replace(habits, resize="none")  # such models resize the image themselves
     if _is_tensorflow(roles):
         habits = replace(habits, box_form="yxyx", box_units="fractions")
     if layout == "end_to_end" and facts.ultralytics_detr:
         habits = replace(habits, resize="stretch", box_form="cxcywh", box_units="fractions")
-    if layout == "detr" and "predictions" in named:  # RT-DETR as Ultralytics exported it
-        habits = replace(habits, activation="none", normalise=PLAIN)
+    if layout == "detr" and "predictions" in named:  # RT-DETR exported by Ultralytics
+        habits = replace(habits, activation="none", mean=NO_MEAN, std=UNIT_STD)
     elif layout == "detr":
         queries, classes = named["logits"].shape[-2:]
         old = queries < _QUERIES
         if classes == facts.classes + 1 if facts.classes is not None else old:
             habits = replace(habits, activation="softmax")
-        if not old and roles["boxes"] != "dets":  # RT-DETR and its kin; RF-DETR, whose boxes are "dets", normalises
-            habits = replace(habits, normalise=PLAIN)
-    return replace(habits, divide_by=1.0, normalise=PLAIN) if bytes_in else habits
+        if not old and roles["boxes"] != "dets":  # RT-DETR and its variants do not normalise. RF-DETR ("dets") does.
+            habits = replace(habits, mean=NO_MEAN, std=UNIT_STD)
+    return replace(habits, divide_by=1.0, mean=NO_MEAN, std=UNIT_STD) if bytes_in else habits
 
 
-def _told_size(metadata: Mapping[str, str]) -> tuple[int, int] | None:
+def _training_size(metadata: Mapping[str, str]) -> tuple[int, int] | None:
     try:
         height, width = json.loads(metadata.get("imgsz", "null"))
     except (ValueError, TypeError, RecursionError):
@@ -158,7 +148,7 @@ def _is_tensorflow(roles: Roles) -> bool:
 def _fit_names(
     network: Network, known: tuple[str, ...] | None, channels: int | None, *, softmax: bool, exact: bool
 ) -> tuple[tuple[str, ...], str | None]:
-    """The names for the channels; where they are the metadata's, channels after them (masks, key points) are none."""
+    """Return the class names. With names from the metadata, further channels (masks, key points) are no classes."""
     if channels is None:
         return known or (), None if known else _UNNAMED
     room = channels - softmax
@@ -167,18 +157,18 @@ def _fit_names(
     if softmax and len(known) == channels and is_background(known[-1]):
         known = known[:-1]
     if len(known) > room or (len(known) < room and (exact or softmax)):
-        hint = 'after softmax the last class means "nothing": is that so? (detector.activation)' if softmax else None
-        message = f"there are {len(known)} class names, the model has {room} classes"
+        hint = 'softmax counts the last class as "no object": check detector.activation' if softmax else None
+        message = f"there are {len(known)} class names, but the model has {room} classes"
         raise ConfigError(message, where=str(network.path), hint=hint)
     return known, None
 
 
 def _taken(classes: tuple[str, ...] | None, names: tuple[str, ...], network: Network) -> tuple[int, ...] | None:
-    """The classes that count, all but the background if the settings list none; ConfigError for one that is not there."""
+    """Return the indices of the classes to keep. Without `classes` keep all except the background."""
     if not names:
         numbers = [re.fullmatch("class_([0-9]{1,9})", name) for name in classes or ()]
         if not all(numbers):
-            message = "detector.classes needs detector.names: the model names no classes, they are class_0, class_1, ..."
+            message = "detector.classes needs detector.names, because the classes of the model are class_0, class_1, ..."
             raise ConfigError(message, where=str(network.path))
         return tuple(int(number[1]) for number in numbers if number) if classes else None
     for name in classes or ():

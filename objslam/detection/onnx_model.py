@@ -1,6 +1,4 @@
-"""The network itself: an ONNX model in an onnxruntime session, and what its file says about it."""
-
-from __future__ import annotations
+"""The network: an ONNX model in an onnxruntime session, with its inputs, outputs and metadata."""
 
 import hashlib
 from collections.abc import Mapping
@@ -25,13 +23,13 @@ _KINDS: dict[str, type[np.generic]] = {
 }
 _PIXELS = ("float", "float16", "double", "uint8")
 _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
-_FED = {_MASK: 3, _SIZES: 2}  # what exporters of the DETR family ask for besides the image, with the rank
+_FED = {_MASK: 3, _SIZES: 2}  # The ranks of the inputs that exported DETR models need in addition to the image.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 @dataclass(frozen=True)
 class Tensor:
-    """An input or output as the model declares it: name, shape (None where it may be anything), kind of its values."""
+    """Hold the declaration of an input or output: name, shape (None for a free size), and kind of the values."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -43,10 +41,8 @@ class Tensor:
 
 @dataclass(frozen=True)
 class ImageInput:
-    """How the image goes in.
-
-    batch, height, width: None where they may be anything; batch is 0 where there is no such axis. channels_last: HWC.
-    """
+    """Hold the layout of the image input, HWC if `channels_last` is True, else CHW. A size of None is free. A batch of 0
+    means that the input has no batch axis."""
 
     tensor: Tensor
     batch: int | None
@@ -57,7 +53,7 @@ class ImageInput:
 
 @dataclass(frozen=True)
 class Network:
-    """A session that runs, with the facts of its file. digest: SHA-256 of the model. extras: its other inputs."""
+    """Hold a session with the path, SHA-256 digest, metadata, image input, further inputs and outputs of its model."""
 
     path: Path
     session: Any
@@ -68,7 +64,7 @@ class Network:
     outputs: tuple[Tensor, ...]
 
     def run(self, blob: Array) -> list[Array]:
-        """The outputs, in the model's order, for the values of images (B, 3, H, W); DetectorError if it fails."""
+        """Run the model on images (B, 3, H, W) and return its outputs in its order. DetectorError if the run fails."""
         count, _, height, width = blob.shape
         array = blob.transpose(0, 2, 3, 1) if self.image.channels_last else blob
         if self.image.batch == 0:
@@ -84,11 +80,8 @@ class Network:
 
 
 def open_network(path: Path, settings: config.Detector) -> Network:
-    """Load an ONNX model with the settings' device and threads.
-
-    DetectorError where the file is missing, no ONNX model, or has inputs that an image cannot feed; ConfigError where CUDA
-    is asked for and this onnxruntime cannot give it.
-    """
+    """Load an ONNX model on the device and with the threads of the settings. DetectorError if the file is missing, is no
+    ONNX model, or needs more inputs than an image. ConfigError if the device is cuda and onnxruntime has no CUDA."""
     import onnxruntime
 
     try:
@@ -96,9 +89,9 @@ def open_network(path: Path, settings: config.Detector) -> Network:
     except OSError as error:
         raise DetectorError(f"the model cannot be read: {error.strerror or error}", where=str(path)) from error
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # what fails is raised; it is not printed besides
+    options.log_severity_level = 4  # errors are raised, so onnxruntime need not print them
     options.intra_op_num_threads = settings.threads
-    # Threads that spin while they wait take the cores from the thread that decodes the images.
+    # Spinning threads would take the cores from the threads that decode the images.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     providers = _providers(onnxruntime, settings.device)
     try:
@@ -107,15 +100,20 @@ def open_network(path: Path, settings: config.Detector) -> Network:
         message = f"not an ONNX model that onnxruntime loads: {first_line(error)}"
         raise DetectorError(message, where=str(path)) from error
     if settings.device == "cuda" and _CUDA not in session.get_providers():
-        raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="are its CUDA libraries there?")
+        raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="check its CUDA libraries")
     inputs, outputs = ([_tensor(node) for node in nodes] for nodes in (session.get_inputs(), session.get_outputs()))
-    image, extras = _split_inputs(path, inputs)
+    images = [image for image in map(_as_image, inputs) if image is not None]
+    extras = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
+    if len(images) != 1 or len(extras) + 1 != len(inputs):
+        saw = "; ".join(map(str, inputs)) or "none"
+        hint = f"export the model with one image input of 3 channels, and at most {_MASK} and {_SIZES} besides"
+        raise DetectorError(f"the model has inputs that an image does not feed: {saw}", where=str(path), hint=hint)
     metadata = session.get_modelmeta().custom_metadata_map
-    return Network(path, session, digest, metadata, image, extras, tuple(outputs))
+    return Network(path, session, digest, metadata, images[0], extras, tuple(outputs))
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of the model and of the files beside it that begin with its name: exporters keep large weights there."""
+    """Hash the model and the files beside it whose names begin with its name, where exporters store large weights."""
     total = hashlib.sha256()
     beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
     for part in (path, *beside):
@@ -127,9 +125,7 @@ def _digest(path: Path) -> str:
 def _providers(onnxruntime: Any, device: config.Device) -> list[str]:
     offered = _CUDA in onnxruntime.get_available_providers()
     if device == "cuda" and not offered:
-        raise ConfigError(
-            "detector.device is cuda, but this onnxruntime has no CUDA", hint="pip install onnxruntime-gpu in its place"
-        )
+        raise ConfigError("detector.device is cuda, but this onnxruntime has no CUDA", hint="replace it by onnxruntime-gpu")
     if device == "cpu" or not offered:
         return [_CPU]
     onnxruntime.preload_dlls()  # finds the CUDA libraries that pip installed
@@ -139,19 +135,6 @@ def _providers(onnxruntime: Any, device: config.Device) -> list[str]:
 def _tensor(node: Any) -> Tensor:
     shape = tuple(n if isinstance(n, int) and n > 0 else None for n in node.shape)
     return Tensor(node.name, shape, str(node.type).removeprefix("tensor(").removesuffix(")"))
-
-
-def _split_inputs(path: Path, inputs: list[Tensor]) -> tuple[ImageInput, tuple[Tensor, ...]]:
-    images = [image for image in map(_as_image, inputs) if image is not None]
-    rest = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
-    if len(images) != 1 or len(rest) + 1 != len(inputs):
-        saw = "; ".join(map(str, inputs)) or "none"
-        raise DetectorError(
-            f"the model has inputs that an image does not feed: {saw}",
-            where=str(path),
-            hint=f"one image with 3 channels is fed, and {_MASK} and {_SIZES} where they are asked for; export the model so",
-        )
-    return images[0], rest
 
 
 def _as_image(tensor: Tensor) -> ImageInput | None:
@@ -165,7 +148,7 @@ def _as_image(tensor: Tensor) -> ImageInput | None:
 
 
 def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
-    """pixel_mask: all of the image counts. orig_target_sizes: boxes in pixels of the input, as from any other model."""
+    """Return a mask of the whole image, or the input size as original size, so that boxes are in pixels of the input."""
     kind = _KINDS[tensor.kind]
     if tensor.name == _SIZES:
         return np.tile(np.array([width, height], dtype=kind), (count, 1))

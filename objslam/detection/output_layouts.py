@@ -1,6 +1,4 @@
-"""Which layout a model's outputs have, told from their shapes on one image and from the model's metadata."""
-
-from __future__ import annotations
+"""Recognition of the layout of a model's outputs from their shapes for one image and from the model's metadata."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,25 +8,25 @@ from typing import get_args
 import numpy as np
 
 from objslam import config
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array
 from objslam.errors import ConfigError, DetectorError
 
-STRIDES = (8, 16, 32)  # of the three grids that most of the YOLOs predict on
-_FEW = 1000  # more boxes than a network gives once it has chosen among them; a grid gives thousands
+STRIDES = (8, 16, 32)  # The strides in px of the three grids on which most YOLO models predict.
+_FEW = 1000  # The maximum number of boxes of a network that selects its boxes. A grid has thousands of boxes.
 _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
     "ssd": (frozenset({"boxes", "labels", "scores"}), frozenset({"boxes", "labels"})),
     "detr": (frozenset({"boxes", "logits"}), frozenset({"predictions"})),
 }
-_ONE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
+_SINGLE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
 
 Roles = Mapping[Role, str]
-"""The name of the output that holds each role."""
+"""The output name of each role."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """One output of a run on one image: its name and values."""
+    """Hold the name and values of one output for one image."""
 
     name: str
     values: Array
@@ -39,7 +37,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Facts:
-    """What helps to tell layouts apart: the input's size in px, the number of class names (None if unknown), metadata."""
+    """Hold the facts that distinguish layouts: input size in px, number of class names (None if unknown), and metadata."""
 
     height: int
     width: int
@@ -47,51 +45,42 @@ class Facts:
     metadata: Mapping[str, str]
 
     @property
-    def cells(self) -> int:
-        """Cells of the three grids together."""
-        return sum(-(-self.height // stride) * -(-self.width // stride) for stride in STRIDES)
-
-    @property
     def ultralytics_detr(self) -> bool:
-        """Whether Ultralytics says that it is one of the DETR family: one output then, with each box's class scores, or,
-        since 8.4 (which names the `head` besides), its best score and class."""
+        """Return whether the metadata of Ultralytics describe a DETR model. Its single output has the class scores of each
+        box. Since version 8.4, with the metadata key `head`, the output has the best score and class of each box instead."""
         return "detr" in self.metadata.get("description", "").lower()
 
 
 def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
-    """The layout of the outputs and which of them has which role; what the settings say goes before what is told.
-
-    ConfigError where the settings name outputs that are not there, or roles that make no layout; DetectorError, with the
-    outputs and how to describe them, where no layout fits.
-    """
-    found: tuple[Layout, Roles] | None
-    if settings.outputs is not None:
-        named = _named(outputs, settings.outputs, model)
-        layout = settings.layout or _by_roles(named, facts)
-        found = (layout, settings.outputs) if layout is not None else None
-        if layout is not None and frozenset(named) not in _ROLES.get(layout, _ONE):
-            forms = " or ".join(", ".join(sorted(form)) for form in _ROLES.get(layout, _ONE))
-            message = f"detector.outputs names {', '.join(sorted(named))}, but the layout {layout} has {forms}"
+    """Return the layout and the output name of each role. The settings override the recognition. ConfigError if the settings
+    name a missing output or roles that form no layout. DetectorError with the outputs and a remedy if no layout fits."""
+    layout = settings.layout
+    roles: Roles | None = settings.outputs
+    if roles is not None:
+        named = _named(outputs, roles, model)
+        layout = layout or _by_roles(named, facts)
+        if layout is not None and frozenset(named) not in (forms := _ROLES.get(layout, _SINGLE)):
+            allowed = " or ".join(", ".join(sorted(form)) for form in forms)
+            message = f"detector.outputs names {', '.join(sorted(named))}, but the layout {layout} has {allowed}"
             raise ConfigError(message, where=str(model))
-    elif settings.layout is not None:
-        roles = _roles(settings.layout, outputs)
-        found = (settings.layout, roles) if roles is not None else None
+    elif layout is not None:
+        roles = _roles(layout, outputs)
     else:
-        found = _tell(outputs, facts)
-    if found:
-        return found
+        layout, roles = _tell(outputs, facts)
+    if layout is not None and roles is not None:
+        return layout, roles
     saw = "; ".join(map(str, outputs))
     what = "no layout that is known" if settings.layout is None else f"not the layout {settings.layout}"
     raise DetectorError(
         f"its outputs fit {what}: {saw}",
         where=str(model),
-        hint=f"describe them: detector.layout is one of {', '.join(get_args(Layout))}; detector.outputs says which is "
-        "which, such as {boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}",
+        hint=f"set detector.layout to one of {', '.join(get_args(Layout))}, and detector.outputs to "
+        "{boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}",
     )
 
 
 def rows_are_boxes(values: Array, classes: int | None) -> bool:
-    """Whether predictions (..., A, B) have a box a row, not a box a column as YOLOv8 has it."""
+    """Return whether a row of predictions (..., A, B) is a box. In YOLOv8 a column is a box."""
     rows, columns = values.shape[-2:]
     if classes is not None and (rows == 4 + classes) != (columns == 4 + classes):
         return bool(columns == 4 + classes)
@@ -99,7 +88,7 @@ def rows_are_boxes(values: Array, classes: int | None) -> bool:
 
 
 def count_classes(layout: Layout, named: Mapping[Role, Array], facts: Facts) -> int | None:
-    """How many classes the outputs have room for; None where they only give the numbers of classes."""
+    """Return the number of classes that the outputs have scores for, or None if they have class numbers only."""
     if layout in ("ssd", "end_to_end"):
         return None
     if "logits" in named:
@@ -110,22 +99,20 @@ def count_classes(layout: Layout, named: Mapping[Role, Array], facts: Facts) -> 
     return int(values.shape[-1]) - (4 if layout == "detr" else 5)
 
 
-def _tell(outputs: Sequence[Output], facts: Facts) -> tuple[Layout, Roles] | None:
+def _tell(outputs: Sequence[Output], facts: Facts) -> tuple[Layout | None, Roles | None]:
     ssd, detr, single = _ssd_roles(outputs), _detr_roles(outputs), _single(outputs)
     if ssd is not None:
         return "ssd", ssd
     if detr is not None and all(o.values.shape[-2] <= _FEW for o in outputs if o.name in detr.values()):
         return "detr", detr
-    layout = _tell_single(single, facts) if single is not None else None
-    return (layout, {"predictions": single.name}) if single is not None and layout is not None else None
+    return (None, None) if single is None else (_tell_single(single, facts), {"predictions": single.name})
 
 
 def _roles(layout: Layout, outputs: Sequence[Output]) -> Roles | None:
-    single = _single(outputs)
-    one: Roles | None = {"predictions": single.name} if single is not None else None
     if layout == "ssd":
         return _ssd_roles(outputs)
-    return _detr_roles(outputs) or one if layout == "detr" else one
+    single, detr = _single(outputs), _detr_roles(outputs) if layout == "detr" else None
+    return detr or (None if single is None else {"predictions": single.name})
 
 
 def _ssd_roles(outputs: Sequence[Output]) -> Roles | None:
@@ -157,7 +144,7 @@ def _detr_roles(outputs: Sequence[Output]) -> Roles | None:
 
 
 def _single(outputs: Sequence[Output]) -> Output | None:
-    """The one output with predictions; others may be there that have nothing for each box (masks, raw heads)."""
+    """Return the single output with predictions. Other outputs must have no row per box (masks, raw heads)."""
     lists = [o for o in outputs if o.values.dtype.kind == "f" and (_is_numbered(o) or _is_list(o))]
     if len(lists) != 1:
         return None
@@ -170,13 +157,14 @@ def _is_list(output: Output) -> bool:
 
 
 def _is_numbered(output: Output) -> bool:
-    return output.values.ndim == 2 and output.values.shape[-1] == 7  # the image's number comes first (YOLOv7, end to end)
+    return output.values.ndim == 2 and output.values.shape[-1] == 7  # a row of YOLOv7 begins with the image number
 
 
 def _tell_single(output: Output, facts: Facts) -> Layout | None:
     if _is_numbered(output):
         return "end_to_end"
-    (rows, columns), cells, classes = output.values.shape[-2:], facts.cells, facts.classes
+    (rows, columns), classes = output.values.shape[-2:], facts.classes
+    cells = sum(-(-facts.height // stride) * -(-facts.width // stride) for stride in STRIDES)
     few = rows <= _FEW and rows not in (cells, 3 * cells)
     if few and facts.ultralytics_detr:
         return "end_to_end" if columns == 6 and (classes != 2 or "head" in facts.metadata) else "detr"
@@ -187,21 +175,18 @@ def _tell_single(output: Output, facts: Facts) -> Layout | None:
     if rows == 3 * cells:
         return "yolov5"
     if rows == cells and (classes is None or columns != 4 + classes):
-        return _tell_yolox(output.values)
+        # Raw offsets of box centres are a few cells. Decoded centres in px are spread over the image.
+        if np.median(np.abs(output.values[..., :2])) < STRIDES[0]:
+            return "yolox"
+        # YOLOv6 has an objectness of 1 for every box.
+        return "yolov5" if (output.values[..., 4] == 1).all() else "yolox_decoded"
     if classes is not None and 4 + classes in (rows, columns):
         return "detr" if few and columns == 4 + classes else "yolov8"
     if classes is not None and columns == 5 + classes:
         return "yolov5"
-    if max(rows, columns) > _FEW:  # other grids: more strides, more anchors
+    if max(rows, columns) > _FEW:  # a grid with more strides or anchors
         return "yolov8" if columns > rows else "yolov5"
     return None
-
-
-def _tell_yolox(values: Array) -> Layout:
-    """Raw offsets stay within a few cells; decoded centres, in pixels, are spread over the image."""
-    if np.median(np.abs(values[..., :2])) < STRIDES[0]:
-        return "yolox"
-    return "yolov5" if (values[..., 4] == 1).all() else "yolox_decoded"  # YOLOv6 writes an objectness of 1 throughout
 
 
 def _by_roles(named: Mapping[Role, Output], facts: Facts) -> Layout | None:
@@ -211,12 +196,12 @@ def _by_roles(named: Mapping[Role, Output], facts: Facts) -> Layout | None:
 
 
 def _named(outputs: Sequence[Output], names: Roles, model: Path) -> dict[Role, Output]:
-    there = {output.name: output for output in outputs}
+    by_name = {output.name: output for output in outputs}
     for name in names.values():
-        if name not in there:
+        if name not in by_name:
             message = f"detector.outputs: the model has no output {name!r}"
             raise ConfigError(message, where=str(model), hint=f"it has {'; '.join(map(str, outputs))}")
-    return {role: there[name] for role, name in names.items()}
+    return {role: by_name[name] for role, name in names.items()}
 
 
 def _named_so(outputs: Sequence[Output], *words: str) -> list[Output]:

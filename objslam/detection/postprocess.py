@@ -1,26 +1,24 @@
-"""Outputs to boxes: one function a layout, each on one image, vectorised over its boxes."""
-
-from __future__ import annotations
+"""Decoding of the outputs of one image to boxes, with one function per layout."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.config import Layout, Role
+from objslam.config.detector import Layout, Role
 from objslam.core.arrays import Array, Floats, Ints
 from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # no box in fractions of the image reaches further out, and none in pixels that stays below matters
-_CANDIDATES = 1000  # The best boxes that go through non-maximum suppression, whose time grows with their square.
+_FRACTION = 1.5  # The largest absolute coordinate of boxes in fractions. Boxes in px below it are too small to matter.
+_CANDIDATES = 1000  # The maximum number of boxes in non-maximum suppression, whose time grows with the square of it.
 _Outputs = Mapping[Role, Array]
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Boxes (N, 4), scores (N,) and the number of each one's class, label (N,)."""
+    """Hold boxes (N, 4) with their scores (N,) and class numbers `label` (N,)."""
 
     boxes: Floats
     scores: Floats
@@ -28,17 +26,15 @@ class Candidates:
 
 
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
-    """The boxes of one image that count: x1, y1, x2, y2 in px of the network's input of width x height, the best first.
-
-    outputs: by role, without the batch's axis. label: place among the recipe's names, or the model's number without names.
-    DetectorError where scores are no probabilities or a class has no name.
-    """
+    """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
+    is an index into the names, or a class number without names. The outputs have no batch axis. DetectorError if a score is
+    no probability or a class has no name."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:
-        hint = "detector.activation: sigmoid or softmax makes them from what the network gives"
+        hint = "set detector.activation to sigmoid or softmax"
         raise DetectorError(f"scores of up to {scores.max():g} are no probabilities", hint=hint)
-    label = _places(recipe, found.label)
+    label = _name_indices(recipe, found.label)
     keep = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1) & (label >= 0)
     if recipe.taken is not None:
         keep &= np.isin(label, recipe.taken)
@@ -51,7 +47,7 @@ def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candid
 
 
 def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
-    """Indices of the boxes (N, 4) that stay, best first: none overlaps a better one of its label by more than `iou`."""
+    """Return the indices of the boxes (N, 4) left by non-maximum suppression per label above `iou`, best first."""
     import cv2
 
     if len(boxes) == 0:
@@ -70,7 +66,7 @@ def _ssd(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidat
 
 def _end_to_end(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     rows = outputs["predictions"]
-    if rows.shape[1] == 7:  # YOLOv7 writes the image's number, box, class, score
+    if rows.shape[1] == 7:  # a row of YOLOv7 is image number, box, class, score
         rows = rows[:, [1, 2, 3, 4, 6, 5]]
     scores = _probability(rows[:, 4], recipe)
     keep = np.flatnonzero(scores >= recipe.min_score)
@@ -89,14 +85,15 @@ def _yolov5(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candi
 
 def _yolox(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     rows, likely = _likely(recipe, outputs["predictions"])
-    cells, strides = _grid(width, height)
+    grids = [np.indices((-(-height // stride), -(-width // stride))).reshape(2, -1) for stride in STRIDES]
+    cells = np.concatenate(grids, axis=1)[::-1].T.astype(np.float64)  # (N, 2) corners of the cells, by grid, then by row
+    strides = np.repeat(STRIDES, [grid.shape[1] for grid in grids]).astype(np.float64)
     if len(strides) != len(outputs["predictions"]):
-        message = (
-            f"{len(outputs['predictions'])} predictions, but the grids of an input of {width}x{height} have {len(strides)}"
-        )
+        count = len(outputs["predictions"])
+        message = f"{count} predictions, but the grids of an input of {width}x{height} have {len(strides)}"
         raise DetectorError(message, hint="detector.layout yolox needs strides of 8, 16 and 32")
     cells, strides, raw = cells[likely], strides[likely, None], rows[:, :4].astype(np.float64)
-    with np.errstate(over="ignore"):  # an infinite box is dropped
+    with np.errstate(over="ignore"):  # decode drops infinite boxes
         boxes = np.concatenate([(raw[:, :2] + cells) * strides, np.exp(raw[:, 2:]) * strides], axis=1)
     return _best_class(recipe, boxes, rows[:, 5:], rows[:, 4])
 
@@ -120,13 +117,13 @@ _DECODERS: dict[Layout, Callable[[Recipe, _Outputs, int, int], Candidates]] = {
 
 
 def _likely(recipe: Recipe, rows: Array) -> tuple[Array, Ints]:
-    """The rows whose objectness, in column 4, alone is enough, and which they are: few, so that the rest costs little."""
+    """Return the few rows with sufficient objectness (column 4) and their indices, so that further work is small."""
     likely = np.flatnonzero(_probability(rows[:, 4], recipe) >= recipe.min_score)
     return rows[likely], likely
 
 
 def _best_class(recipe: Recipe, boxes: Array, values: Array, objectness: Array | None = None) -> Candidates:
-    """Each box with its best class where that is good enough; values (N, C), objectness (N,) multiplies them."""
+    """Return each box whose best class has a sufficient score, from class values (N, C) times objectness (N,)."""
     values = values[:, : recipe.channels]
     if recipe.activation == "softmax":
         weights = np.exp(values - values.max(axis=1, keepdims=True))
@@ -148,23 +145,14 @@ def _candidates(boxes: Array, scores: Array, label: Array) -> Candidates:
 def _probability(values: Array, recipe: Recipe) -> Array:
     if recipe.activation != "sigmoid":
         return values
-    return 0.5 * (1.0 + np.tanh(0.5 * values.astype(np.float64)))  # the logistic function, without overflow
-
-
-def _grid(width: int, height: int) -> tuple[Floats, Floats]:
-    """The corner (N, 2) and stride (N,) of every cell, grid after grid, row after row."""
-    corners, strides = [], []
-    for stride in STRIDES:
-        columns, rows = np.meshgrid(np.arange(-(-width // stride)), np.arange(-(-height // stride)))
-        corners.append(np.stack([columns.ravel(), rows.ravel()], axis=1))
-        strides.append(np.full(columns.size, stride))
-    return np.concatenate(corners).astype(np.float64), np.concatenate(strides).astype(np.float64)
+    return 0.5 * (1.0 + np.tanh(0.5 * values.astype(np.float64)))  # the logistic function without overflow
 
 
 def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
-    """Boxes (N, 4) in the recipe's form and units as x1, y1, x2, y2 in px of the network's input."""
+    """Convert boxes (N, 4) from the form and units of the recipe to x1, y1, x2, y2 in px of the input."""
     if recipe.box_form == "cxcywh":
-        boxes = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
+        centre, half = boxes[:, :2], boxes[:, 2:] / 2
+        boxes = np.concatenate([centre - half, centre + half], axis=1)
     elif recipe.box_form == "yxyx":
         boxes = boxes[:, [1, 0, 3, 2]]
     fractions = recipe.box_units == "fractions"
@@ -173,13 +161,11 @@ def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
     return boxes * np.array([width, height] * 2) if fractions else boxes
 
 
-def _places(recipe: Recipe, label: Ints) -> Ints:
-    """The place of each number among the names, -1 for the background before the first; the number itself without names."""
-    places = label - recipe.first_label
-    beyond = places >= len(recipe.names)
+def _name_indices(recipe: Recipe, label: Ints) -> Ints:
+    """Return the index of each class number in the names, -1 for the background. Without names return the numbers."""
+    indices = label - recipe.first_label
+    beyond = indices >= len(recipe.names)
     if recipe.names and beyond.any():
         message = f"the model gives class {label[beyond][0]}, but there are {len(recipe.names)} names"
-        raise DetectorError(
-            message, hint="detector.names in the model's order; detector.first_label, the first one's number"
-        )
-    return np.maximum(places, -1)
+        raise DetectorError(message, hint="set detector.names in the order of the model, or detector.first_label")
+    return np.maximum(indices, -1)

@@ -1,6 +1,4 @@
-"""Images in: fitted into the network's input, its colours and range of values; and the way back for the boxes."""
-
-from __future__ import annotations
+"""Conversion of images to the size, colours and value range of the network input, and of boxes back to the image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Array, Floats
-from objslam.detection.recipe import InputSize, Recipe
+from objslam.detection.recipe import Recipe
 from objslam.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an image of width x height px lies in the network's input: at left, top, resized to content_width x _height."""
+    """Hold the place (left, top, content_width, content_height) in the network input of an image of width x height px."""
 
     width: int
     height: int
@@ -26,35 +24,34 @@ class Fit:
     content_height: int
 
     def to_raw(self, boxes: Floats) -> Floats:
-        """Boxes (N, 4) x1, y1, x2, y2 from pixels of the input to pixels of the raw image, cut off at its edges."""
+        """Convert boxes (N, 4) x1, y1, x2, y2 from px of the input to px of the raw image, clipped at its edges."""
         scale = np.array([self.width / self.content_width, self.height / self.content_height] * 2)
         raw = (boxes - np.array([self.left, self.top] * 2)) * scale
         return np.clip(raw, 0.0, np.array([self.width, self.height] * 2, dtype=np.float64))
 
 
 def fit(recipe: Recipe, width: int, height: int) -> Fit:
-    """How an image of this size goes in; ConfigError where it cannot."""
+    """Compute the place of an image of this size in the input. ConfigError if the image does not fit."""
     size = recipe.size
     if recipe.resize == "none":
         if (width if size.free_width else size.width, height if size.free_height else size.height) != (width, height):
-            message = (
-                f"detector.resize is none, but the model takes {size.width}x{size.height} and images are {width}x{height}"
-            )
-            raise ConfigError(message, hint="letterbox, corner or stretch fits them")
+            message = f"detector.resize is none, but the model takes {size.width}x{size.height}, images are {width}x{height}"
+            raise ConfigError(message, hint="set letterbox, corner or stretch")
         return Fit(width, height, width, height, 0, 0, width, height)
     if recipe.resize == "stretch":
         return Fit(width, height, size.width, size.height, 0, 0, size.width, size.height)
     scale = min(size.width / width, size.height / height)
     content_width, content_height = max(round(width * scale), 1), max(round(height * scale), 1)
-    input_width, input_height = _shrunk(size, content_width, content_height)
-    left, top = 0, 0
-    if recipe.resize == "letterbox":
-        left, top = (input_width - content_width) // 2, (input_height - content_height) // 2
+    # A free axis shrinks to the content, in whole strides.
+    input_width = -(-content_width // size.stride) * size.stride if size.free_width else size.width
+    input_height = -(-content_height // size.stride) * size.stride if size.free_height else size.height
+    centred = recipe.resize == "letterbox"
+    left, top = ((input_width - content_width) // 2, (input_height - content_height) // 2) if centred else (0, 0)
     return Fit(width, height, input_width, input_height, left, top, content_width, content_height)
 
 
 def fill(recipe: Recipe, images: Sequence[Array], where: Fit, count: int) -> Array:
-    """The images (H, W, 3), uint8 BGR, of one size, as values (count, 3, H, W); those missing to `count` are grey."""
+    """Convert images (H, W, 3), uint8 BGR, of one size to values (count, 3, H, W). Missing images become grey."""
     import cv2
 
     gain = 1.0 / (recipe.divide_by * np.array(recipe.std))
@@ -69,19 +66,10 @@ def fill(recipe: Recipe, images: Sequence[Array], where: Fit, count: int) -> Arr
         if (where.content_width, where.content_height) != (where.width, where.height):
             content = cv2.resize(image, (where.content_width, where.content_height), interpolation=cv2.INTER_LINEAR)
         channels = cv2.split(content)
-        for plane, channel, factor, shift in zip(
-            planes, reversed(channels) if recipe.colour == "rgb" else channels, gain, offset, strict=True
-        ):
+        ordered = reversed(channels) if recipe.colour == "rgb" else channels
+        for plane, channel, factor, shift in zip(planes, ordered, gain, offset, strict=True):
             target = plane[rows, columns]
             np.multiply(channel, np.float32(factor), out=target)
             if shift:
                 target += np.float32(shift)
     return blob
-
-
-def _shrunk(size: InputSize, width: int, height: int) -> tuple[int, int]:
-    """The input, along its free axes only as much of it as holds the content, in whole strides."""
-    return (
-        -(-width // size.stride) * size.stride if size.free_width else size.width,
-        -(-height // size.stride) * size.stride if size.free_height else size.height,
-    )

@@ -1,37 +1,34 @@
-"""The recipe of a model: everything between an image and its boxes but the network itself."""
-
-from __future__ import annotations
+"""The recipe of a detector model, which defines how an image becomes network input and how outputs become boxes."""
 
 import json
 from dataclasses import asdict, dataclass
 
-from objslam.config import Activation, BoxForm, BoxUnits, Colour, Layout, Resize
+from objslam.config.detector import Activation, BoxForm, BoxUnits, Colour, Layout, Resize
 from objslam.detection.output_layouts import Roles
 
 Three = tuple[float, float, float]
-PLAIN: tuple[Three, Three] = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+NO_MEAN: Three = (0.0, 0.0, 0.0)
+UNIT_STD: Three = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Habits:
-    """What the models of a family have in common, unless the settings or the model say otherwise.
-
-    box_units None: the values must tell. normalise: mean and std of the channels, after the division.
-    """
+    """Hold the properties shared by the models of a layout. The settings and the model's own description override them."""
 
     resize: Resize
     colour: Colour
     divide_by: float
     box_form: BoxForm
-    box_units: BoxUnits | None
+    box_units: BoxUnits | None  # None infers the units from the values of the boxes.
     nms: bool
     activation: Activation = "none"
-    normalise: tuple[Three, Three] = PLAIN
+    mean: Three = NO_MEAN  # The mean of each channel after the division.
+    std: Three = UNIT_STD  # The standard deviation of each channel after the division.
 
 
 _YOLO = Habits("letterbox", "rgb", 255.0, "cxcywh", "pixels", nms=True)
 _YOLOX = Habits("corner", "bgr", 1.0, "cxcywh", "pixels", nms=True)
+_IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # Mean and std of the channels of ImageNet.
 HABITS: dict[Layout, Habits] = {
     "ssd": Habits("stretch", "rgb", 255.0, "xyxy", None, nms=False),
     "yolov8": _YOLO,
@@ -39,16 +36,14 @@ HABITS: dict[Layout, Habits] = {
     "end_to_end": Habits("letterbox", "rgb", 255.0, "xyxy", "pixels", nms=False),
     "yolox": _YOLOX,
     "yolox_decoded": _YOLOX,
-    "detr": Habits("stretch", "rgb", 255.0, "cxcywh", "fractions", False, "sigmoid", IMAGENET),
+    "detr": Habits("stretch", "rgb", 255.0, "cxcywh", "fractions", False, "sigmoid", *_IMAGENET),
 }
 
 
 @dataclass(frozen=True)
 class InputSize:
-    """The network's input, px; along a free axis (one that the model leaves open) the most of it.
-
-    stride: what a side of an input that shrinks to its image must be a multiple of.
-    """
+    """Hold the size of the network input in px, which is the maximum along an axis of free size. An input of free size
+    shrinks to its image, and each of its sides is then a multiple of `stride`."""
 
     width: int
     height: int
@@ -57,37 +52,23 @@ class InputSize:
     stride: int
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How images go in and boxes come out: the detector settings, with nothing left open.
-
-    names: of the classes, empty where nobody knows them. first_label: the number that the model gives to the first.
-    taken: the classes that count, by their place in names (by their number without names), None for all. channels: of class
-    scores. row_boxes: predictions have a box a row. box_units None: the values tell.
-    """
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Habits):
+    """Hold the detector settings of a model with every value determined."""
 
     layout: Layout
     outputs: Roles
     size: InputSize
-    resize: Resize
     pad: int
-    colour: Colour
-    divide_by: float
-    mean: Three
-    std: Three
-    names: tuple[str, ...]
-    first_label: int
-    taken: tuple[int, ...] | None
-    channels: int | None
-    row_boxes: bool
-    box_form: BoxForm
-    box_units: BoxUnits | None
-    activation: Activation
-    nms: bool
+    names: tuple[str, ...]  # The class names. The tuple is empty if the names are unknown.
+    first_label: int  # The class number that the model gives to the first name.
+    taken: tuple[int, ...] | None  # The indices into names (or class numbers) of the classes to keep. None keeps all.
+    channels: int | None  # The number of class scores per box.
+    row_boxes: bool  # True if a row of the predictions is a box, False if a column is a box.
     min_score: float
     iou: float
     max_boxes: int
 
     def as_text(self) -> str:
-        """All of it as text, the same for the same recipe."""
+        """Return the recipe as text. Equal recipes have equal texts."""
         return json.dumps(asdict(self), sort_keys=True)

@@ -1,4 +1,2 @@
-"""A result held against the truth: the two maps laid on each other, matched, and the errors as numbers and a table.
-
-Where results come from is `results`; pictures of them are in `output`.
-"""
+"""Align and match a result with the ground truth, and compute its errors as numbers and as a table. The folder `results`
+reads the results, and the folder `output` draws them."""

@@ -1,6 +1,4 @@
-"""Which object of the map is which object of the ground truth, and how the map lies on the truth."""
-
-from __future__ import annotations
+"""Matching of map objects with true objects, and alignment of the map with the ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,34 +12,34 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory, Truth, TruthObject
 
 Alignment = Literal["none", "se2", "sim2"]
-"""How a map is laid onto the truth: not at all; turned about z and moved; or turned, moved and scaled."""
+"""The alignment of a map with the truth: none, se2 (yaw and translation), or sim2 (yaw, translation and scale)."""
 
-_MAX_CORRESPONDENCES = 2000  # With more possible correspondences than this, their pairs are drawn at random.
-_DRAWN_PAIRS = 200_000  # How many pairs of correspondences are drawn then.
-_MAX_STARTS = 3000  # The largest number of starting transforms that are scored.
-_MAX_REFINED = 12  # How many of the best starts are refined: more find the right one more surely and take longer.
-_MAX_ROUNDS = 50  # The largest number of rounds of matching and aligning: a bound, should the matches never stay.
-_SCALES = (0.1, 10.0)  # The smallest and largest scale of a map, as a ratio to the truth, that sim2 looks for.
+_MAX_CORRESPONDENCES = 2000  # The number of correspondences above which their pairs are sampled.
+_DRAWN_PAIRS = 200_000  # The number of sampled pairs of correspondences.
+_MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
+_MAX_REFINED = 12  # The number of best initial transforms to refine. More are more reliable and take longer.
+_MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
+_SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 searches.
 
 
 @dataclass(frozen=True)
 class Transform:
-    """scale * rotation @ point + translation, as `objslam.core.geometry.align` gives it: pose (4, 4) and scale."""
+    """Hold the transform scale * rotation @ point + translation as a pose (4, 4) and a scale."""
 
     pose: Floats
     scale: float = 1.0
 
     def apply(self, points: Floats) -> Floats:
-        """Points (..., 3) moved."""
+        """Transform points (..., 3)."""
         return self.scale * points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
 IDENTITY = Transform(np.eye(4))
-"""The transform that leaves every point where it is."""
+"""The identity transform."""
 
 
 def correspondences(objects: Sequence[MapObject], truth: Sequence[TruthObject]) -> tuple[Floats, Floats, Bools]:
-    """Positions (N, 3) of map objects, positions (M, 3) of true objects, m, and which of them share a label (N, M)."""
+    """Return the positions in m of map objects (N, 3) and true objects (M, 3), and whether a pair shares a label (N, M)."""
     source = np.array([o.position for o in objects]).reshape(-1, 3)
     target = np.array([t.position for t in truth]).reshape(-1, 3)
     same = np.array([[o.label == t.label for t in truth] for o in objects], dtype=bool)
@@ -49,16 +47,16 @@ def correspondences(objects: Sequence[MapObject], truth: Sequence[TruthObject]) 
 
 
 def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> tuple[Ints, Ints]:
-    """One-to-one pairs between two sets of points, by the Hungarian method.
+    """Match two sets of points one-to-one by the Hungarian method.
 
-    The pairs are as many as possible; among equally many, they have the least sum of squared distances.
+    The number of pairs is maximal. Among the maximal matchings, the sum of squared distances is minimal.
 
     Args:
-        source, target: (N, 3) and (M, 3) m.
-        same: (N, M) which points may be paired.
-        radius: m, the largest distance of a pair.
+        source, target: points (N, 3) and (M, 3) in m.
+        same: (N, M), True if two points may be a pair.
+        radius: maximum distance of a pair in m.
     Returns:
-        The pairs' indices into source, increasing, and into target.
+        The indices of the pairs in source (increasing) and in target.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -66,7 +64,7 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     allowed = same & (squared <= radius**2)
-    # not allowed costs more than any number of pairs within the radius
+    # A forbidden pair costs more than all allowed pairs together.
     rows, columns = linear_sum_assignment(np.where(allowed, squared, 2 * radius**2 * (min(squared.shape) + 1)))
     kept = allowed[rows, columns]
     return rows[kept], columns[kept]
@@ -75,16 +73,16 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
 def align_objects(
     source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment, start: Transform | None = None
 ) -> Transform:
-    """The transform that lays map objects onto true ones: iterated closest points with one-to-one matches.
+    """Align map objects with true objects by iterative closest point (ICP) with one-to-one matches.
 
-    From each start, points are matched within the radius and aligned to their matches, until the matches stay. The best
-    transform has the least sum over the true objects of min(distance, radius)^2.
+    From each initial transform, points are matched within the radius and aligned with their matches, until the matches
+    converge. The best transform has the minimal sum of min(distance, radius)^2 over the true objects.
 
     Args:
-        source, target: (N, 3) map objects and (M, 3) true ones, m.
-        same: (N, M) which may be the same object.
-        start: where to start. Without it, every pair of map objects is put onto every pair of true objects that they may be
-            and that lies as far apart; of more than 3,000 of those pairs, 3,000 are drawn at random, always the same.
+        source, target: map objects (N, 3) and true objects (M, 3) in m.
+        same: (N, M), True if two objects may be the same.
+        start: initial transform. None aligns each pair of map objects with each possible pair of true objects of similar
+            distance. At most 3,000 of these alignments are sampled, with a fixed seed.
     """
     if kind == "none" or not same.any():
         return IDENTITY
@@ -116,9 +114,12 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Transforms that put one pair of correspondences onto each other, the most promising first."""
+    """Return initial transforms that each align one pair of correspondences, ordered by cost."""
     i, k = np.nonzero(same)
-    first, second = np.triu_indices(len(i), 1) if len(i) <= _MAX_CORRESPONDENCES else _random_pairs(len(i))
+    if len(i) <= _MAX_CORRESPONDENCES:
+        first, second = np.triu_indices(len(i), 1)
+    else:
+        first, second = np.random.default_rng(0).integers(len(i), size=(_DRAWN_PAIRS, 2)).T
     distinct = (i[first] != i[second]) & (k[first] != k[second])
     first, second = first[distinct], second[distinct]
     a, b = source[i[second], :2] - source[i[first], :2], target[k[second], :2] - target[k[first], :2]
@@ -131,7 +132,7 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
     chosen = np.flatnonzero(likely)
     if len(chosen) > _MAX_STARTS:
         chosen = np.sort(np.random.default_rng(0).choice(chosen, _MAX_STARTS, replace=False))
-    if len(chosen) == 0:  # there is one correspondence, or none agree: only the position can be aligned
+    if len(chosen) == 0:  # without a consistent pair, only positions are aligned
         return [Transform(*align(source[[i[c]]], target[[k[c]]], kind)) for c in range(min(len(i), _MAX_REFINED))]
     first, second, a, b = first[chosen], second[chosen], a[chosen], b[chosen]
     yaw = np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[:, 1], a[:, 0])
@@ -147,23 +148,15 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
 
 
 def _nearest_cost(transform: Transform, source: Floats, target: Floats, same: Bools, radius: float) -> float:
-    """Sum over the true objects of min(distance to the nearest it may be, radius)^2."""
+    """Return the sum over the true objects of min(distance to the nearest possible map object, radius)^2."""
     squared = ((transform.apply(source)[:, None] - target[None]) ** 2).sum(axis=2)
     return float(np.minimum(np.where(same, squared, np.inf).min(axis=0), radius**2).sum())
 
 
-def _random_pairs(count: int) -> tuple[Ints, Ints]:
-    pairs = np.random.default_rng(0).integers(count, size=(_DRAWN_PAIRS, 2))
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-    return pairs[:, 0], pairs[:, 1]
-
-
 def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
-    """The truth as it lies on the map, to be drawn there.
-
-    A map from odometry alone has a frame of its own. The truth is moved by an alignment in the plane where fewer than half
-    of what could match does so within the radius (m), and the alignment makes more of it match. Otherwise it stays.
-    """
+    """Return the truth in the frame of the map, for drawing. A map from odometry alone has its own frame. The truth is
+    aligned in the plane if fewer than half of the possible matches are within the radius (m) and the alignment increases
+    their number."""
     source, target, same = correspondences(objects.resolved(), truth.objects)
     matched = len(match_points(source, target, same, radius)[0])
     if 2 * matched >= min(len(source), len(target)):

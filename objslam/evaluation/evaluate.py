@@ -1,6 +1,4 @@
-"""How good a map is, and a path: compared with the ground truth."""
-
-from __future__ import annotations
+"""Evaluation of a map and a path against the ground truth."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,12 +18,12 @@ from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, 
 from objslam.results.read import load_map, load_trajectory, load_truth
 
 MAX_TRUTH_GAP = 1.0
-"""The longest gap between two true poses, s, that is interpolated; a pose in a longer one has no truth."""
+"""The longest interpolated gap between two true poses in s. A pose in a longer gap has no truth."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """A map object and the true object that it is; error (m) after the alignment, offset (3,) is map minus truth."""
+    """Hold a map object, its true object, and the offset (3,) map minus truth in m after the alignment."""
 
     object: MapObject
     truth: TruthObject
@@ -33,16 +31,14 @@ class Match:
 
     @property
     def error(self) -> float:
-        """Distance between the two, m."""
+        """Return the distance between map object and true object in m."""
         return float(np.linalg.norm(self.offset))
 
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """The map against the true objects: what was matched (one-to-one, same label, within the radius), missed and false.
-
-    An unresolved object claims no position. It is neither matched nor false, only counted.
-    """
+    """Hold the matched, missed and false objects. A match is one-to-one, has one label, and is within the radius. An
+    unresolved object has no reliable position. It is counted, but is neither matched nor false."""
 
     matches: tuple[Match, ...]
     missed: tuple[TruthObject, ...]
@@ -52,36 +48,33 @@ class ObjectScores:
 
     @property
     def errors(self) -> Floats:
-        """Position errors (matched,), m."""
+        """Return the position errors (matched,) in m."""
         return np.array([m.error for m in self.matches])
 
     @property
     def precision(self) -> float | None:
-        """Share of the mapped objects that are matched; None when none is mapped."""
+        """Return the share of the map objects that are matched, or None for an empty map."""
         return _share(len(self.matches), len(self.false))
 
     @property
     def recall(self) -> float | None:
-        """Share of the true objects that are matched."""
+        """Return the share of the true objects that are matched, or None without true objects."""
         return _share(len(self.matches), len(self.missed))
 
 
 @dataclass(frozen=True)
 class PathScores:
-    """The path against the true one, at the stamps of the path that the truth covers.
+    """Hold the absolute trajectory error (ATE; Sturm et al., IROS 2012) at the timestamps of the path with truth."""
 
-    The errors are those of the translation (absolute trajectory error; Sturm et al., IROS 2012).
-    """
-
-    errors: Floats  # (N,) m, after aligning the path by itself.
-    errors_with_map: Floats | None  # (N,) m, after the alignment of the objects; None without objects.
-    outside: int  # The number of stamps without truth.
-    transform: Transform  # The alignment of the path by itself.
+    errors: Floats  # The translation errors (N,) in m after the alignment of the path.
+    errors_with_map: Floats | None  # The translation errors (N,) in m after the alignment of the objects, if any.
+    outside: int  # The number of timestamps without truth.
+    transform: Transform  # The alignment of the path.
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The comparison of a result with the ground truth; each part is None where there was nothing to compare."""
+    """Hold the evaluation of a result. A part is None if there is nothing to compare."""
 
     objects: ObjectScores | None
     path: PathScores | None
@@ -89,10 +82,10 @@ class Evaluation:
     radius: float
     warnings: tuple[str, ...] = ()
     truth: str | None = None
-    """What it was compared with, where that is not the truth that the log brought: a path."""
+    """The path of the ground truth, or None if it is the truth of the log."""
 
     def to_dict(self) -> dict[str, Any]:
-        """What evaluation.json holds: counts, m and s; null where there is no value."""
+        """Return the content of evaluation.json in m and deg. A missing value is None."""
         return {
             "truth": self.truth,
             "align": self.align,
@@ -112,12 +105,12 @@ def evaluate(
     align: Alignment = "none",
     radius: float = 0.5,
 ) -> Evaluation:
-    """Compare a map, and the path where both are there, with the ground truth.
+    """Compare a map with the ground truth, and a path with the true path if both exist.
 
     Args:
-        trajectory: map_T_base.
-        align: how the map is laid onto the truth first; objects are aligned by their matches, the path by itself.
-        radius: m, the largest distance of a match; only objects of one label are matched.
+        trajectory: poses map_T_base.
+        align: kind of the alignment. Objects are aligned by their matches, and the path by its own poses.
+        radius: maximum distance of a match in m. Only objects of one label can match.
     Raises:
         LogError: there is no truth to compare with.
         ConfigError: the radius is not positive.
@@ -125,7 +118,8 @@ def evaluate(
     _check_radius(radius)
     pairs = None
     if trajectory is not None and truth is not None and truth.trajectory is not None:
-        pairs = _path_pairs(trajectory, truth.trajectory)
+        poses, known = interpolate(truth.trajectory.stamps, truth.trajectory.poses, trajectory.stamps, MAX_TRUTH_GAP)
+        pairs = trajectory.poses[known, :3, 3], poses[known, :3, 3]
     if truth is None or (not truth.objects and pairs is None):
         raise LogError("no ground truth", hint="give --truth FILE")
     on_path = IDENTITY if pairs is None else Transform(*align_points(*pairs, align))
@@ -141,22 +135,15 @@ def evaluate(
 
 
 def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
-    """Compare the result in the folder `out` with the truth in `truth` (as `load_truth` finds it), else with its log's.
-
-    Raises:
-        LogError: there is no truth; the message names where it was looked for.
-        OutputError: the result cannot be read.
-        ConfigError: the radius is not positive.
-    """
+    """Compare the result folder `out` with the truth in the path `truth` (see `load_truth`), or with the truth of its log.
+    LogError if there is no truth, OutputError if the result cannot be read, ConfigError if the radius is not positive."""
     _check_radius(radius)
     map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
     if known is None:
-        names = f"{GROUNDTRUTH}/{OBJECTS} or {GROUNDTRUTH}/{TRAJECTORY}"
         if truth is None:
-            message, hint = "the log of this result brought no ground truth", "give --truth FILE"
-        else:
-            message, hint = f"no ground truth here: looked for {names}", "give an objects file or a folder that holds one"
-        raise LogError(message, where=str(truth or out), hint=hint)
+            raise LogError("the log of this result has no ground truth", where=str(out), hint="give --truth FILE")
+        message = f"no ground truth here: looked for {GROUNDTRUTH}/{OBJECTS} or {GROUNDTRUTH}/{TRAJECTORY}"
+        raise LogError(message, where=str(truth), hint="give an objects file, or a folder with such a file")
     if not known.objects and known.trajectory is None:
         raise LogError("the ground truth is empty", where=str(truth or out), hint="give --truth FILE")
     evaluation = evaluate(map_, known, path, align=align, radius=radius)
@@ -164,7 +151,7 @@ def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = 
 
 
 def write_evaluation(evaluation: Evaluation, out: Path) -> None:
-    """Write evaluation.json into the result folder `out`; OutputError when the disk refuses."""
+    """Write evaluation.json into the result folder `out`. OutputError if the file cannot be written."""
     write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())
 
 
@@ -176,11 +163,11 @@ def _check_radius(radius: float) -> None:
 def _score_objects(
     map: ObjectMap, truth: tuple[TruthObject, ...], kind: Alignment, radius: float, on_path: Transform | None
 ) -> ObjectScores:
-    # sorted, so that the matches do not depend on the order in the files
+    # The order makes the matches independent of the order in the files.
     mapped = sorted(map.resolved(), key=lambda o: (o.label, o.id))
     true = sorted(truth, key=lambda o: (o.label, o.id))
     ours, theirs, same = correspondences(mapped, true)
-    # where a label repeats, the path, if there is one, says better than the objects how map and truth lie
+    # If a label repeats, the path gives a better initial alignment than the objects.
     repeat = bool((same.sum(axis=0) > 1).any() or (same.sum(axis=1) > 1).any())
     transform = align_objects(ours, theirs, same, radius, kind, start=on_path if repeat else None)
     moved = transform.apply(ours)
@@ -197,20 +184,16 @@ def _score_objects(
 def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
     warnings = []
     if objects is not None and kind != "none" and 0 < len(objects.matches) < 3:
-        warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only: their errors say little")
+        warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only, so their errors mean little")
     if objects is not None and kind == "none" and objects.false and 2 * len(objects.matches) < len(objects.missed):
-        warnings.append("hardly an object is where the truth has it: is the map in a frame of its own? then --align se2")
+        warnings.append("few objects match the truth: if the map has its own frame, use --align se2")
     if objects is not None and not 0.5 <= objects.transform.scale <= 2.0:
-        warnings.append(f"the map is scaled by {objects.transform.scale:.3g} to fit the truth: do they show the same place?")
+        warnings.append(
+            f"the map is scaled by {objects.transform.scale:.3g} to fit the truth: check that both show the same place"
+        )
     if path is not None and not len(path.errors):
-        warnings.append("no pose of the path has a truth at its stamp: do both use the same clock?")
+        warnings.append("no pose of the path has a truth at its timestamp: check that both use the same clock")
     return warnings
-
-
-def _path_pairs(path: Trajectory, truth: Trajectory) -> tuple[Floats, Floats]:
-    """Positions (N, 3), m, of the path and of the truth at the same stamps: those of the path that the truth covers."""
-    poses, known = interpolate(truth.stamps, truth.poses, path.stamps, MAX_TRUTH_GAP)
-    return path.poses[known, :3, 3], poses[known, :3, 3]
 
 
 def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
@@ -242,10 +225,9 @@ def _listing(scores: ObjectScores | None) -> dict[str, Any]:
         {"id": m.object.id, "truth_id": m.truth.id, "label": m.truth.label, "error": m.error, "offset": m.offset.tolist()}
         for m in scores.matches
     ]
-    missed = [{"truth_id": o.id, "label": o.label} for o in scores.missed]
     return {
         "objects": matches,
-        "missed_objects": missed,
+        "missed_objects": [{"truth_id": o.id, "label": o.label} for o in scores.missed],
         "false_objects": [{"id": o.id, "label": o.label} for o in scores.false],
     }
 
@@ -266,7 +248,5 @@ def _summary(prefix: str, errors: Floats | None) -> dict[str, float | None]:
 
 
 def _transform_dict(transform: Transform) -> dict[str, Any]:
-    """map to truth: scale * rotation @ point + translation."""
-    pose = transform.pose
-    yaw = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
-    return {"scale": transform.scale, "yaw_deg": yaw, "translation": pose[:3, 3].tolist()}
+    yaw = float(np.degrees(np.arctan2(transform.pose[1, 0], transform.pose[0, 0])))
+    return {"scale": transform.scale, "yaw_deg": yaw, "translation": transform.pose[:3, 3].tolist()}

@@ -1,4 +1,4 @@
-"""A comparison with the ground truth as tables for a terminal."""
+"""Tables of an evaluation for a terminal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OBJECT_ROWS = (
     ("position_median", "position median", " m"),
     ("position_max", "position max", " m"),
 )
-"""Rows about objects: the key in evaluation.json, what the table says, and the unit."""
+"""The rows about objects: key in evaluation.json, name in the table, and unit."""
 
 _PATH_ROWS = (
     ("ate", "ATE (RMSE)", " m"),
@@ -30,11 +30,11 @@ _PATH_ROWS = (
     ("path_poses", "poses compared", ""),
     ("path_poses_without_truth", "poses without truth", ""),
 )
-"""Rows about the path, likewise."""
+"""The rows about the path: key in evaluation.json, name in the table, and unit."""
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """The scores, every object with its error (the worst first), and the warnings."""
+    """Return the scores, the objects by decreasing error, and the warnings."""
     from rich.console import Group
     from rich.markup import escape
     from rich.table import Table

@@ -1,6 +1,4 @@
-"""From boxes to bearing rays: each box's centre, undistorted, as a direction from its keyframe's camera."""
-
-from __future__ import annotations
+"""Turn boxes into bearing rays: the undistorted centre of a box gives a direction from its keyframe's camera."""
 
 import numpy as np
 
@@ -11,15 +9,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
 MAX_OF_LABEL = 1000
-"""The most boxes of one label in a frame that are looked at, which bounds memory and time in a crowd."""
+"""The most boxes of one label in a frame that are used. A larger number takes more memory and time in a crowd."""
 
 
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
-    """One ray for each usable box of the keyframes, in their order.
+    """Return one ray for each usable box of the keyframes, in the order of the keyframes.
 
-    Dropped and counted are boxes below the score limit, with their centre outside the image, cut off by its edge (unless
-    the detections are `whole`), where the lens model has no inverse, or beyond the surest `MAX_OF_LABEL` of a label in a
-    frame.
+    The ledger counts the other boxes. A box is not usable if its score is too low, its centre is outside the image, or the
+    lens model has no inverse at its centre. A box that the image's edge cuts off is usable only if the detections are
+    `whole`. In each frame, only the `MAX_OF_LABEL` boxes of a label with the highest scores are used.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -61,23 +59,24 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 def box_rays(
     boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
 ) -> tuple[Ints, Floats, Floats]:
-    """Indices (n,) of the usable boxes (M, 4) px of a camera, their unit directions (n, 3) in its frame and sigmas (n,) rad.
+    """Return the indices (n,) of the usable boxes (M, 4) px of a camera, and the rays through their centres.
 
-    The other boxes are counted. whole: as in `types.Detections`.
+    A ray has a unit direction (n, 3) in the camera frame and a standard deviation (n,) rad. The ledger counts the other
+    boxes. `whole` is explained in `types.Detections`.
     """
     kept = _usable(boxes, scores, camera, settings, ledger, whole)
-    boxes = boxes if len(kept) == len(boxes) else boxes[kept]
+    boxes = boxes[kept]
     directions, valid = undistort(camera, (boxes[:, :2] + boxes[:, 2:]) / 2)
     if not valid.all():
         ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
         kept, boxes, directions = kept[valid], boxes[valid], directions[valid]
-    return kept, directions, _angle_sigma(camera, directions, _centre_sigma(boxes, settings))
+    return kept, directions, _angle_sigma(camera, directions, boxes, settings)
 
 
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
-    """Increasing indices of the boxes (M,) that are looked at: of each label in a frame the surest `MAX_OF_LABEL`.
+    """Return increasing indices of the boxes (M,) that are used: the `MAX_OF_LABEL` best of each label in a frame.
 
-    The other boxes are counted. Of boxes with the same score the first ones are surer.
+    A box is better if its score is higher. Among equal scores the first box is better. The ledger counts the other boxes.
     """
     count = len(frame)
     if count <= MAX_OF_LABEL:
@@ -104,25 +103,19 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
         border = np.maximum(of.border, of.border_share * (high - low))
         cut = (low <= border) | (high >= size - 1 - border)
         wrong["boxes cut off by the image's edge (rays.border)"] = cut.any(axis=1)
-    keep = ~np.logical_or.reduce(list(wrong.values()))
-    if not keep.all():
-        left = np.ones(len(boxes), dtype=bool)
-        for reason, bad in wrong.items():
-            ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}")
-            left &= ~bad
-    return np.flatnonzero(keep)
+    left = np.ones(len(boxes), dtype=bool)
+    for reason, bad in wrong.items():
+        ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}")
+        left &= ~bad
+    return np.flatnonzero(left)
 
 
-def _centre_sigma(boxes: Floats, settings: Settings) -> Floats:
-    """One standard deviation (M,), px, of the centres of boxes (M, 4)."""
+def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Settings) -> Floats:
+    """Return the standard deviations (n,), rad, of rays in unit directions (n, 3) through the centres of boxes (n, 4)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
-    return np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
-
-
-def _angle_sigma(camera: Camera, directions: Floats, pixel_sigma: Floats) -> Floats:
-    # At an angle `a` off the axis, a small angle moves a pinhole image by f / cos(a)^2 along the radius and by f / cos(a)
-    # across it. Their geometric mean gives one sigma a ray. A fisheye has f everywhere.
+    pixels = np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
+    # A small angle moves a pinhole image by f / cos(a)^2 along the radius and by f / cos(a) across it. Here a is the angle
+    # off the axis. The geometric mean of the two gives one sigma for the ray. A fisheye image moves by f everywhere.
     if camera.fisheye:
-        return pixel_sigma / camera.focal
-    cos = directions[:, 2]
-    return pixel_sigma / camera.focal * cos**1.5
+        return pixels / camera.focal
+    return pixels / camera.focal * directions[:, 2] ** 1.5

@@ -1,6 +1,4 @@
-"""Depths at boxes, read from depth images."""
-
-from __future__ import annotations
+"""Read the depths of boxes from depth images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,19 +15,19 @@ from objslam.errors import LogError
 from objslam.io.images import decode_depth
 from objslam.io.text import read_bytes
 
-_CENTRE_SHARE = (
-    0.5  # The share of a box's width and height whose depth counts: its edge shows what stands behind the object.
-)
-_MIN_VALID_SHARE = 0.1  # The least share of valid pixels there for a depth.
+_CENTRE_SHARE = 0.5
+"""The share of a box's width and height in which depth is read. A larger share includes background at the box's edge."""
+_MIN_VALID_SHARE = 0.1
+"""The least share of valid pixels for a depth to be read. A larger share leaves more boxes without a depth."""
 MAX_IMAGE_LAG = 0.02
-"""The greatest time (s) between the colour and the depth image of one frame: some cameras stamp the two apart."""
+"""The greatest time (s) between the colour and the depth image of one frame. Some cameras stamp the two images apart."""
 
 
 def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledger: Ledger) -> Detections:
-    """The detections with the depth (m, NaN where unknown) of each box, from the depth image nearest in time.
+    """Return the detections with the depth (m) of each box, from the depth image nearest in time.
 
-    The depth images must be registered to the camera's image. Images that cannot be decoded or have another size are
-    dropped and counted; so are boxes' frames without a depth image within 20 ms.
+    An unknown depth is NaN. The depth images must be registered to the camera's image. The ledger counts images
+    that cannot be used, and frames without a depth image within 20 ms.
     """
     depths = np.full(len(detections), np.nan)
     frames, start, count = np.unique(detections.frame, return_index=True, return_counts=True)
@@ -47,9 +45,10 @@ def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledg
 
 
 def box_depth(image: NDArray[Any], box: Floats) -> float:
-    """The median depth of the central half (in width and height) of a box (x1, y1, x2, y2) px, in the image's units.
+    """Return the median depth in the central half of a box (x1, y1, x2, y2) px, in the image's units.
 
-    NaN where fewer than a tenth of the pixels there are valid, finite and above zero.
+    The central half has half the width and half the height. Only finite depths above zero are valid. If fewer than a tenth
+    of the pixels are valid, the result is NaN.
     """
     height, width = image.shape
     middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) * _CENTRE_SHARE / 2
@@ -61,14 +60,17 @@ def box_depth(image: NDArray[Any], box: Floats) -> float:
 
 
 def nearest_stamps(stamps: Floats, query: Floats) -> NDArray[np.int64]:
-    """For each stamp asked for (Q,), the index of the one nearest to it of stamps (N,), increasing."""
+    """Return for each query stamp (Q,) the index of the nearest among increasing stamps (N,)."""
     after = np.clip(np.searchsorted(stamps, query), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(stamps[before] - query) <= np.abs(stamps[after] - query), before, after)
 
 
 def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
-    """A depth image (H, W) in its own units; None, counted, where it cannot be decoded or has not the camera's size."""
+    """Read a depth image (H, W) in its own units.
+
+    If it cannot be decoded or does not have the camera's size, the ledger counts it and the result is None.
+    """
     try:
         image = decode_depth(read_bytes(path))
     except LogError:

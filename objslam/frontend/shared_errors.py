@@ -3,10 +3,9 @@
 The parameters change what was measured, never the factors that a graph makes of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,8 +19,8 @@ from objslam.core.types import CameraLog, Images, Keyframes, Log, Rays, Trajecto
 from objslam.frontend.odometry_drift import gathered_drift
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
-"""The steps (in the parameter's unit) over which derivatives are taken. The clock's is long, because velocities are noisy and
-change in steps: over 0.1 s the clocks of the MRCLAM robots converge in half the rounds that 0.01 s takes."""
+"""The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are noisy
+and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01
 """The step of every other parameter, in its unit; the measurements are close to linear over it."""
 _MOST_SIGMAS = 6.0
@@ -75,10 +74,10 @@ class SharedErrors:
         odometry, localization = self._odometry(error), self.log.localization
         odom_T_base, gathered = keyframes.odom_T_base, keyframes.drift
         settings = _scaled_noise(self.settings, error)
-        map_T_base = _at_stamps(localization, stamps) if localization is not None else None
+        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, stamps)
         if odometry is not None:
             at = _at_stamps(odometry, stamps)
-            map_T_base = at if map_T_base is None else map_T_base
+            map_T_base = at if localization is None else map_T_base
             if odom_T_base is not None:
                 odom_T_base = inverse(odometry.poses[0]) @ at
                 if (
@@ -103,7 +102,7 @@ class SharedErrors:
         cameras = tuple(_corrected_camera(one, error) for one in self.log.cameras)
         return replace(self.log, odometry=self._odometry(error), cameras=cameras)
 
-    def take(self, keyframes: Keyframes, rays: Rays) -> SharedErrors:
+    def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""
         return replace(self, keyframes=keyframes, rays=rays)
 

@@ -1,4 +1,4 @@
-"""The factor graph, batch and incremental: variables, factors, optimisers, marginals. The only room that knows GTSAM.
+"""The factor graph, batch and incremental: variables, factors, optimisers and marginals, the only folder that knows GTSAM.
 
-What a log is, and the alternation of association and solve, are not here: that is in `mapping`.
+The alternation of association and solve is in `mapping`.
 """

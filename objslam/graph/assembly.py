@@ -1,9 +1,4 @@
-"""The graph of a log: the one place that says which factors its measurements become.
-
-Both initialisations, outlier rejection and the final solve take their factors from here.
-"""
-
-from __future__ import annotations
+"""Choose the factors for the measurements of a log, for the initialisations, outlier rejection and the final solve."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -26,7 +21,10 @@ from objslam.graph.factors.rays import ray_factors
 
 @dataclass(frozen=True)
 class Measurements:
-    """What a log measured. motion: (K-1, 4, 4), covariance: (K-1, 6, 6) the cameras' by odometry, None without it."""
+    """The measurements of a log.
+
+    motion (K-1, 4, 4) and covariance (K-1, 6, 6): camera motions by odometry, None without odometry.
+    """
 
     keyframes: Keyframes
     rays: Rays
@@ -36,14 +34,14 @@ class Measurements:
 
     @classmethod
     def of(cls, keyframes: Keyframes, rays: Rays, settings: Settings) -> Self:
-        """The measurements of some keyframes and their rays."""
+        """Collect the measurements of keyframes and their rays."""
         moved = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
         return cls(keyframes, rays, settings, *moved)
 
     def odometry(self) -> tuple[Floats, Floats]:
-        """Motions (K-1, 4, 4) and their covariances (K-1, 6, 6); ValueError without odometry."""
+        """Return the motions (K-1, 4, 4) and their covariances (K-1, 6, 6). ValueError without odometry."""
         if self.motion is None or self.covariance is None:
-            raise ValueError("motions need odometry")
+            raise ValueError("the log has no odometry, which motions need")
         return self.motion, self.covariance
 
     def factors(
@@ -56,14 +54,16 @@ class Measurements:
         begin: int = 0,
         end: int | None = None,
     ) -> list[gtsam.NonlinearFactor]:
-        """What a graph gains with keyframes begin to end, some rays and some landmarks; by default with all keyframes.
+        """Return the factors that a graph gets with the keyframes from begin to end and with some rays and landmarks.
+
+        Without `end`, all later keyframes count.
 
         Args:
-            owner: (R,) the landmark of each ray, -1 without.
-            which: (n,) the rays that come in; the first n factors are their bearings, in their order.
-            landmarks: (m,) those that come in.
-            positions: (N, 3) m in map, where landmarks are.
-            loss: that of the bearings.
+            owner: (R,) the landmark of each ray, or -1.
+            which: (n,) the added rays. The first n factors are their bearings, in the order of `which`.
+            landmarks: (m,) the added landmarks.
+            positions: (N, 3) m, the landmarks in map.
+            loss: the loss of the bearings.
         """
         keyframes, settings = self.keyframes, self.settings
         end = len(keyframes) if end is None else end
@@ -83,15 +83,16 @@ class Measurements:
 def fixed_pose_factors(
     rays: Rays, origins: Floats, directions: Floats, landmark: Ints, across: Floats, loss: Loss
 ) -> list[gtsam.NonlinearFactor]:
-    """The factors of rays at known poses: first each one's distance from its landmark, then the ranges, but not for `l1`.
+    """Return the factors of rays at fixed poses: the distance of each ray from its landmark, then the measured ranges.
+
+    The loss `l1` is Eq. 1, which has neither noise nor ranges.
 
     Args:
         origins, directions: (n, 3), (n, 3) of the rays in map.
-        landmark: (n,) that of each ray.
-        across: (n,) m, the rays' noise across at their landmarks; Eq. 1, which is the loss `l1`, knows none.
+        landmark: (n,) the landmark of each ray.
+        across: (n,) m, the noise of each ray across, at its landmark.
     """
-    made = point_to_line_fixed(
-        origins, directions, landmark, robust(loss, np.ones(len(rays)) if loss == "l1" else across, 2)
-    )
+    noise = robust(loss, np.ones(len(rays)) if loss == "l1" else across, 2)
     at = np.flatnonzero(np.isfinite(rays.range) & (loss != "l1"))
-    return made + along_ray(origins[at], directions[at], rays.range[at], rays.range_sigma[at], landmark[at])
+    along = along_ray(origins[at], directions[at], rays.range[at], rays.range_sigma[at], landmark[at])
+    return point_to_line_fixed(origins, directions, landmark, noise) + along

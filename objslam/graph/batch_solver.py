@@ -1,6 +1,4 @@
-"""The whole log in one factor graph: objects with fixed poses, or poses and objects together."""
-
-from __future__ import annotations
+"""Solve a whole log in one factor graph: objects at fixed poses, or poses and objects together."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,11 +34,11 @@ def solve_fixed(
     settings: Settings,
     trace: Trace | None = None,
 ) -> Estimate:
-    """The objects with the poses as they are, from the triangulation on: one point-to-line factor for each of its inliers.
+    """Solve the objects at fixed poses, starting from the triangulation, with one point-to-line factor for each inlier.
 
-    With the loss `l1` this is Eq. 1, and the covariance is the triangulation's, which also places the objects that need
-    their ranges for it. The other losses weigh each ray by its noise across at the object's distance, and take a measured
-    range as a factor along the ray. Objects that the triangulation left unresolved stay out.
+    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions of objects
+    that need their ranges. The other losses weigh each ray by its noise across at the object's distance, and add a
+    factor along the ray for a measured range. Objects that the triangulation did not resolve are left out.
     """
     loss = settings.fixed.loss
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
@@ -92,13 +90,14 @@ def solve_joint(
     errors: CalibratedMeasurements | None = None,
     theta: Floats | None = None,
 ) -> Estimate:
-    """Poses and objects together, from the localisation's poses, or from a graph that has grown along the odometry.
+    """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
-    start: camera poses (K, 4, 4) to begin from instead. errors: the errors that all measurements share, as a function of which
-    the same measurements are made anew; they are estimated, beginning at theta (P,), and widen the covariances.
-    After each solve, rays that miss their object by far more than its others do are rejected, or taken back, and objects
-    that the poses now carry, or place better, enter or move, until nothing changes. Where a stretch of the drive was
-    rejected as a whole, its poses may be wrong, not its rays: these are taken back once, and the better solution counts.
+    Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
+    return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes.
+    If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
+    solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
+    start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors,
+    which are then estimated from theta (P,) on, or from 0. Their covariance enters the covariance of the objects.
     """
 
     def remeasure(values: Floats) -> Measurements:
@@ -124,18 +123,15 @@ def solve_joint(
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        at = found.map_T_camera, found.positions, found.used
-        other = reject_outliers(measured, association, *at, back, attempt)
+        other = reject_outliers(measured, association, found.map_T_camera, found.positions, found.used, back, attempt)
         before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
         if after < before:
-            iterations = found.iterations + other.iterations
-            found = replace(other, cost_before=found.cost_before, iterations=iterations)
+            found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
-    calibration, sensitivity = None, None
+    calibrated = None
     if errors is not None and theta is not None:
         calibrated = calibrate(errors, remeasure, association, found, theta)
-        calibration, sensitivity = calibrated.calibration, calibrated.sensitivity
         measured, found = calibrated.measured, calibrated.found
         keyframes, rays = measured.keyframes, measured.rays
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
@@ -157,8 +153,9 @@ def solve_joint(
     wider = widening(residual, association.object[used], association.count)
     covariance *= wider[:, None, None]
     seen_sigma *= np.sqrt(wider)
-    if calibration is not None and sensitivity is not None:
-        covariance += sensitivity @ calibration.covariance @ np.swapaxes(sensitivity, 1, 2)
+    if calibrated is not None:
+        by_error = calibrated.sensitivity
+        covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
     return Estimate(
         map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
         positions=positions,
@@ -169,15 +166,13 @@ def solve_joint(
         cost_before=found.cost_before,
         cost_after=optimum.cost_after,
         iterations=found.iterations,
-        calibration=calibration,
+        calibration=None if calibrated is None else calibrated.calibration,
     )
 
 
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
-    """The rays with the noise of ranges widened so that all of an object's together say no more than their shared bias lets.
-
-    n ranges of noise s that share a bias b have a mean of variance b^2 + s^2 / n: that of n independent ones of s^2 + n b^2.
-    """
+    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
+    # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()
@@ -196,7 +191,7 @@ def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:
 
 
 def _witnesses(rays: Rays, association: Association, used: Bools) -> Ints:
-    """For each object (N,) the keyframe of the middle one of its used rays, 0 where it has none."""
+    """Return for each object (N,) the keyframe of its middle used ray, or 0 without one."""
     object_, keyframe = association.object[used], rays.keyframe[used]
     order = np.lexsort((keyframe, object_))
     number = np.bincount(object_, minlength=association.count)

@@ -1,4 +1,4 @@
-"""Every factor that is to be in a growing graph, by its kind and number."""
+"""Store every factor of a growing graph by its kind and number."""
 
 from __future__ import annotations
 
@@ -8,56 +8,50 @@ from typing import NamedTuple
 
 import gtsam
 
+from objslam.graph.optimizers import build_graph
+
 Factors = Sequence[gtsam.NonlinearFactor]
 
 
 class Stored(NamedTuple):
-    """The factors of one measurement, and the keys of the variables that they are about."""
+    """The factors of one measurement, and the keys of their variables."""
 
     keys: frozenset[int]
     factors: Factors
 
 
-def _no_factors() -> dict[str, dict[int, Stored]]:
-    return {kind: {} for kind in ("motion", "absolute", "landmark", "ray")}
-
-
 @dataclass
 class FactorStore:
-    """The factors by kind, then by number; kinds in the order in which a graph gets them.
+    """The factors by kind, then by number, in the order in which a graph gets the kinds.
 
-    A `motion` has the number of the keyframe that it leads to, an `absolute` pose that of its keyframe, the prior of a
-    `landmark` that of the landmark, a `ray` its own. Any other kind has numbers of its caller's choice.
+    The number of a `motion` is that of the keyframe at its end. The number of an `absolute` pose is that of its keyframe.
+    The number of a `landmark` prior is that of the landmark. A `ray` has its own number. The caller numbers other kinds.
     """
 
-    kinds: dict[str, dict[int, Stored]] = field(default_factory=_no_factors)
+    kinds: dict[str, dict[int, Stored]] = field(
+        default_factory=lambda: {kind: {} for kind in ("motion", "absolute", "landmark", "ray")}
+    )
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
-        """Store the factors of some measurements, in place of those that have their numbers."""
+        """Store one group of factors for each number. Factors that have the same number are replaced."""
         stored = self.kinds.setdefault(kind, {})
         for number, group in zip(numbers, groups, strict=True):
-            keys = [key for factor in group for key in factor.keys()]  # noqa: SIM118 (no dict)
-            stored[number] = Stored(frozenset(keys), group)
+            stored[number] = Stored(frozenset(key for factor in group for key in factor.keys()), group)  # noqa: SIM118 (no dict)
 
     def drop(self, kind: str, numbers: Iterable[int]) -> None:
-        """Forget measurements of a kind."""
+        """Remove measurements of a kind."""
         for number in numbers:
             self.kinds[kind].pop(number, None)
 
     def drop_variables(self, keys: frozenset[int]) -> None:
-        """Forget all measurements of some variables."""
+        """Remove every measurement of these variables."""
         for kind, stored in self.kinds.items():
             self.kinds[kind] = {number: one for number, one in stored.items() if one.keys.isdisjoint(keys)}
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All of them."""
-        graph = gtsam.NonlinearFactorGraph()
-        for stored in self.kinds.values():
-            for one in stored.values():
-                for factor in one.factors:
-                    graph.push_back(factor)
-        return graph
+        """Return a graph with all factors."""
+        return build_graph(*(one.factors for stored in self.kinds.values() for one in stored.values()))
 
     def copy(self) -> FactorStore:
-        """The same factors, in tables of their own."""
+        """Return a copy with tables of its own. The factors are shared."""
         return FactorStore({kind: dict(stored) for kind, stored in self.kinds.items()})

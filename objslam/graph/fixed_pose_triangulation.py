@@ -1,6 +1,4 @@
-"""Objects at camera poses that are taken as they are, with the noise that those bring."""
-
-from __future__ import annotations
+"""Triangulate objects at fixed camera poses, with the noise of these poses."""
 
 import numpy as np
 
@@ -13,7 +11,7 @@ from objslam.triangulation.triangulate import Triangulation, triangulate
 def triangulate_at(
     map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
 ) -> Triangulation:
-    """Every object by Eq. 1 at the camera poses (K, 4, 4); poses that are localised bring their own noise to the rays."""
+    """Triangulate every object by Eq. 1 at the camera poses (K, 4, 4). Localised poses add their noise to the rays."""
     sigma, place = pose_noise(rays, keyframes, settings)
     return _triangulate(map_T_camera, rays, association, settings, sigma, place)
 
@@ -21,9 +19,9 @@ def triangulate_at(
 def triangulate_landmarks(
     map_T_camera: Floats, rays: Rays, association: Association, fewest: int, settings: Settings
 ) -> tuple[Triangulation, Bools]:
-    """Triangulate every object from the camera poses (K, 4, 4), and tell which objects (N,) can enter a growing graph.
+    """Triangulate every object at the camera poses (K, 4, 4), and return which objects (N,) can enter a growing graph.
 
-    At least `fewest` rays must agree on such an object. In addition, its rays must have parallax, or one of them a range.
+    An object can enter if at least `fewest` rays agree on it. Its rays must also have parallax, or one of them a range.
     """
     found = _triangulate(map_T_camera, rays, association, settings, rays.sigma, 0.0)
     ranged = association.object[np.isfinite(rays.range) & (association.object >= 0)]
@@ -33,9 +31,9 @@ def triangulate_landmarks(
 
 
 def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
-    """The rays' angle noise (R,), rad, and that of their origins, m, with the localisation's own noise in it.
+    """Return the angle noise of the rays (R,), rad, and the noise of their origins, m, with the noise of the localisation.
 
-    Keyframes that share a measured pose share its error: their rays count as the one.
+    Keyframes that share a measured pose share its error, so their rays count as one ray.
     """
     share = keyframes.localized_every
     of = settings.localization

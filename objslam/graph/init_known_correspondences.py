@@ -1,10 +1,8 @@
-"""Initialisation where it is known which ray is of which object: the graph grows along the path.
+"""Initialise poses and landmarks with a known association, by growing the graph along the path.
 
-From dead reckoning alone a batch solve can diverge by kilometres. Here a few keyframes are added at a time at the poses
-that the solved ones predict, and an object enters when the rays seen so far, at the poses of that moment, carry a position.
+From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes enter a few at a time, at the poses that the
+solved ones predict. A landmark enters when its rays so far determine its position.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 
@@ -21,32 +19,28 @@ from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _ITERATIONS = 4
-"""The iterations of the solve after each step. Few are enough: each begins close to its optimum, and the next one goes
-on from there. More are slower."""
+"""The number of iterations of the solve after each step. A larger number is slower. Few are enough, because each solve
+starts close to its optimum and the next one continues from there."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
-"""The median angles (rad) by which landmarks are missed from the predicted poses: below the first the next step is twice as
-long, above the second a step is taken back and tried again shorter; larger takes longer steps. The MRCLAM robots converge
-to the same map with anything from 1 and 3 to 5 and 15 degrees, and with iSAM2 in place of full solves they do not (settings
-of it that took half the time lost robot 1 or 5)."""
+"""The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
+doubles. Above the second, a shorter step is tried again. Larger limits take longer steps. On MRCLAM, limits from 1 and 3 to
+5 and 15 degrees converge to the same map. iSAM2 in place of full solves does not: in half the time it lost robot 1 or 5."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""The angle (rad), and the factor on the median of its step, that a ray must both exceed to be left out while the graph
-grows; larger lets more false boxes in. Chosen well above what the odometry's drift explains in one step."""
+"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger values let more
+false boxes in. They were chosen well above the odometry's drift in one step."""
 _MORE_RAYS = 1
-"""The rays beyond association.min_rays that must agree on a landmark before it enters. With fewer, false boxes agree by
-chance too often; with more, landmarks enter later."""
+"""The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter
+later. With fewer, false boxes agree by chance too often."""
 _SHORTEST = 4
-"""What joint.grow_step is divided by for the shortest step; larger lets steps become shorter, and the growth slower."""
+"""The divisor of joint.grow_step that gives the shortest step. A larger divisor allows shorter steps and slower growth."""
 
 
 def initialize_known(
-    measured: Measurements,
-    association: Association,
-    progress: Callable[[int, int], None],
-    trace: Trace | None = None,
+    measured: Measurements, association: Association, progress: Callable[[int, int], None], trace: Trace | None = None
 ) -> tuple[Floats, Floats]:
-    """A start near the solution: camera poses (K, 4, 4) in map and landmark positions (N, 3), NaN where the rays gave none.
+    """Return camera poses (K, 4, 4) and landmark positions (N, 3) near the solution, in map. An unknown position is NaN.
 
-    The map is the odometry's frame: its first keyframe is held. progress(done, total) is called in keyframes.
+    The map frame is the odometry's frame, in which the first keyframe is fixed. progress(done, total) counts keyframes.
     """
     keyframes, rays, settings = measured.keyframes, measured.rays, measured.settings
     map_T_camera = keyframes.map_T_camera.copy()
@@ -58,7 +52,6 @@ def initialize_known(
     shortest = max(2, step // _SHORTEST)
     while begin < len(keyframes):
         end = min(begin + step, len(keyframes))
-        # the new keyframes follow the last solved one by odometry
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
@@ -67,23 +60,18 @@ def initialize_known(
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
         fresh = new[known[so_far[new]]]
         off = _off(rays, association, map_T_camera, positions, fresh)
-        born, places, agreeing = _new_landmarks(
-            rays, association, map_T_camera, np.flatnonzero((so_far >= 0) & ~known[so_far]), settings
-        )
+        waiting = np.flatnonzero((so_far >= 0) & ~known[so_far])
+        born, places, agreeing = _new_landmarks(rays, association, map_T_camera, waiting, settings)
         expected = positions.copy()
         expected[born] = places
-        surprise = (
-            np.median(np.concatenate([off, _off(rays, association, map_T_camera, expected, agreeing)]))
-            if len(off) + len(agreeing)
-            else _HOLDS
-        )
+        off_all = np.concatenate([off, _off(rays, association, map_T_camera, expected, agreeing)])
+        surprise = np.median(off_all) if len(off_all) else _HOLDS
         if surprise > _FAILS and step > shortest:
             step = max(step // 4, shortest)
             continue
         fresh = np.concatenate([fresh[off <= max(_GATE, _GATE_SHARE * np.median(off))], agreeing]) if len(off) else agreeing
         positions = expected
-        for factor in measured.factors(association.object, fresh, born, positions, begin=begin, end=end):
-            graph.push_back(factor)
+        graph.push_back(build_graph(measured.factors(association.object, fresh, born, positions, begin=begin, end=end)))
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         if len(landmarks):
             values = make_values(map_T_camera[:end], positions, landmarks)
@@ -107,7 +95,7 @@ def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: 
 def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
 ) -> tuple[Ints, Floats, Ints]:
-    """Landmarks (n,) that the waiting rays carry now, where (n, 3), and which of the rays agree on them."""
+    """Return the landmarks (n,) that the waiting rays determine now, their positions (n, 3), and the rays that agree."""
     if len(waiting) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), waiting
     landmarks, index = np.unique(association.object[waiting], return_inverse=True)

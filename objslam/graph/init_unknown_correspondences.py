@@ -1,12 +1,9 @@
-"""Initialisation where it is unknown which ray is of which object, and odometry alone says where the robot is.
+"""Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes are added a few at a time at the poses that the solved ones predict. Their
-rays are given to the landmarks known so far by predicted bearing, with the odometry's drift in the gate; what is left over
-in the last stretch of the drive, where poses still agree with each other, is searched for new landmarks. With the poses and
-landmarks that come of it a global association can begin.
+As in `init_known_correspondences`, keyframes enter a few at a time at predicted poses. Their rays are assigned to the known
+landmarks by predicted bearing, with a gate that contains the odometry's drift. The unassigned rays of the last stretch,
+whose poses still agree, give new landmarks. The result is the start of a global association.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,31 +27,32 @@ from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
 from objslam.graph.variables import make_values, read_points, read_poses
 
 _HORIZON = 0.1
-"""The drift in heading (rad, one standard deviation) since a landmark was last seen, up to which it is expected where it
-was; larger recognises landmarks after longer, and confuses neighbours."""
+"""The drift in heading (rad, one standard deviation) up to which a landmark is expected at its position. A larger drift
+recognises landmarks after a longer absence, and confuses neighbours."""
 _STRETCH = 150
-"""The most keyframes back among which new landmarks are searched for; larger is slower, and lets the odometry drift more."""
+"""The most recent keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The distance (m) that a measured range may always be off its landmark, besides its own noise; larger lets wrong ones
-pass."""
+"""The error (m) of a measured range that is allowed besides its noise. A larger value accepts more wrong ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
-"""What is left open of a step's pose once it is aligned with the landmarks: a share of its drift, and standard deviations
-(rad, m); larger widens the gate of every ray."""
+"""The uncertainty of a step's pose after its alignment with the landmarks: a share of its drift, and standard deviations
+(rad, m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
-"""The rays beyond association.min_rays that must agree on a new landmark: a wrong one pulls on every pose after it. With
-more, landmarks enter later."""
+"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
+A wrong landmark disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-"""The iterations of the solve after a step, which begins close to its optimum, and after a loop closed, which does not; more
-are slower."""
+"""The number of iterations of the solve after a step, and after a loop closure. More are slower. A loop closure needs more,
+because it starts farther from its optimum."""
 _STRAIN = 200.0
-"""The squared deviations by which a loop may raise the cost for each landmark that it joins; larger closes more wrong
-loops. On MRCLAM right ones took up to 110, wrong ones 240 and more."""
+"""The squared deviation per joined landmark by which a loop may raise the cost. A larger value closes more wrong loops. On
+MRCLAM correct loops took up to 110, and wrong ones 240 and more."""
 
 
 @dataclass(frozen=True)
 class InitialEstimate:
-    """Camera poses (K, 4, 4) in map, which is the odometry's frame: its first keyframe is held; which ray is of which
-    landmark, and where those are, (N, 3)."""
+    """A start for the global association: camera poses (K, 4, 4), the landmark of each ray, and landmark positions (N, 3).
+
+    The map frame is the odometry's frame, in which the first keyframe is fixed.
+    """
 
     map_T_camera: Floats
     association: Association
@@ -62,22 +60,19 @@ class InitialEstimate:
 
 
 def initialize_unknown(
-    keyframes: Keyframes,
-    rays: Rays,
-    cameras: tuple[Camera, ...],
-    settings: Settings,
-    progress: Callable[[int, int], None],
+    keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings, progress: Callable[[int, int], None]
 ) -> InitialEstimate:
-    """Poses and landmarks, a few keyframes at a time; progress(done, total) is called in keyframes."""
+    """Return initial poses and landmarks. progress(done, total) counts keyframes."""
     measured = Measurements.of(keyframes, rays, settings)
-    heading = _heading_drift(keyframes)
+    assert keyframes.drift is not None
+    heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])  # variance, rad^2
     map_T_camera = keyframes.map_T_camera.copy()
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
     owner = np.full(len(rays), -1, dtype=np.int64)
     known = Landmarks.none()
-    refused: set[tuple[tuple[int, ...], tuple[int, ...]] | None] = set()
-    nobody = np.zeros(0, dtype=np.int64)
-    graph = build_graph(measured.factors(owner, nobody, nobody, known.position, end=1))
+    refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
+    none = np.zeros(0, dtype=np.int64)
+    graph = build_graph(measured.factors(owner, none, none, known.position, end=1))
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
@@ -93,8 +88,7 @@ def initialize_unknown(
         fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known) - len(born))]) if len(born) else fresh
         known.last[owner[fresh]] = np.maximum(known.last[owner[fresh]], rays.keyframe[fresh])
 
-        for factor in measured.factors(owner, fresh, born, known.position, begin=begin, end=end):
-            graph.push_back(factor)
+        graph.push_back(build_graph(measured.factors(owner, fresh, born, known.position, begin=begin, end=end)))
         if len(known):
             values = _solve(graph, map_T_camera[:end], known, _ITERATIONS)
             map_T_camera[:end] = read_poses(values)
@@ -102,14 +96,13 @@ def initialize_unknown(
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
             active, now = _active(known, heading, end - 1), end - 1
             found = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, settings.association)
-            pairs = None if found is None else (tuple(found.now), tuple(found.before))
-            if found is not None and pairs not in refused:
+            if found is not None and (pairs := (tuple(found.now), tuple(found.before))) not in refused:
                 closed = _close(found, known, measured, owner, map_T_camera[:end], heading)
                 if closed is None:
                     refused.add(pairs)
                 else:
                     graph, known, owner, map_T_camera[:end] = closed
-                    refused.clear()  # the landmarks have other numbers now
+                    refused.clear()  # the numbers of the landmarks have changed
         progress(end, len(keyframes))
     return InitialEstimate(map_T_camera, Association(owner, known.label), known.position)
 
@@ -120,14 +113,9 @@ def _solve(graph: gtsam.NonlinearFactorGraph, map_T_camera: Floats, known: Landm
 
 
 def _close(
-    found: Closure,
-    known: Landmarks,
-    measured: Measurements,
-    owner: Ints,
-    map_T_camera: Floats,
-    heading: Floats,
+    found: Closure, known: Landmarks, measured: Measurements, owner: Ints, map_T_camera: Floats, heading: Floats
 ) -> tuple[gtsam.NonlinearFactorGraph, Landmarks, Ints, Floats] | None:
-    """The graph, landmarks, owners and poses with the loop closed, or None where it strains them."""
+    """Return the graph, landmarks, owners and poses after a loop closure, or None if the cost rises too much."""
     now, old, rays = found.now, found.before, measured.rays
     back = int(known.first[now].min())
     left = int(np.minimum(known.last[old], back).max())
@@ -140,7 +128,7 @@ def _close(
     first, last = known.first.copy(), known.last.copy()
     np.minimum.at(first, into, known.first)
     np.maximum.at(last, into, known.last)
-    # landmarks go along with the pose that saw them last
+    # A landmark moves with the pose that observed it last.
     carried = poses[known.last] @ inverse(map_T_camera[known.last])
     position = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position) + carried[:, :3, 3]
     merged = Landmarks(position[kept], known.covariance[kept], known.label[kept], first[kept], last[kept])
@@ -156,33 +144,21 @@ def _close(
     return graph, merged, owned, poses
 
 
-def _heading_drift(keyframes: Keyframes) -> Floats:
-    """(K,) rad^2, the variance of the heading that the odometry has gathered by each keyframe."""
-    assert keyframes.drift is not None
-    return np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
-
-
 def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Which landmarks (N,) were seen recently enough to be expected at their known positions.
-
-    "Recently" means that the drift in heading since then (rad, one standard deviation) is below _HORIZON.
-    """
+    """Return which landmarks (N,) have a drift in heading below `_HORIZON` since their last observation."""
     return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
 
 
 def _recognise(
     rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """The active landmark of each of the new rays (n,), or -1, and the poses (K, 4, 4) with which they fit.
-
-    Landmarks may stand closer together than the odometry's heading is known: ray by ray each would take its nearest. So the
-    step is first laid onto the landmarks as a whole.
-    """
+    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4) that are aligned with the landmarks."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)
     drift = _drifted(keyframes, begin - 1)
     centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
+    # The whole step is aligned first, because the heading may err by more than the angle between two landmarks.
     correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread)
     poses = map_T_camera.copy()
     poses[begin:end] = correction @ poses[begin:end]
@@ -196,21 +172,17 @@ def _recognise(
         some.sigma,
         pose_covariance=left,
     )
-    return np.where(_in_range(some, owner, known, poses), owner, -1), poses
+    origins, _ = some.in_map(poses)
+    distance = np.linalg.norm(known.position[owner] - origins, axis=1)
+    wrong = np.abs(some.range - distance) > 4 * some.range_sigma + _PLACE
+    return np.where(wrong, -1, owner), poses
 
 
 def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
-    """Standard deviations (3,) of x, y (m) and yaw (rad) in map, of a covariance (6, 6) in the camera's own frame."""
+    """Return the standard deviations of x, y (m) and yaw (rad) in map, from a covariance (6, 6) in the camera frame."""
     turn = map_T_camera[:3, :3]
     place, rotation = (np.diag(turn @ block @ turn.T) for block in (covariance[3:, 3:], covariance[:3, :3]))
     return np.sqrt(np.maximum([place[0], place[1], rotation[2]], 0.0))
-
-
-def _in_range(rays: Rays, owner: Ints, known: Landmarks, map_T_camera: Floats) -> Bools:
-    """Which rays (n,) do not contradict their landmark by the range that came with them."""
-    origins, _ = rays.in_map(map_T_camera)
-    distance = np.linalg.norm(known.position[owner] - origins, axis=1)
-    return ~(np.abs(rays.range - distance) > 4 * rays.range_sigma + _PLACE)
 
 
 def _discover(
@@ -224,16 +196,14 @@ def _discover(
     cameras: tuple[Camera, ...],
     settings: Settings,
 ) -> Ints:
-    """New landmarks among the rays of the last stretch, from begin to end, that have no owner; they become owners."""
+    """Find landmarks among the unassigned rays of keyframes begin to end. Add them to `known` and `owner`."""
     free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
-    none = np.zeros(0, dtype=np.int64)
-    fewest = settings.association.min_rays + _MORE_RAYS
+    none, fewest = np.zeros(0, dtype=np.int64), settings.association.min_rays + _MORE_RAYS
     if len(free) < fewest:
         return none
     some = rays.take(free)
-    found = associate_globally(
-        some, keyframes.take(np.arange(end)), cameras, settings, map_T_camera=map_T_camera[:end], sigma=some.sigma
-    )
+    frames, poses = keyframes.take(np.arange(end)), map_T_camera[:end]
+    found = associate_globally(some, frames, cameras, settings, map_T_camera=poses, sigma=some.sigma)
     if found.count == 0:
         return none
     placed, ready = triangulate_landmarks(map_T_camera, some, found, fewest, settings)
@@ -244,16 +214,16 @@ def _discover(
     known.position = np.concatenate([known.position, placed.positions[ready]])
     known.covariance = np.concatenate([known.covariance, placed.covariance[ready]])
     known.label = np.concatenate([known.label, found.label[ready]])
-    mine = owner[free] >= born[0] if len(born) else np.zeros(len(free), dtype=bool)
+    mine = free[owner[free] >= 0]
     seen_first = np.full(len(known.label), len(keyframes), dtype=np.int64)
-    np.minimum.at(seen_first, owner[free][mine], rays.keyframe[free][mine])
+    np.minimum.at(seen_first, owner[mine], rays.keyframe[mine])
     known.first = np.concatenate([known.first, seen_first[born]])
     known.last = np.concatenate([known.last, np.zeros(len(born), dtype=np.int64)])
     return born
 
 
 def _drifted(keyframes: Keyframes, since: int) -> Floats:
-    """Covariance (K, 6, 6) of the cameras that the odometry has gathered from keyframe `since` on, in their own frames."""
+    """Return the covariances (K, 6, 6) that the odometry accumulated after keyframe `since`, in the camera frames."""
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     assert odom_T_base is not None
     assert drift is not None
@@ -263,7 +233,7 @@ def _drifted(keyframes: Keyframes, since: int) -> Floats:
 
 
 def _covariances(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats) -> Floats:
-    """Covariances (N, 3, 3) of landmarks from the rays that they own, at these poses."""
+    """Return the covariances (N, 3, 3) of landmarks from their rays, at fixed poses."""
     held = np.flatnonzero(owner >= 0)
     origins, n = rays.take(held).in_map(map_T_camera)
     across = np.linalg.norm(position[owner[held]] - origins, axis=1) * rays.sigma[held]

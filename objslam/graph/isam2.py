@@ -1,10 +1,8 @@
-"""The estimate of a growing graph by iSAM2: updates, rebuilds, and what is read off it.
+"""Estimate a growing graph by iSAM2: updates, rebuilds, and access to the estimate.
 
-An update that throws is no lost map: the graph is rebuilt from the stored factors, by Levenberg-Marquardt from the last good
-estimate, which damps what nothing holds yet.
+If an update throws, Levenberg-Marquardt solves the stored factors from the last good estimate, and iSAM2 is rebuilt there.
+The damping covers variables that nothing holds yet.
 """
-
-from __future__ import annotations
 
 import gtsam
 import numpy as np
@@ -12,30 +10,29 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.errors import SolveError
-from objslam.graph.elimination_ordering import elimination_groups
 from objslam.graph.factor_store import FactorStore
 from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.graph.factors.priors import point_prior, pose_prior
 from objslam.graph.growing_graph import GrowingGraph
 from objslam.graph.isam2_rebuild import IncrementalRebuild, new_isam
 from objslam.graph.marginals import HELD, in_camera
-from objslam.graph.optimizers import indeterminate, levenberg_marquardt
+from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marquardt
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 400
-"""The most keyframes of a graph that is rebuilt at once; larger lets a frame wait longer for it, smaller takes more frames
-until a rebuild is done."""
+"""The most keyframes of a graph that is rebuilt in one call. A larger number delays a frame for longer. A smaller number
+spreads a rebuild over more frames."""
 _SLICE = 100
-"""The keyframes of one slice of a rebuild; larger is done sooner, and lets a frame wait longer."""
+"""The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays a frame for longer."""
 _FRESH = 10
-"""The updates after which a landmark that none of them was about has sunk in iSAM2's tree; larger lays the tree out less
-often, and finds landmarks that come back deeper in it."""
+"""The number of updates without a landmark after which the landmark counts as deep in iSAM2's tree. A larger number changes
+the layout of the tree less often, and finds returning landmarks deeper in the tree."""
 
 
 class IncrementalGraph(GrowingGraph):
-    """A growing graph and its estimate; `update` works in what was added.
+    """A growing graph and its estimate.
 
-    rebuilds: how often an update threw and the graph was rebuilt.
+    rebuilds: how many times an update threw, and the graph was rebuilt.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -45,32 +42,32 @@ class IncrementalGraph(GrowingGraph):
         self.rebuilds = 0
 
     def update(self) -> None:
-        """Work in what was added."""
+        """Add the new variables and factors to the estimate."""
         self._updates += 1
         self._work_in()
 
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
-        """Work in what was added, and lay the tree out for a keyframe that may show landmarks coming (n,), where it is not.
+        """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
-        The cliques between an observed variable and the root are eliminated again, so what may be observed goes near to the
-        root. relinearise: look for variables that moved, too.
+        An update eliminates the cliques between an observed variable and the root again. So variables that may be observed
+        move near the root, unless they are there. relinearise: also linearise again the variables that moved.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():
             self._work_in(relinearise, self._layout(coming))
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
-            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # the others may have sunk
+            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # the others may be deep now
         if self._newest in self._at.poses:
-            self.pose(self._newest)  # solves for what the updates left unsolved
+            self.pose(self._newest)  # makes iSAM2 solve now
 
     def pose(self, k: int) -> Floats:
-        """map_T_camera (4, 4) of X(k) as of now."""
+        """Return the current map_T_camera (4, 4) of X(k)."""
         if self._stale and not self._values.exists(X0 + k):
             self._at.poses[k] = self._isam.calculateEstimatePose3(X0 + k).matrix()
         return self._at.poses[k]
 
     def points(self, landmarks: Ints) -> Floats:
-        """(n, 3) the places of landmarks as of now."""
+        """Return the current positions (n, 3) of landmarks."""
         points, ids = self._at.points, landmarks.tolist()
         if self._stale:
             points.update((j, self._isam.calculateEstimatePoint3(L0 + j)) for j in ids if not self._values.exists(L0 + j))
@@ -83,73 +80,68 @@ class IncrementalGraph(GrowingGraph):
             self._stale = False
 
     def poses(self, keyframes: Ints) -> Floats:
-        """(n, 4, 4) the poses of keyframes as of the last `refresh`."""
+        """Return the poses (n, 4, 4) of keyframes at the last `refresh`."""
         return np.array([self._at.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4)
 
     def variable(self, key: int) -> gtsam.Pose3 | Floats:
-        """What `add_variable` added, as of the last `refresh`."""
+        """Return a variable from `add_variable` at the last `refresh`."""
         return self._at.others[key]
 
     def pose_covariance(self, k: int) -> Floats:
-        """Covariance (6, 6) of X(k), rotation first, in the camera's frame; NaN where the graph does not tell."""
+        """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. It is NaN if the graph lacks it."""
         return self._covariance(X0 + k, 6)
 
     def point_covariance(self, j: int) -> Floats:
-        """Covariance (3, 3) of L(j), m^2; NaN where the graph does not tell."""
+        """Return the covariance (3, 3) of L(j), m^2. It is NaN if the graph lacks it."""
         return self._covariance(L0 + j, 3)
 
     def seen_covariance(self, j: int, k: int) -> Floats:
-        """Covariance (3, 3) of L(j) in the frame of X(k), m^2, as `marginals.seen_covariances` has it; NaN likewise.
+        """Return the covariance (3, 3), m^2, of L(j) in the frame of X(k), as in `marginals.seen_covariances`.
 
-        That takes about a millisecond for a keyframe near to the root, as the newest are, and a hundred for another.
+        It is NaN if the graph lacks it. It takes about 1 ms for a keyframe near the root, such as the newest, and about
+        100 ms for other keyframes.
         """
         try:
             joint = self._isam.jointMarginalCovariance([X0 + k, L0 + j])
-        except (RuntimeError, IndexError):  # indeterminate, or not worked in yet
+        except (RuntimeError, IndexError):  # indeterminate, or not in the graph yet
             return np.full((3, 3), np.nan)
         return in_camera(joint, k, j, self.pose(k), self.points(np.array([j]))[0])
 
     def save(self) -> tuple[FactorStore, Variables]:
-        """What `restore` goes back to."""
+        """Return a copy of the factors and variables for `restore`."""
         self.refresh()
         return self._store.copy(), self._at.copy()
 
     def restore(self, saved: tuple[FactorStore, Variables]) -> None:
-        """The graph as it was when it was saved."""
+        """Return to the state of a `save`."""
         self._store, self._at = saved
         self._newest, self._touched = max(self._at.poses, default=-1), {}
         self._stale = False
         self._fill(self._store.graph())
-        self._clear()
 
     def solve(self, iterations: int, tolerance: float = 1e-5) -> None:
-        """All variables by Levenberg-Marquardt from where they are, and iSAM2 rebuilt from there.
+        """Optimise all variables by Levenberg-Marquardt from the current estimate, and rebuild iSAM2 there.
 
-        Args:
-            iterations: the most steps.
-            tolerance: the share of the cost below which a step gains no more.
-        Raises:
-            SolveError: the cost runs away, or nothing holds some variable; nothing has changed then.
+        It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is
+        not finite, or if nothing holds some variable. After a SolveError the graph is unchanged.
         """
         self.refresh()
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
         self.rebuild()
 
     def rebuild(self) -> None:
-        """iSAM2 rebuilt from the stored factors, linearised where the estimate is now."""
+        """Rebuild iSAM2 from the stored factors, linearised at the current estimate."""
         self.refresh()
         try:
             self._fill(self._store.graph())
         except RuntimeError:
-            self.rebuilds += 1
             self._rescue()
-        self._clear()
 
     def rebuild_in_slices(self, order: Ints) -> None:
-        """As `rebuild`, in slices, one for each call of `continue_rebuild`; the old graph goes on until all are done.
+        """Start a rebuild that runs one slice per call of `continue_rebuild`. Until its end the old graph stays in use.
 
-        order: all keyframes (K,), each after the one that its motion comes from. Asked for once more before it is done, it
-        is done at once: changes that come so often must not keep it from ever being done.
+        A second call before the end rebuilds at once, because frequent changes must not postpone the end for ever.
+        order: (K,) all keyframes. The keyframe at the start of a motion comes before the one at its end.
         """
         if self._unfinished or len(order) <= _AT_ONCE:
             self.rebuild()
@@ -161,11 +153,11 @@ class IncrementalGraph(GrowingGraph):
 
     @property
     def is_rebuilding(self) -> bool:
-        """Whether `rebuild_in_slices` is not done yet."""
+        """Whether a rebuild in slices has begun and not ended."""
         return self._unfinished
 
     def continue_rebuild(self) -> None:
-        """Go on with what `rebuild_in_slices` began, if it did."""
+        """Run the next slice of the rebuild, if there is one."""
         if self._rebuild is None:
             return
         try:
@@ -174,10 +166,10 @@ class IncrementalGraph(GrowingGraph):
                 return
             self.refresh()
             self._rebuild.finish(self._at)
-        except RuntimeError:  # all at once, which knows what to do then
+        except RuntimeError:  # a full rebuild can handle this
             self.rebuild()
             return
-        self._clear()  # what was not worked in yet is in the new one, too
+        self._clear()  # the new iSAM2 has these factors and variables too
         self._isam, self._stale = self._rebuild.isam, True
         self._rebuild, self._unfinished = None, False
 
@@ -188,20 +180,29 @@ class IncrementalGraph(GrowingGraph):
                 self._fill(self._store.graph())
             else:
                 self._update(relinearise, layout or {})
-        except (RuntimeError, ValueError):  # indeterminate, or no such layout: counted, and goes on from the stored factors
-            self.rebuilds += 1
+        except (RuntimeError, ValueError):  # indeterminate, or an impossible layout
             self._rescue()
-        self._clear()
-        self._stale = True
 
     def _layout(self, coming: Ints) -> dict[int, int]:
-        """`elimination_groups` as of now."""
+        """Return the group of each key to eliminate late. A higher group is eliminated later.
+
+        The newest keyframe X(k) and the landmarks that it observes make the root. The coming landmarks make the clique below
+        the root. GTSAM merges a clique into its parent if it involves all variables of the parent. The cliques below these
+        two are dense, so each of the two gets a pose that no clique below it involves. The root has X(k), which motions tie
+        to X(k-1) only. The clique of the coming landmarks has X(k-1), which motions tie to X(k-2).
+        """
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
             chain.append(before)
-        shown = (j for j, number in self._touched.items() if number == self._updates)
+        groups = {X0 + k: 1 for k in chain}
+        groups.update((L0 + j, 2) for j in coming.tolist())
+        groups.update((L0 + j, 3) for j, number in self._touched.items() if number == self._updates)
+        groups.update((X0 + k, 3) for k in chain[:2])
         isam, new = self._isam, self._values
-        return elimination_groups(chain, coming.tolist(), shown, lambda key: isam.valueExists(key) or new.exists(key))
+        groups = {key: group for key, group in groups.items() if isam.valueExists(key) or new.exists(key)}
+        number = {group: i for i, group in enumerate(sorted(set(groups.values())), start=1)}
+        # CCOLAMD needs consecutive groups, with 0 for all other variables, and fewer groups than variables.
+        return {key: number[group] for key, group in groups.items()} if len(number) < len(groups) else {}
 
     def _update(self, relinearise: bool, layout: dict[int, int]) -> None:
         last, reordered = gtsam.KeyGroupMap(), gtsam.KeyList()
@@ -210,6 +211,8 @@ class IncrementalGraph(GrowingGraph):
             if self._isam.valueExists(key):
                 reordered.push_back(key)
         self._isam.update(self._new, self._values, [], last if layout else None, None, reordered, relinearise)
+        self._clear()
+        self._stale = True
 
     def _clear(self) -> None:
         self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -217,20 +220,20 @@ class IncrementalGraph(GrowingGraph):
     def _fill(self, graph: gtsam.NonlinearFactorGraph) -> None:
         isam = new_isam(self._at.others)
         isam.update(graph, self._at.values())
-        isam.calculateEstimate()  # throws now, if it does
-        self._isam = isam
-        self._stale = True
+        isam.calculateEstimate()  # throws here if the graph is indeterminate
+        self._isam, self._stale = isam, True
         self._rebuild, self._unfinished, self._outgrown = None, False, False
+        self._clear()
 
     def _rescue(self) -> None:
-        """iSAM2 rebuilt after it threw, with priors on landmarks and poses that nothing holds, as strong as it takes."""
+        """Rebuild iSAM2 after an exception. Add priors on landmarks, then on poses, until the graph is determined."""
+        self.rebuilds += 1
         self._stale = False
         loose = [point_prior(j, point, HELD) for j, point in self._at.points.items()]
         afloat = [pose_prior(k, pose, UNKNOWN_TURN, UNKNOWN_WAY) for k, pose in self._at.poses.items()]
         for held in ([], loose, loose + afloat):
             graph = self._store.graph()
-            for factor in held:
-                graph.push_back(factor)
+            graph.push_back(build_graph(held))
             try:
                 self._at.read(levenberg_marquardt(graph, self._at.values(), 10, 1e-4).values)
                 self._fill(graph)

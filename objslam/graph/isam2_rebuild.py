@@ -1,6 +1,4 @@
-"""Rebuilds a large iSAM2 graph in slices, while the old one goes on: no frame has to wait until all of it is done."""
-
-from __future__ import annotations
+"""Rebuild a large iSAM2 graph in slices, while the old graph stays in use, so that no frame waits for the whole rebuild."""
 
 from collections.abc import Mapping
 
@@ -12,14 +10,15 @@ from objslam.graph.factor_store import FactorStore, Stored
 from objslam.graph.variables import LETTER, X0, Variables
 
 _RELINEARISE = (0.02, 0.05)
-"""How far (rad, m) a variable moves before its factors are linearised again. Chosen below what bends a bearing noticeably;
-larger is faster, and less exact."""
+"""The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact.
+They were chosen below a change that affects a bearing noticeably."""
 _NEVER = 1_000_000
-"""The updates between two looks for variables that moved, where nobody asks for one: the caller knows when there is time."""
+"""The number of updates between two automatic relinearisations. It is so large that only the caller asks for one, when it
+has time. A smaller number would relinearise without a request."""
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
-    """An iSAM2 with nothing in it, for poses X, points L and the letters of other variables (by key)."""
+    """Return an empty iSAM2 for poses X, points L, and the letters of other variables (by key)."""
     parameters = gtsam.ISAM2Params()
     turn, way = _RELINEARISE
     limits = {"x": np.array([turn] * 3 + [way] * 3), "l": np.full(3, way)}
@@ -36,18 +35,18 @@ def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
 
 
 class IncrementalRebuild:
-    """Works in the factors that were stored when it began, keyframe by keyframe; what came since is worked in last.
+    """A new iSAM2 that gets the stored factors keyframe by keyframe, and the later additions at the end.
 
-    order: keyframes, each after the one that its motion comes from. variables: where all are linearised. isam: what has been
-    built so far.
+    order: keyframes. The keyframe at the start of a motion comes before the one at its end. variables: the linearisation
+    points. isam: the graph so far. new, later: keys of variables and factors that were added after the start.
     """
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:
         self.isam = new_isam(variables.others)
         self._variables, self._order = variables, order
-        self._at: list[list[Stored]] = [[] for _ in order]  # by the last of its keyframes
-        self._alone: dict[int, list[Stored]] = {}  # by the one variable that it is about, no keyframe
-        self._last: list[Stored] = []  # about several variables, none of them a keyframe
+        self._at: list[list[Stored]] = [[] for _ in order]  # by their last keyframe in the order
+        self._alone: dict[int, list[Stored]] = {}  # on one variable, no keyframe
+        self._last: list[Stored] = []  # on several variables, no keyframe
         place = {X0 + k: i for i, k in enumerate(order)}
         for stored in store.kinds.values():
             for one in stored.values():
@@ -60,24 +59,16 @@ class IncrementalRebuild:
                     self._last.append(one)
         self._done = 0
         self._there: set[int] = set()
-        self._later: list[gtsam.NonlinearFactor] = []
-        self._new: list[int] = []
+        self.later = gtsam.NonlinearFactorGraph()
+        self.new: list[int] = []
 
     @property
     def last(self) -> bool:
-        """Whether only what came since is left: `finish` takes it."""
+        """Whether the next step is `finish`."""
         return self._done >= len(self._order)
 
-    def add_variable(self, key: int) -> None:
-        """A variable that came since."""
-        self._new.append(key)
-
-    def add_factor(self, factor: gtsam.NonlinearFactor) -> None:
-        """A factor that came since."""
-        self._later.append(factor)
-
     def step(self, keyframes: int) -> None:
-        """Work in a number of keyframes; RuntimeError where nothing holds them."""
+        """Add the next keyframes, by number. RuntimeError if their graph is indeterminate."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         begin, self._done = self._done, self._done + keyframes
         for k, here in zip(self._order[begin : self._done], self._at[begin : self._done], strict=True):
@@ -87,27 +78,25 @@ class IncrementalRebuild:
         self.isam.update(graph, values)
 
     def finish(self, variables: Variables) -> None:
-        """The last step: what came since, where the variables are now; RuntimeError where nothing holds it."""
+        """Add the later variables and factors, linearised at `variables`. RuntimeError if the graph is indeterminate."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key in self._alone:
             self._bring(key, graph, values)
         for one in self._last:
             self._push(one, graph, values)
-        variables.insert(self._new, values)
-        for factor in self._later:
-            graph.push_back(factor)
+        variables.insert(self.new, values)
+        graph.push_back(self.later)
         self.isam.update(graph, values)
-        self.isam.calculateEstimate()  # throws now, if it does
+        self.isam.calculateEstimate()  # throws here if the graph is indeterminate
 
     def _push(self, one: Stored, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         for key in one.keys:
-            if key not in self._there:
-                self._bring(key, graph, values)
+            self._bring(key, graph, values)
         for factor in one.factors:
             graph.push_back(factor)
 
     def _bring(self, key: int, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Put in a variable, and what is about it alone."""
+        """Add a variable, unless it is in the graph, and the factors on it alone."""
         if key in self._there:
             return
         self._there.add(key)

@@ -1,6 +1,4 @@
-"""Loop closure during initialisation: landmarks of now that are landmarks of long ago become one."""
-
-from __future__ import annotations
+"""Close loops during initialisation: find recent landmarks that are also old landmarks, and correct the path."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -16,17 +14,18 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The epochs of the past in which a loop is looked for, the latest first; more is slower, and closes longer loops."""
+"""The number of past epochs, latest first, in which a loop is searched. A larger value is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
-"""The factors on the promised drift with which a loop is looked for: wheels slip more than a Gaussian says. Larger ones find
-loops after a slip, and more wrong candidates."""
+"""The factors on the assumed drift with which a loop is searched, because wheels slip more than a Gaussian allows. Larger
+values find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The keyframes of an epoch, for which one keyframe stands; larger is faster, and coarser about the drift since then."""
+"""The number of keyframes in an epoch. One keyframe represents the epoch. A larger number is faster. It also makes the drift
+since the epoch less exact."""
 
 
 @dataclass
 class Landmarks:
-    """Landmarks so far: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe that saw them (N,)."""
+    """Landmarks: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe with an observation (N,)."""
 
     position: Floats
     covariance: Floats
@@ -36,7 +35,7 @@ class Landmarks:
 
     @classmethod
     def none(cls) -> Self:
-        """No landmarks."""
+        """Return an empty table."""
         nobody = np.zeros(0, dtype=np.int64)
         return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody)
 
@@ -46,7 +45,10 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Closure:
-    """Landmarks of now (P,) that are those of before (P,); correction: (4, 4) of the poses of now; evidence: log odds."""
+    """A loop: the recent landmarks now (P,) are the old landmarks before (P,).
+
+    correction: (4, 4) for the current poses. evidence: log odds.
+    """
 
     correction: Floats
     now: Ints
@@ -65,10 +67,10 @@ def find_closure(
     now: int,
     settings: AssociationSettings,
 ) -> Closure | None:
-    """Which landmarks of now are landmarks of before, if any are for sure.
+    """Return the loop with the most evidence, or None if no loop is certain.
 
-    Two ways lead there. The robot comes back after a long drift: then the active landmarks (N,) are among those not seen for
-    long. Or its wheels slipped, or somebody pushed it: then all that was born since is there already.
+    The search has two cases. After a long drift, the active landmarks (N,) match landmarks without recent observations.
+    After a slip or a push, the landmarks born since then match all others.
     """
     together = _seen_together(rays, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
@@ -81,8 +83,9 @@ def find_closure(
         one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
         if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
             continue
-        marginals = marginals or _marginals(graph, values)
-        if marginals is None:
+        try:
+            marginals = marginals or gtsam.Marginals(graph, values)
+        except RuntimeError:  # indeterminate: no loop can be tested
             return None
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
@@ -98,16 +101,8 @@ def find_closure(
     return best
 
 
-def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | None:
-    """None where the graph is indeterminate: a loop that cannot be judged stays open."""
-    try:
-        return gtsam.Marginals(graph, values)
-    except RuntimeError:
-        return None
-
-
 def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
-    """Whether two landmarks (N, N) were ever in one frame."""
+    """Return whether two landmarks (N, N) were observed in the same keyframe."""
     from scipy.sparse import csr_array
 
     held = np.flatnonzero(owner >= 0)
@@ -117,16 +112,14 @@ def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
 
 
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
-    """Covariances (3, 3) of the camera `now` relative to each of the anchor keyframes: x, y, yaw along the map's axes.
+    """Return covariances (3, 3) of x, y, yaw of camera `now` relative to the anchor keyframes, along the axes of map.
 
-    Each comes as the graph has it, and for wheels that slipped more than they should.
+    Each anchor before `now` gives one covariance for each factor in `_SLIPS`.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
     result = []
-    for anchor in anchors:
-        if anchor >= now:
-            continue
+    for anchor in (a for a in anchors if a < now):
         joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
         relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
         jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])
@@ -137,11 +130,11 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
 
 
 def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
-    """The path (K, 4, 4) with the correction spread over keyframes begin to end by the drift (K,) gathered there."""
+    """Spread a correction (4, 4) over the keyframes begin to end of a path (K, 4, 4), in proportion to the drift (K,)."""
     gathered = drift - drift[begin]
     share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)
     share[:begin] = 0.0
-    # about the place where it begins: nothing swings out on the way
+    # The twist is relative to the position of keyframe `begin`, so that the path does not swing out.
     centre = np.eye(4)
     centre[:3, 3] = map_T_camera[begin, :3, 3]
     twist = log_se3(inverse(centre) @ correction @ centre)

@@ -1,6 +1,4 @@
-"""Marginal covariances of landmarks, with a way out when the graph does not determine them all."""
-
-from __future__ import annotations
+"""Compute marginal covariances of landmarks, also if the graph does not determine all landmarks."""
 
 import gtsam
 import numpy as np
@@ -13,27 +11,27 @@ from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
-"""The standard deviation (m) of a prior that holds landmarks which nothing else does. A landmark that only this prior holds
-is not determined; larger holds less, and lets the linear system become indeterminate."""
+"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger value holds less, until the linear
+system is indeterminate. A landmark that only this prior holds counts as undetermined."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
-    """Covariances (n, 3, 3), m^2, of the landmarks (n,) at `values`.
+    """Return the covariances (n, 3, 3), m^2, of the landmarks (n,) at `values`.
 
-    When the linear system is indeterminate, every landmark is held by a prior of 1 m for this computation; those whose
-    uncertainty then comes from that prior get NaN, the others keep theirs, and the ledger is warned.
+    If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior of 1 m.
+    Landmarks that only this prior determines get NaN. The other covariances are corrected for the prior.
     """
     try:
         return _marginals(graph, values, landmarks)
     except RuntimeError as error:
-        ledger.warn(f"covariances: {indeterminate(error).message}; objects that nothing holds are left unresolved")
+        ledger.warn(f"covariances: {indeterminate(error).message}; objects that no measurement holds are left unresolved")
     held = graph.clone()
     for j in landmarks.tolist():
         held.push_back(point_prior(j, values.atPoint3(L0 + j), HELD))
     try:
         covariance = _marginals(held, values, landmarks)
     except RuntimeError as error:
-        ledger.warn(f"covariances: {indeterminate(error).message}; no object has one")
+        ledger.warn(f"covariances: {indeterminate(error).message}; no object has a covariance")
         return np.full((len(landmarks), 3, 3), np.nan)
     held_by_more = np.linalg.eigvalsh(covariance)[:, -1] <= (0.5 * HELD) ** 2
     without_prior = np.full_like(covariance, np.nan)
@@ -44,10 +42,10 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 def seen_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, witnesses: Ints, ledger: Ledger
 ) -> Floats:
-    """Covariances (n, 3, 3), m^2, of landmarks (n,) in the frame of one camera each, keyframes (n,), at `values`.
+    """Return the covariances (n, 3, 3), m^2, of landmarks (n,), each in the frame of its witness, a keyframe (n,).
 
-    What the graph does not know of the camera's own pose is not in them: far from where a map from odometry begins, that is
-    nearly all of a landmark's own covariance. NaN, and the ledger is warned, where the linear system is indeterminate.
+    The uncertainty of the camera pose is left out. Far from the start of a map by odometry, it is nearly all of a landmark's
+    own covariance. If the linear system is indeterminate, the ledger gets a warning, and the result is NaN.
     """
     covariance = np.full((len(landmarks), 3, 3), np.nan)
     if len(landmarks) == 0:
@@ -63,7 +61,10 @@ def seen_covariances(
 
 
 def in_camera(joint: gtsam.JointMarginal, k: int, j: int, map_T_camera: Floats, point: Floats) -> Floats:
-    """Covariance (3, 3), m^2, of L(j) at a point (3,) in the frame of X(k) at map_T_camera (4, 4), of their joint one."""
+    """Return the covariance (3, 3), m^2, of L(j) in the frame of X(k), from their joint marginal.
+
+    map_T_camera: (4, 4) the pose of X(k). point: (3,) the position of L(j) in map.
+    """
     x, landmark = X0 + k, L0 + j
     to_point = map_T_camera[:3, :3].T
     seen = to_point @ (point - map_T_camera[:3, 3])
@@ -74,7 +75,7 @@ def in_camera(joint: gtsam.JointMarginal, k: int, j: int, map_T_camera: Floats, 
 
 
 def largest_sigma(covariances: Floats) -> Floats:
-    """The largest standard deviation (n,) m in any direction of covariances (n, 3, 3); NaN where they are."""
+    """Return the largest standard deviation (n,), m, of each covariance (n, 3, 3). A NaN covariance gives NaN."""
     known = np.isfinite(covariances).all(axis=(1, 2))
     sigma = np.full(len(covariances), np.nan)
     sigma[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances[known])[:, -1], 0.0))

@@ -1,6 +1,4 @@
-"""Levenberg-Marquardt and GNC on a factor graph, with what GTSAM throws turned into an error that says what to do."""
-
-from __future__ import annotations
+"""Optimise a factor graph by Levenberg-Marquardt or GNC, and turn GTSAM's exceptions into errors with a hint."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,12 +13,15 @@ from objslam.errors import SolveError
 from objslam.graph.variables import read_poses, with_points
 
 OnIteration = Callable[[float, gtsam.Values], None]
-"""Called after each iteration with the cost and the values that it led to."""
+"""A function that is called after each iteration with the new cost and the new values."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """What an optimisation found; weights: (F,) one for each factor of the graph, for GNC alone."""
+    """The result of an optimisation. SolveError if its cost is not finite.
+
+    weights: (F,) one for each factor of the graph, or None unless GNC was used.
+    """
 
     values: gtsam.Values
     cost_before: float
@@ -28,9 +29,15 @@ class Optimum:
     iterations: int
     weights: Floats | None = None
 
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.cost_after):
+            raise SolveError(
+                "the solve diverged: its cost is not finite", hint="check that the odometry is in metres and radians"
+            )
+
 
 def build_graph(*groups: Sequence[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    """One graph of all the factors, in their order."""
+    """Return one graph with all factors in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for group in groups:
         for factor in group:
@@ -47,7 +54,7 @@ def optimize(
     tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """The minimum from `start` by the optimiser that the loss asks for, as `graduated` or `levenberg_marquardt` has it."""
+    """Minimise from `start` by `graduated` for the loss `gnc`, by `levenberg_marquardt` for the other losses."""
     if loss == "gnc":
         return graduated(graph, start, settings.joint.max_iterations, known_inliers)
     return levenberg_marquardt(graph, start, settings.joint.max_iterations, tolerance, on_iteration)
@@ -60,10 +67,7 @@ def levenberg_marquardt(
     relative_tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """The minimum that Levenberg-Marquardt finds from `start`.
-
-    SolveError when the linear system is indeterminate. It names the variable if GTSAM does.
-    """
+    """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)
@@ -74,18 +78,18 @@ def levenberg_marquardt(
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
         before = graph.error(start)
         values = optimizer.optimize()
-        after = optimizer.error()
     except RuntimeError as error:
         raise indeterminate(error) from error
-    return _finite(Optimum(values, before, after, optimizer.iterations()))
+    return Optimum(values, before, optimizer.error(), optimizer.iterations())
 
 
 def graduated(
     graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, max_iterations: int, known_inliers: Sequence[int]
 ) -> Optimum:
-    """Graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020) over LM.
+    """Minimise by graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020) over LM.
 
-    known_inliers: indices of the factors that are never rejected (odometry, priors).
+    known_inliers: indices of the factors that are never rejected (odometry, priors). SolveError if the linear system is
+    indeterminate, or if the cost is not finite.
     """
     inner = gtsam.LevenbergMarquardtParams()
     inner.setMaxIterations(max_iterations)
@@ -101,26 +105,23 @@ def graduated(
         after = float(sum(w * graph.at(i).error(values) for i, w in enumerate(weights) if w > 0))
     except RuntimeError as error:
         raise indeterminate(error) from error
-    return _finite(Optimum(values, before, after, 0, weights))
-
-
-def _finite(optimum: Optimum) -> Optimum:
-    if not np.isfinite(optimum.cost_after):
-        raise SolveError("the solve ran away: its cost is not finite", hint="is the odometry usable, in metres and radians?")
-    return optimum
+    return Optimum(values, before, after, 0, weights)
 
 
 def indeterminate(error: RuntimeError) -> SolveError:
-    """The error for what GTSAM threw: it names the variable that nothing holds, where it says so."""
-    said = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
+    """Return the error for an exception of GTSAM. It names the undetermined variable if GTSAM names it."""
+    reason = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
     return SolveError(
-        f"the factor graph has no single solution: {said.rstrip('.')}",
+        f"the factor graph has no single solution: {reason.rstrip('.')}",
         hint="some pose or object is not held by any measurement; a smaller joint.prior_sigma holds every object",
     )
 
 
 def trace_solve(trace: Trace | None, positions: Floats, landmarks: Ints, fixed: Floats | None = None) -> OnIteration | None:
-    """What traces a solve of some landmarks (n,) among the positions (N, 3); fixed: camera poses that are not solved."""
+    """Return a function that records each iteration of a solve in the trace, or None without a trace.
+
+    landmarks: (n,) the solved rows of positions (N, 3). fixed: (K, 4, 4) camera poses that are not solved.
+    """
     if trace is None:
         return None
 

@@ -1,6 +1,4 @@
-"""Outlier rejection: the joint solve and a test of every ray alternate until no ray changes sides."""
-
-from __future__ import annotations
+"""Reject outliers: the joint solve and a test of every ray alternate until the set of inliers is stable."""
 
 from dataclasses import dataclass, replace
 
@@ -18,22 +16,21 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""The rays before and after a rejected one, and the share of them that are rejected where it is their poses that are wrong;
-a larger share takes fewer rays back. Chosen so that a run of a few false boxes in a row is none."""
+"""The number of neighbours in time on each side of a rejected ray, and the share of rejected rays among them above which the
+poses are wrong. A larger share restores fewer rays. They were chosen so that a few false boxes in a row restore none."""
 _ROUNDS = 4
-"""The most rounds of solve and test; more is slower, and the last ones change few rays."""
+"""The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _SURE = 0.95
-"""The share of an object's rays that agree with it, below which it is triangulated again; larger is slower, and finds more
-objects that stand elsewhere."""
-
+"""The share of inliers among an object's rays below which it is triangulated again. A larger share is slower, and finds more
+objects at wrong positions."""
 _FEWEST = 6
-"""The rays of an object whose median says how noisy they are; of fewer, the promised noise counts. Larger rejects
-more rays of noisy objects with few of them. A session goes by the median of fewer, too."""
+"""The least number of rays whose median gives the noise of an object. An object with fewer rays has the assumed noise. A
+larger number rejects more rays of noisy objects. A live session has no such limit."""
 
 
 @dataclass(frozen=True)
 class JointSolution:
-    """A joint solve: map_T_camera (K, 4, 4), positions (N, 3), and used, (R,) the rays in it, which are no outliers."""
+    """A joint solution: map_T_camera (K, 4, 4), positions (N, 3), and used (R,), which is True for inliers."""
 
     map_T_camera: Floats
     positions: Floats
@@ -52,12 +49,10 @@ def reject_outliers(
     back: Bools,
     trace: Trace | None,
 ) -> JointSolution:
-    """Solve, and test which rays agree with their objects, until none changes sides.
+    """Solve, and test which rays agree with their objects, until the set of inliers is stable.
 
-    Args:
-        map_T_camera, positions: (K, 4, 4), (N, 3) to start from; NaN where an object has no position yet.
-        used: (R,) the rays that a solve before had, none where there was none.
-        back: (R,) rays that the first solve has whether they agree or not.
+    map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
+    solve, or all False. back: (R,) rays that count as inliers in the first solve.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
@@ -82,7 +77,7 @@ def reject_outliers(
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """The rejected rays (R,) among whose neighbours in time most are rejected, too: not they are wrong, but their poses."""
+    """Return the rejected rays (R,) whose neighbours in time are mostly rejected, as if the poses were wrong."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)
@@ -94,9 +89,9 @@ def rejected_stretches(rays: Rays, association: Association, found: JointSolutio
 
 
 def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, association: Association) -> float:
-    """What tells the better of two solutions of the same rays: camera poses (K, 4, 4) and places (N, 3), NaN where none is.
+    """Return the cost of camera poses (K, 4, 4) and positions (N, 3), to compare two solutions of the same rays.
 
-    A ray whose object has no place counts as a stray.
+    An unknown position is NaN. A ray whose object has no position counts `STRAY_RAY`.
     """
     placed = np.isfinite(positions[:, 0])
     owner = np.where((association.object >= 0) & placed[association.object], association.object, -1)
@@ -107,10 +102,9 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 def second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
 ) -> tuple[Floats, Bools]:
-    """Positions (N, 3), NaN where there is none, and the rays (R,) that agree with them.
+    """Triangulate undetermined objects and objects with outliers again. Move an object if more of its rays agree then.
 
-    An object that some of its rays disagree with, or that has no place yet, is asked for by consensus of all its rays at
-    these poses, and moved where more of them agree.
+    Return the positions (N, 3), and which rays (R,) agree with them.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
@@ -122,20 +116,19 @@ def second_opinion(
         return positions, supported
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
-    if used.any():  # poses that were solved have left the localisation's noise behind
+    if used.any():  # solved poses do not have the noise of the localisation
         keyframes = replace(keyframes, localized_every=0.0)
     placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, measured.settings)
     other = positions.copy()
     other[objects[placed.ok]] = placed.positions[placed.ok]
-    gained = np.bincount(
-        association.object[_supported(rays, association, map_T_camera, other, used)], minlength=len(support)
-    )
+    agreeing = _supported(rays, association, map_T_camera, other, used)
+    gained = np.bincount(association.object[agreeing], minlength=len(support))
     positions = np.where((gained > support)[:, None], other, positions)
     return positions, _supported(rays, association, map_T_camera, positions, used)
 
 
 def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
-    """Which rays (R,) agree with their object, by how noisy those of its rays are that agreed so far (at first all)."""
+    """Return which rays (R,) agree with their object, relative to the noise of its inliers so far (or of all its rays)."""
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
     origins, directions = (a[placed] for a in rays.in_map(map_T_camera))
@@ -148,5 +141,5 @@ def _supported(rays: Rays, association: Association, map_T_camera: Floats, posit
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Factors (N,) >= 1 on the covariances: what the whitened residuals show beyond the noise that was assumed."""
+    """Return the factor (N,) >= 1 by which whitened residuals (R,) exceed the assumed noise, squared, for covariances."""
     return noise_factors(residual, landmark, count, _FEWEST) ** 2

@@ -1,6 +1,4 @@
-"""How well poses and landmarks explain a drive, in a measure that compares solutions with different rays in them."""
-
-from __future__ import annotations
+"""Compute the cost of poses and landmarks for comparing solutions with different inliers, and the information of rays."""
 
 import numpy as np
 
@@ -10,17 +8,17 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 FLOOR = 0.02
-"""The standard deviation (m) that every landmark has at least, for a box's centre is not a point of its object; larger lets
-rays miss nearby landmarks by more."""
+"""The least standard deviation (m) of a landmark, because the centre of a box is not a point of the object. A larger value
+lets rays miss nearby landmarks by more."""
 
 
 def truncated_cost(
     rays: Rays, owner: Ints, positions: Floats, map_T_camera: Floats, motion: Floats, covariance: Floats
 ) -> float:
-    """Squared deviations of all rays (R,) with a landmark, none more than a stray's, and of the odometry, up to here.
+    """Return the sum of squared deviations of the rays and of the odometry. A ray counts `STRAY_RAY` at most.
 
-    owner: (R,) index into positions (N, 3), -1 none. map_T_camera: (K, 4, 4), the first of the keyframes. motion (M, 4, 4)
-    and covariance (M, 6, 6) between them, by odometry.
+    owner: (R,) index into positions (N, 3), or -1 for a ray that does not count. map_T_camera: (K, 4, 4) the first K
+    keyframes. Later rays and motions do not count. motion (M, 4, 4) and covariance (M, 6, 6): by odometry.
     """
     held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
     some = rays.take(held)
@@ -34,12 +32,10 @@ def truncated_cost(
 
 
 def ray_information(directions: Floats, across: Floats, along: Floats, landmark: Ints, count: int) -> Floats:
-    """The information (N, 3, 3), m^-2, that rays have about landmarks where they are.
+    """Return the information (N, 3, 3), m^-2, of rays about the positions of `count` landmarks.
 
-    Args:
-        directions: (R, 3) unit, in map.
-        across, along: (R,) m^-2, the information of each across and along its ray; 0 along where it has no range.
-        landmark: (R,) that of each ray, below count.
+    directions: (R, 3) unit, in map. across, along: (R,) m^-2, the information across and along each ray. The information
+    along a ray without a range is 0. landmark: (R,) index of the ray's landmark.
     """
     outer = directions[:, :, None] * directions[:, None, :]
     one = (np.eye(3) - outer) * across[:, None, None] + outer * along[:, None, None]

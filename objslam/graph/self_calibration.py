@@ -3,8 +3,6 @@
 An outer Gauss-Newton step moves the parameters; an inner solve moves poses and landmarks to the measurements that result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -29,7 +27,7 @@ _CONVERGED = 0.2
 _INNER = 5
 """The iterations of an inner solve. Few are enough, because each begins at a linear prediction of its optimum."""
 _TOLERANCE = 1e-4
-"""The share of the cost by which an iteration of an inner solve lowers it, below which the solve ends; larger ends sooner."""
+"""The relative decrease of the cost in an iteration below which an inner solve ends. A larger value ends it sooner."""
 _HALVINGS = 3
 """How often a step that does not lower the cost is halved before the parameters are left as they are."""
 _MEMORY = 3
@@ -88,7 +86,7 @@ def calibrate(
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, None)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
     system = state.reduced(errors, theta)
-    posterior = np.linalg.inv(system.information + np.diag(weight))
+    posterior = np.asarray(np.linalg.inv(system.information + np.diag(weight)), dtype=np.float64)
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     sensitivity[state.landmarks] = system.sensitivity[: 3 * len(state.landmarks)].reshape(-1, 3, len(theta))
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + final.iterations)

@@ -3,8 +3,6 @@
 The parameters are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gtsam
@@ -124,7 +122,7 @@ def _parameter_columns(
         other, other_rays, settings = errors.at(parameters, drift=False)
         longer = other_rays.range[which[ranged]] / rays_of_range.range
         parts = [range_root * (distance - longer * rays_of_range.range) / longer]
-        if len(steps):
+        if other.odom_T_base is not None and len(steps):
             odom_T_camera = other.odom_T_base @ other.base_T_camera
             said = inverse(odom_T_camera[:-1]) @ odom_T_camera[1:]
             turn, way = settings.odometry.floor_yaw / odometry.floor_yaw, settings.odometry.floor_xy / odometry.floor_xy

@@ -1,4 +1,1 @@
-"""Files, one module a format: each reads or writes one kind of file and says what is wrong with it, by line.
-
-What a folder of such files means is not decided here: logs are in `sources`, results in `results` and `output`.
-"""
+"""Read and write files, with one module per format. Folders are defined in `sources`, `results` and `output`."""

@@ -1,6 +1,4 @@
-"""Files that are written whole or not at all: one by itself, or a set of them that share a folder."""
-
-from __future__ import annotations
+"""Write single files and sets of files atomically, so that a killed process leaves no partial result."""
 
 import errno
 import fcntl
@@ -14,31 +12,26 @@ from pathlib import Path
 from objslam.errors import OutputError
 
 _STAGING = ".objslam-staging"
-_SWAPPING = "swapping"
-"""In the staging folder from before the first old file goes: what a killed swap left beside it is no one's but ours."""
+_SWAPPING = "swapping"  # This file in the staging folder marks that the replacement of the old files has started.
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
-"""What network file systems answer that can neither lock nor sync a folder: there we go on without."""
+"""The ignored error codes of network file systems that cannot lock or sync a folder."""
 
 
 @dataclass(frozen=True)
 class FileSet:
-    """The names of the files that are replaced together.
+    """The names of files that are replaced together."""
 
-    seal: the file that stands for the whole: it goes first and comes last. others: the rest, whether written each time or
-    not. pattern: a glob, for those whose names are not known beforehand.
-    """
-
-    seal: str
-    others: tuple[str, ...]
-    pattern: str
+    seal: str  # The file that is deleted first and written last.
+    others: tuple[str, ...]  # All other names, including optional files.
+    pattern: str  # A glob pattern for files whose names vary.
 
     def names(self, folder: Path) -> tuple[str, ...]:
-        """Every name of the set that may be in a folder, the seal first."""
+        """Return all names of the set, with the files in the folder that match the pattern. The seal is first."""
         return (self.seal, *self.others, *sorted(file.name for file in folder.glob(self.pattern)))
 
 
 def try_folder(folder: Path, files: FileSet) -> None:
-    """Make a folder and try to write there; OutputError where `replace_files` could not."""
+    """Create a folder and test writing to it. Raises OutputError if `replace_files` would fail."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with _staged(folder, files) as staging:
@@ -46,18 +39,12 @@ def try_folder(folder: Path, files: FileSet) -> None:
 
 
 def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Path], object]]) -> tuple[str, ...]:
-    """Write a set of files into a folder, in place of an older one; other files there stay.
+    """Replace a set of files in a folder, and return the names of the deleted files without replacement.
 
-    The new files are first written to a staging folder. Then all files of the old set are deleted. Then the new files are
-    renamed into place, the seal last. If the process is killed at any moment, the folder never holds a half-written file or
-    a mix of two sets. It holds the seal only if the set is complete.
-
-    Args:
-        writers: the function that writes each file, by the name of the file, which must be a name of the set.
-    Returns:
-        The names of the old files that were deleted and not replaced.
-    Raises:
-        OutputError: the disk refuses, or another run writes there.
+    `writers` has the function that writes each file, by file name. New files are first written to a staging folder. Then
+    all files of the old set are deleted. Then the new files are renamed, the seal last. A killed process therefore never
+    leaves a half-written file, a mix of two sets, or a seal in an incomplete set. Other files in the folder are not changed.
+    Raises OutputError for a disk error, or if another run is writing to the folder.
     """
     with disk_errors(folder), _staged(folder, files) as staging:
         for name, write in writers.items():
@@ -68,17 +55,17 @@ def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Pat
 
 
 def is_cut_short(folder: Path, files: FileSet) -> bool:
-    """Whether a swap began in the folder and did not end: then it holds parts of a set."""
+    """Return whether a replacement was interrupted, so that the folder contains an incomplete set."""
     return (folder / _STAGING / _SWAPPING).exists() and not (folder / files.seal).exists()
 
 
 def has_staging(folder: Path) -> bool:
-    """Whether a set is being written in the folder, or a run was killed while it did."""
+    """Return whether a run is writing to the folder or was killed while writing."""
     return (folder / _STAGING).exists()
 
 
 def write_file(file: Path, data: bytes) -> None:
-    """Write one file under a temporary name and rename it; OutputError, with the file's own name, when the disk refuses."""
+    """Write one file under a temporary name and rename it. Raises OutputError with the final file name for a disk error."""
     temporary = file.with_name(f".{file.name}.{os.getpid()}")
     with disk_errors(file, only=True):
         try:
@@ -90,17 +77,17 @@ def write_file(file: Path, data: bytes) -> None:
 
 
 def encode(text: str) -> bytes:
-    """Text as UTF-8; OutputError where it holds half of a surrogate pair, which no file can."""
+    """Return the text as UTF-8. Raises OutputError for an unpaired surrogate, which UTF-8 cannot represent."""
     try:
         return text.encode()
     except UnicodeEncodeError as error:
         bad = error.object[max(error.start - 20, 0) : error.end]
-        raise OutputError(f"text that cannot be written (half of a surrogate pair) near {bad!r}") from error
+        raise OutputError(f"text that cannot be written (an unpaired surrogate) near {bad!r}") from error
 
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """What the disk refuses, as an OutputError of one line; it names the file in question, or (only) always the path."""
+    """Convert OSError to OutputError. The error names the failing file, or always `path` if `only` is set."""
     try:
         yield
     except OSError as error:
@@ -110,23 +97,20 @@ def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
-    """An empty staging folder in a folder, and that one to ourselves as long as the process lives; gone afterwards.
-
-    A swap that was cut short leaves it, as the sign of whose the rest is; here that rest goes too. OutputError when another
-    run has it.
-    """
+    """Lock a folder and yield an empty staging folder in it. The remains of an interrupted run are deleted."""
     staging = folder / _STAGING
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            hint = "name another folder with -o"
-            raise OutputError("another run is writing here", where=str(folder), hint=hint) from error
+            raise OutputError(
+                "another run is writing here", where=str(folder), hint="name another folder with -o"
+            ) from error
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 raise
-        if staging.exists():  # a killed run left it: the lock says that nobody is at it
+        if staging.exists():  # A killed run left the folder, because the lock is free.
             if is_cut_short(folder, files):
                 for name in files.names(folder):
                     (folder / name).unlink(missing_ok=True)
@@ -142,7 +126,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
 
 
 def _swap(staging: Path, folder: Path, files: FileSet) -> tuple[str, ...]:
-    """Put the staged files in the place of the old ones; the order is what keeps a killed run from a mix."""
+    """Replace the old files by the staged files. The order prevents a mix of two sets after a kill."""
     old = files.names(folder)
     removed = tuple(name for name in old if (folder / name).exists() and not (staging / name).exists())
     _write(staging / _SWAPPING, b"")

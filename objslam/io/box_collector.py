@@ -1,23 +1,17 @@
-"""Boxes as they come out of a file, gathered frame by frame and checked all at once."""
-
-from __future__ import annotations
+"""Collect boxes frame by frame and check them together."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from objslam.core.arrays import Bools
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, label_table
-from objslam.io.text import count_drops, in_order
+from objslam.io.text import drop_rows, in_order
 
 
 @dataclass
 class BoxCollector:
-    """Frames and boxes as read, with the place (file:line) of each; `checked` makes detections of them.
-
-    A depth is NaN where the file says that it is unknown; a track id is -1 there.
-    """
+    """Frames and boxes with the place (file:line) of each. An unknown depth is NaN, and an unknown track id is -1."""
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)
@@ -30,14 +24,14 @@ class BoxCollector:
     box_places: list[str] = field(default_factory=list)
 
     def add_frame(self, stamp: float, place: str) -> None:
-        """Begin a frame; the boxes added next belong to it."""
+        """Start a frame. The next boxes belong to it."""
         self.stamps.append(stamp)
         self.frame_places.append(place)
 
     def add_box(
         self, box: list[float], label: str, score: float, place: str, depth: float = np.nan, track_id: int = -1
     ) -> None:
-        """Add a box (x1, y1, x2, y2) px to the frame begun last."""
+        """Add a box x1, y1, x2, y2 (px) to the last frame."""
         self.frame.append(len(self.stamps) - 1)
         self.boxes.append(box)
         self.labels.append(label)
@@ -47,16 +41,10 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """The detections, without frames whose stamp repeats or goes back and without boxes that cannot be right.
-
-        Each of them is counted; a depth that is not above zero becomes unknown and is counted too.
-        """
+        """Return the valid detections. Late frames, invalid boxes and depths that are not above zero are counted."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
-        late = np.flatnonzero(~forward)
-        places = (self.frame_places[i] for i in late)
-        count_drops("detection frame with a stamp that repeats or goes back", len(late), places, ledger)
-
+        drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)
         frame = np.array(self.frame, dtype=np.int64)
         boxes = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)
         scores = np.array(self.scores, dtype=np.float64)
@@ -68,13 +56,12 @@ class BoxCollector:
             ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
             (names, "box with a label that is empty or not printable"),
         ):
-            self._count(good & ~fine, reason, ledger)
+            drop_rows(reason, good & ~fine, self.box_places, ledger)
             good &= fine
         depths = np.array(self.depths, dtype=np.float64)
         wrong = ~np.isnan(depths) & ~((depths > 0) & np.isfinite(depths))
-        self._count(good & wrong, "depth of a box that is not above zero (taken as unknown)", ledger)
+        drop_rows("depth of a box that is not above zero (taken as unknown)", good & wrong, self.box_places, ledger)
         depths[wrong] = np.nan
-
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(
             frame_stamps=stamps[forward],
@@ -86,7 +73,3 @@ class BoxCollector:
             track_ids=np.array(self.track_ids, dtype=np.int64)[good],
             label_names=label_names,
         )
-
-    def _count(self, bad: Bools, reason: str, ledger: Ledger) -> None:
-        rows = np.flatnonzero(bad)
-        count_drops(reason, len(rows), (self.box_places[i] for i in rows), ledger)

@@ -1,10 +1,7 @@
-"""camera.yaml: ROS camera_info keys, and the camera's place on the robot.
+"""Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The file is read as YAML nodes, not as Python objects: every value keeps its line, nothing is constructed, and a number such
-as 1e-05, which YAML 1.1 takes for text, stays a number.
+The reader uses YAML nodes, which keep line numbers. Numbers such as 1e-05, which YAML 1.1 reads as text, stay numbers.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -21,14 +18,14 @@ from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
-CAMERAS = "cameras"
-_MAX_SIDE = 1 << 16  # px
+_CAMERAS = "cameras"
+_MAX_SIDE = 1 << 16  # The limit of width and height, px. A larger image counts as an error in the file.
 _Mapping = dict[str, yaml.Node]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera out of a file, and whether the file says where it is on the robot (else base_T_camera is the identity)."""
+    """A camera of a file. placed: whether the file contains base_T_camera. Otherwise, base_T_camera is the identity."""
 
     camera: Camera
     placed: bool
@@ -37,34 +34,27 @@ class Calibration:
 def read_camera(
     path: Path, ledger: Ledger, *, name: str | None = None, place_needed: bool = True, depth_scale: float = 1000.0
 ) -> Camera:
-    """Read a camera file.
+    """Read a camera file. Raises LogError with the line of an invalid value.
 
-    name: the camera's, else camera_name in the file, else "camera". place_needed: whether base_T_camera must be there (else
-    the identity stands in for it). depth_scale: units per metre where the file gives none. camera_matrix and
-    distortion_coefficients are taken as ROS writes them (rows, cols, data), as a flat list or as nested lists. LogError with
-    the line of what is wrong.
+    name: the camera name. The default is camera_name in the file, or "camera". place_needed: whether base_T_camera is
+    required. Otherwise, the default is the identity. depth_scale: the default of depth_scale in the file, units per metre.
     """
-    return _read(path, _mapping(path, _parse(path), "the file"), ledger, name, place_needed, depth_scale).camera
+    return _read(path, _load(path, read_bytes(path), "the file"), ledger, name, place_needed, depth_scale).camera
 
 
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
-    """Read a file with one camera as `read_camera` does, or with several, by name, under the key `cameras`.
-
-    Their place on the robot may be missing. LogError with the line of what is wrong.
-    """
-    top = _mapping(path, _parse(path), "the file")
-    if CAMERAS not in top:
-        return (_read(path, top, ledger, None, False, 1000.0),)
-    cameras = _mapping(path, top[CAMERAS], CAMERAS)
+    """Read one camera, or several cameras by name under the key `cameras`. Raises LogError with the line of an error."""
+    top = _load(path, read_bytes(path), "the file")
+    if _CAMERAS not in top:
+        return (_read(path, top, ledger),)
+    cameras = _mapping(path, top[_CAMERAS], _CAMERAS)
     if not cameras:
-        raise _error(path, top[CAMERAS], "no camera in it")
-    return tuple(
-        _read(path, _mapping(path, node, f"{CAMERAS}.{name}"), ledger, name, False, 1000.0) for name, node in cameras.items()
-    )
+        raise _error(path, top[_CAMERAS], "no camera in it")
+    return tuple(_read(path, _mapping(path, node, f"{_CAMERAS}.{name}"), ledger, name) for name, node in cameras.items())
 
 
 def _read(
-    path: Path, top: _Mapping, ledger: Ledger, name: str | None, place_needed: bool, depth_scale: float
+    path: Path, top: _Mapping, ledger: Ledger, name: str | None = None, placed: bool = False, depth_scale: float = 1000.0
 ) -> Calibration:
     width, height = _size(path, top, "image_width"), _size(path, top, "image_height")
     matrix = _matrix(path, _get(path, top, "camera_matrix"))
@@ -73,27 +63,29 @@ def _read(
     if not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         ledger.warn(f"{path}: the principal point lies outside the image: is the calibration for {width}x{height}?")
     model, distortion = _distortion(path, top)
-    placed = place_needed or "base_T_camera" in top
+    placed = placed or "base_T_camera" in top
     base_T_camera = _pose(path, _get(path, top, "base_T_camera")) if placed else np.eye(4)
     if "depth_scale" in top:
         depth_scale = _number(path, top["depth_scale"], "depth_scale")
         if depth_scale <= 0:
             raise _error(path, top["depth_scale"], "depth_scale must be above zero", "units per metre, such as 1000 for mm")
-    sees_size = "sees_size" not in top or _flag(path, top["sees_size"], "sees_size")
+    sees_size = _text(path, top["sees_size"], "sees_size") if "sees_size" in top else "true"
+    if sees_size not in ("true", "false"):
+        raise _error(path, top["sees_size"], f"sees_size must be true or false, not {sees_size[:40]!r}")
     if name is None:
         name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
-    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size)
+    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size == "true")
     return Calibration(camera, placed)
 
 
 def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
-    """The camera that a text with the keys of a camera file describes; place: what LogError calls it."""
+    """Parse a camera from text with the keys of a camera file. Raises LogError, which names `place` as the file."""
     path = Path(place)
-    return _read(path, _mapping(path, _compose(path, text), "the camera"), ledger, name, True, 1000.0).camera
+    return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
 
 
 def write_camera(camera: Camera, path: Path) -> None:
-    """Write a camera file; every number but the rotation, a quaternion, reads back as the same float."""
+    """Write a camera file. Every number except the quaternion of the rotation is read back as the same float."""
     xyzw = quaternion(camera.base_T_camera[None])[0]
     data = {
         "camera_name": camera.name,
@@ -104,9 +96,8 @@ def write_camera(camera: Camera, path: Path) -> None:
         "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": camera.distortion.tolist()},
         "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
         "depth_scale": float(camera.depth_scale),
+        **({} if camera.sees_size else {"sees_size": False}),
     }
-    if not camera.sees_size:
-        data["sees_size"] = False
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
     path.write_text(text, encoding="utf-8")
 
@@ -115,11 +106,8 @@ def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -
     return LogError(message, where=f"{path}:{node.start_mark.line + 1}", hint=hint)
 
 
-def _parse(path: Path) -> yaml.Node:
-    return _compose(path, read_bytes(path))
-
-
-def _compose(path: Path, text: bytes) -> yaml.Node:
+def _load(path: Path, text: bytes, what: str) -> _Mapping:
+    """Return the values of a YAML text by key. Errors name the whole text `what`."""
     try:
         node = yaml.compose(text.decode("utf-8-sig"), Loader=yaml.SafeLoader)
     except UnicodeDecodeError as error:
@@ -133,7 +121,7 @@ def _compose(path: Path, text: bytes) -> yaml.Node:
         raise LogError("not a camera file: nested too deeply", where=str(path)) from error
     if node is None:
         raise LogError("nothing in it", where=str(path), hint="ROS camera_info keys are expected")
-    return node
+    return _mapping(path, node, what)
 
 
 def _mapping(path: Path, node: yaml.Node, what: str) -> _Mapping:
@@ -141,8 +129,8 @@ def _mapping(path: Path, node: yaml.Node, what: str) -> _Mapping:
         raise _error(path, node, f"{what} must be a mapping of keys to values")
     result: _Mapping = {}
     for key, value in node.value:
-        if key.value in result if isinstance(key, yaml.ScalarNode) else True:
-            raise _error(path, key, f"a key of {what} is there twice, or is not a word")
+        if not isinstance(key, yaml.ScalarNode) or key.value in result:
+            raise _error(path, key, f"a key of {what} occurs twice or is not a word")
         result[key.value] = value
     return result
 
@@ -159,13 +147,6 @@ def _text(path: Path, node: yaml.Node, what: str) -> str:
     if not isinstance(node, yaml.ScalarNode):
         raise _error(path, node, f"{what} must be one value")
     return str(node.value)
-
-
-def _flag(path: Path, node: yaml.Node, what: str) -> bool:
-    text = _text(path, node, what)
-    if text not in ("true", "false"):
-        raise _error(path, node, f"{what} must be true or false, not {text[:40]!r}")
-    return text == "true"
 
 
 def _number(path: Path, node: yaml.Node, what: str) -> float:
@@ -188,10 +169,7 @@ def _size(path: Path, top: _Mapping, key: str) -> int:
 
 
 def _numbers(path: Path, node: yaml.Node, what: str) -> tuple[Floats, yaml.Node]:
-    """The numbers of a YAML node, row by row, and the list node that holds them.
-
-    The node may be a mapping {rows, cols, data}, a flat list, or a list of rows.
-    """
+    """Return the numbers of a mapping {rows, cols, data}, a flat list or a list of rows, and the node of the list."""
     if isinstance(node, yaml.MappingNode):
         fields = _mapping(path, node, what)
         values, data = _numbers(path, _get(path, fields, "data", f"{what}.", node), f"{what}.data")
@@ -227,7 +205,7 @@ def _distortion(path: Path, top: _Mapping) -> tuple[DistortionModel, Floats]:
     coefficients = _get(path, top, "distortion_coefficients")
     empty = isinstance(coefficients, yaml.ScalarNode) and coefficients.value in ("", "~", "null")
     values, data = (np.zeros(0), coefficients) if empty else _numbers(path, coefficients, "distortion_coefficients")
-    if given in ("", "plumb_bob") and not len(values):  # as simulators write a camera without distortion
+    if given in ("", "plumb_bob") and not len(values):  # Simulators write a camera without distortion in this form.
         return "plumb_bob", np.zeros(5)
     model = next((known for known in get_args(DistortionModel) if known == given), None)
     if model is None:
@@ -243,8 +221,7 @@ def _pose(path: Path, node: yaml.Node) -> Floats:
     fields = _mapping(path, node, "base_T_camera")
     parts = []
     for key, size in (("translation", 3), ("rotation_xyzw", 4)):
-        part = _get(path, fields, key, "base_T_camera.", node)
-        values, data = _numbers(path, part, key)
+        values, data = _numbers(path, _get(path, fields, key, "base_T_camera.", node), key)
         if len(values) != size:
             raise _error(path, data, f"{key} must be {size} numbers, got {len(values)}", form)
         parts.append(values)

@@ -1,6 +1,4 @@
-"""Folders that are made for work that may fail."""
-
-from __future__ import annotations
+"""Remove empty folders after a failure."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -9,12 +7,12 @@ from pathlib import Path
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """Work that makes a folder, with its parents: where it fails, those that it made and left empty are taken away again."""
+    """Delete the folder `path` and its parents after an error, if the block created them and left them empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield
     except BaseException:
-        with suppress(OSError):  # not empty: it stays, and so do its parents
+        with suppress(OSError):  # A folder with content remains, and so do its parents.
             for folder in made:
                 if folder.exists():
                     folder.rmdir()

@@ -1,6 +1,4 @@
-"""Image lists in TUM format, rgb.txt and depth.txt: "stamp relative/path" a line, '#' comments."""
-
-from __future__ import annotations
+"""Image lists in TUM format, rgb.txt and depth.txt, with "stamp relative/path" per line and '#' comments."""
 
 from pathlib import Path
 
@@ -10,17 +8,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Images
 from objslam.errors import LogError
 from objslam.io.safe_paths import Inside
-from objslam.io.text import count_drops, in_order, parse_numbers, read_lines
+from objslam.io.text import drop_rows, in_order, parse_numbers, read_lines
 
 
 def read_images(path: Path, ledger: Ledger) -> Images:
-    """Read an image list; the images are found, not opened.
+    """Read an image list without opening the images. Raises LogError if no line is valid.
 
-    Dropped and counted: malformed lines, stamps that repeat or go back, files that are missing or leave the list's folder
-    (absolute, '..', symbolic links). LogError where no image is left.
+    Malformed lines, late timestamps, missing files and files outside the folder of the list are dropped and counted.
     """
-    folder = path.parent
-    inside = Inside(folder)
+    inside = Inside(path.parent)
     name = path.name
     stamps, files, places = [], [], []
     lines = read_lines(path, ledger)
@@ -32,7 +28,7 @@ def read_images(path: Path, ledger: Ledger) -> Images:
             ledger.drop(f'{name} line that is not "stamp path"', where=place)
             continue
         relative = Path(rest[0])
-        file = folder / relative
+        file = path.parent / relative
         outside = relative.is_absolute() or ".." in relative.parts
         reason = "leaves the folder" if outside else inside.reason_against(file)
         if reason is not None:
@@ -43,8 +39,7 @@ def read_images(path: Path, ledger: Ledger) -> Images:
         places.append(place)
     times = np.array(stamps, dtype=np.float64)
     forward = in_order(times)
-    late = np.flatnonzero(~forward)
-    count_drops(f"{name} line with a stamp that repeats or goes back", len(late), (places[i] for i in late), ledger)
+    drop_rows(f"{name} line with a stamp that repeats or goes back", ~forward, places, ledger)
     if not forward.any():
         state = f"none of its {len(lines)} lines leads to an image" if lines else "nothing in it"
         raise LogError(state, where=str(path), hint='a line is "stamp path", the path relative to this file')
@@ -52,7 +47,7 @@ def read_images(path: Path, ledger: Ledger) -> Images:
 
 
 def write_images(images: Images, path: Path) -> None:
-    """Write an image list; the paths are made relative to the list's folder, where they must lie."""
+    """Write an image list. The images must be in the folder of the list, because the written paths are relative to it."""
     pairs = zip(images.stamps.tolist(), images.paths, strict=True)
     text = "".join(f"{stamp!r} {file.relative_to(path.parent).as_posix()}\n" for stamp, file in pairs)
     path.write_text("# stamp path\n" + text, encoding="utf-8")

@@ -1,24 +1,16 @@
-"""How large a packed image says it is, read off its first bytes: nothing is unpacked."""
-
-from __future__ import annotations
+"""Read the stated size of a compressed image from its header without decoding the image."""
 
 import struct
 from collections.abc import Callable
 
-_STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})
-"""JPEG markers that no segment follows."""
-_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""JPEG markers of a frame's header, which holds the size."""
+_STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # The JPEG markers without a segment.
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # The JPEG markers of frame headers, which contain the size.
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
-_TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}
-"""The integers of TIFF fields by their type, as `struct` calls them."""
+_TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}  # `struct` formats by TIFF field type.
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
-    """The width and height, px, that the header of a PNG, JPEG, TIFF, WebP, GIF or BMP file states.
-
-    None for other formats. ValueError where the header is damaged or cut off.
-    """
+    """Return stated width and height, px, of an image file, None for an unknown format. Raises ValueError for damage."""
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:
@@ -28,19 +20,18 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def _png(data: bytes) -> tuple[int, int]:
-    width, height = struct.unpack_from(">II", data, 16)
-    return width, height
+def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
+    first, second = struct.unpack_from(form, data, at)
+    return first, second
 
 
 def _jpeg(data: bytes) -> tuple[int, int]:
     at = 2
     while True:
-        at = data.index(0xFF, at) + 1  # decoders skip what lies between two segments, too
+        at = data.index(0xFF, at) + 1  # Decoders also skip bytes between two segments.
         marker = data[at]
         if marker in _FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 4)
-            return width, height
+            return _pair(">HH", data, at + 4)[::-1]
         if marker not in (0x00, 0xFF):
             at += 1
             if marker not in _STANDALONE:
@@ -65,37 +56,30 @@ def _tiff(data: bytes) -> tuple[int, int]:
 
 
 def _webp(data: bytes) -> tuple[int, int]:
-    if data[8:15] == b"WEBPVP8" and data[15:16] in (b" ", b"L", b"X"):
-        if data[15:16] == b" ":
-            width, height = struct.unpack_from("<HH", data, 26)
-            return width & 0x3FFF, height & 0x3FFF
-        if data[15:16] == b"L":
-            bits = struct.unpack_from("<I", data, 21)[0]
-            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-        less = struct.unpack_from("<Q", data, 22)[0] >> 16
-        return (less & 0xFFFFFF) + 1, (less >> 24) + 1
+    kind = data[8:16]
+    if kind == b"WEBPVP8 ":
+        width, height = _pair("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    if kind == b"WEBPVP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"WEBPVP8X":
+        bits = struct.unpack_from("<Q", data, 22)[0] >> 16
+        return (bits & 0xFFFFFF) + 1, (bits >> 24) + 1
     raise ValueError("not a WebP image")
-
-
-def _gif(data: bytes) -> tuple[int, int]:
-    width, height = struct.unpack_from("<HH", data, 6)
-    return width, height
 
 
 def _bmp(data: bytes) -> tuple[int, int]:
     old = struct.unpack_from("<I", data, 14)[0] == 12
-    width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
+    width, height = _pair("<HH" if old else "<ii", data, 18)
     return abs(width), abs(height)
 
 
 _READERS: dict[bytes, Callable[[bytes], tuple[int, int]]] = {
-    b"\x89PNG\r\n\x1a\n": _png,
+    b"\x89PNG\r\n\x1a\n": lambda data: _pair(">II", data, 16),
     b"\xff\xd8\xff": _jpeg,
-    b"II*\0": _tiff,
-    b"MM\0*": _tiff,
-    b"II+\0": _tiff,
-    b"MM\0+": _tiff,
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
     b"RIFF": _webp,
-    b"GIF8": _gif,
+    b"GIF8": lambda data: _pair("<HH", data, 6),
     b"BM": _bmp,
 }

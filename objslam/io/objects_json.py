@@ -1,6 +1,4 @@
-"""objects.json, the file of a map's objects and of the ground truth: the one place that writes and reads it."""
-
-from __future__ import annotations
+"""Read and write objects.json, the file format of object maps and of ground truth."""
 
 import json
 import math
@@ -16,30 +14,26 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import TruthObject
 from objslam.errors import LogError, ObjslamError, OutputError
 
-FORMAT = "objslam.objects/1"  # What the member "format" says: the kind of file and its version.
-
+FORMAT = "objslam.objects/1"  # The value of the key "format", which is the file type and its version.
 _T = TypeVar("_T")
 
 
 class _Malformed(OutputError):
-    """What is wrong with an entry; a reader of files adds the file and raises its own kind of error."""
+    """An entry is malformed. The public functions convert this error to an error with the file name."""
 
 
 def dump_objects(objects: ObjectMap) -> str:
-    """The text of objects.json for a map; `read_objects` gives the same map back, to the last bit.
-
-    What is not finite becomes null, because JSON has no NaN.
-    """
+    """Return the text of objects.json for a map. `read_objects` restores all bits. NaN becomes null for valid JSON."""
     return _dump([_entry(o) for o in objects.objects], objects.frame)
 
 
 def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
-    """The text of a ground truth file; `read_truth_objects` gives the same objects back."""
+    """Return the text of a ground truth file. `read_truth_objects` restores the same objects."""
     return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map")
 
 
 def read_objects(file: Path) -> ObjectMap:
-    """The map that an objects.json holds; OutputError names the file and the object that is not as `dump_objects` writes."""
+    """Read the map of an objects.json. Raises OutputError with the file and the malformed object."""
     try:
         return parse_objects(_load(file))
     except _Malformed as malformed:
@@ -47,18 +41,16 @@ def read_objects(file: Path) -> ObjectMap:
 
 
 def parse_objects(data: dict[str, Any]) -> ObjectMap:
-    """The map in the data of an objects.json, as `json.loads` gives it; OutputError where that is something else."""
+    """Return the map in the decoded JSON data of an objects.json. Raises OutputError if the data are malformed."""
     if data.get("format") != FORMAT:
         raise _Malformed(f"format is {data.get('format')!r}, not {FORMAT!r}")
-    frame = _text(data.get("frame", "map"), "frame")
-    return ObjectMap(_each(data, _map_object), frame)
+    return ObjectMap(_each(data, _map_object), _text(data.get("frame", "map"), "frame"))
 
 
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
-    """The objects of a ground truth file: objects.json with at least id, label and position (m, in map) of each.
+    """Read a ground truth file, an objects.json with at least id, label and position (m, in map) of each object.
 
-    The map of another run serves as well; its unresolved objects have no position to compare with and are left out.
-    `error` is raised, with the file and the object, where the file is malformed.
+    Unresolved objects in the map of a run are skipped. A malformed file raises `error` with the file and the object.
     """
     try:
         data = _load(file)
@@ -70,7 +62,7 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
 
 
 def _dump(entries: list[dict[str, Any]], frame: str) -> str:
-    """One line per object, so that two files can be compared line by line."""
+    """Return the text of the file, with one line per object for line-based comparison of two files."""
     head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": ['
     lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
     return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
@@ -106,16 +98,14 @@ def _null(x: float) -> float | None:
 
 def _load(file: Path) -> dict[str, Any]:
     try:
-        text = file.read_text(encoding="utf-8-sig")
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise _Malformed(f"cannot read the objects: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise _Malformed(f"not text in UTF-8 (byte {error.start})") from error
-    try:
-        data = json.loads(text)
+        raise _Malformed(f"not UTF-8 text (byte {error.start})") from error
     except json.JSONDecodeError as error:
         raise _Malformed(f"not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
-    except (ValueError, RecursionError) as error:  # an integer of thousands of digits, or deeply nested brackets
+    except (ValueError, RecursionError) as error:  # An integer has thousands of digits, or brackets are deeply nested.
         raise _Malformed(f"not JSON that can be read: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
         raise _Malformed('not an objects file: a mapping with a list under "objects" is needed')
@@ -131,7 +121,7 @@ def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[
                 raise _Malformed("not a mapping")
             number = _integer(entry, "id")
             if number in seen:
-                raise _Malformed(f"id {number} is there twice")
+                raise _Malformed(f"id {number} occurs twice")
             seen.add(number)
             parsed.append(parse(entry))
         except _Malformed as malformed:
@@ -149,19 +139,17 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
     status = entry.get("status")
     if status not in ("ok", "unresolved"):
         raise _Malformed(f'status must be "ok" or "unresolved", got {status!r}')
-    covariance, extent, ray = entry.get("covariance"), entry.get("extent"), entry.get("ray")
+    covariance, extent, ray, labels = (entry.get(name) for name in ("covariance", "extent", "ray", "labels"))
     if covariance is not None:
         if not isinstance(covariance, list) or len(covariance) != 3:
             raise _Malformed("covariance must be 3 rows of 3 numbers, or null")
         covariance = np.stack([_vector(row, "a row of covariance") for row in covariance])
     if extent is not None:
-        width, height = _vector(extent, "extent", 2).tolist()
-        extent = (width, height)
+        extent = tuple(_vector(extent, "extent", 2).tolist())
     if ray is not None:
         if not isinstance(ray, dict):
             raise _Malformed("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
-    labels, existence = entry.get("labels"), entry.get("existence")
     if labels is not None:
         if not isinstance(labels, dict):
             raise _Malformed("labels must be a mapping of labels to shares")
@@ -181,7 +169,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         extent=extent,
         ray=ray,
         labels=labels,
-        existence=None if existence is None else _number(existence, "existence"),
+        existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
     )
 
 
@@ -193,7 +181,7 @@ def _integer(entry: dict[str, Any], name: str) -> int:
 
 
 def _text(value: Any, name: str) -> str:
-    # half of a surrogate pair is valid JSON, but cannot be written to a file
+    # An unpaired surrogate is valid JSON, but cannot be written to a file.
     if not isinstance(value, str) or not value or any("\ud800" <= c <= "\udfff" for c in value):
         raise _Malformed(f"{name} must be text, got {_short(value)}")
     return value
@@ -203,7 +191,7 @@ def _number(value: Any, name: str, null: bool = False) -> float:
     if value is None and null:
         return math.nan
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    # compared before float(): an integer may be greater than any float
+    # The comparison is before float(), because an integer can exceed the largest float.
     if not good or not -sys.float_info.max <= value <= sys.float_info.max:
         raise _Malformed(f"{name} must be a finite number, got {_short(value)}")
     return float(value)

@@ -1,6 +1,4 @@
-"""motions.parquet: what the odometry measured between the poses of a result, for exports and other optimisers."""
-
-from __future__ import annotations
+"""Read and write motions.parquet, the odometry between the poses of a result, for exports and other optimisers."""
 
 import io
 from dataclasses import dataclass
@@ -11,21 +9,21 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.errors import OutputError
 
-_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # How many numbers each column has in a row.
+_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # The numbers per row of each column.
 
 
 @dataclass(frozen=True)
 class Motions:
-    """Measured motions between consecutive poses of the base."""
+    """The measured motions between consecutive poses of the base."""
 
-    before: Floats  # (M,) s, the stamps of the poses before.
-    after: Floats  # (M,) s, the stamps of the poses after.
+    before: Floats  # (M,) timestamp of the first pose, s.
+    after: Floats  # (M,) timestamp of the second pose, s.
     motion: Floats  # (M, 4, 4) before_T_after.
-    covariance: Floats  # (M, 6, 6), translation (m) first, then rotation (rad), in the frame of the pose after.
+    covariance: Floats  # (M, 6, 6), translation (m), then rotation (rad), in the frame of the second pose.
 
 
 def dump_motions(motions: Motions) -> bytes:
-    """The content of motions.parquet: one row per motion, matrices row by row."""
+    """Return the content of motions.parquet, with one row per motion and matrices in row-major order."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -39,7 +37,7 @@ def dump_motions(motions: Motions) -> bytes:
 
 
 def read_motions(file: Path) -> Motions:
-    """What `dump_motions` wrote; OutputError where the file is not that."""
+    """Read a motions.parquet. Raises OutputError for any other content."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,6 +1,4 @@
-"""Surfaces as PLY files (binary, little endian), for MeshLab, CloudCompare, Blender and Open3D."""
-
-from __future__ import annotations
+"""Write surfaces as PLY files (binary, little endian) for MeshLab, CloudCompare, Blender and Open3D."""
 
 from pathlib import Path
 
@@ -10,18 +8,18 @@ from objslam.core.types import Surface
 
 
 def write_mesh(surface: Surface, file: Path) -> None:
-    """Write vertices (m) with their colours, and triangles; OSError when the file cannot be written."""
-    _write(surface, file, normals=False, triangles=True)
+    """Write vertices (m), colours and triangles. Raises OSError if the file cannot be written."""
+    _write(surface, file, triangles=True)
 
 
 def write_cloud(surface: Surface, file: Path) -> None:
-    """Write the vertices alone, with normals and colours; OSError when the file cannot be written."""
-    _write(surface, file, normals=True, triangles=False)
+    """Write vertices (m), normals and colours without triangles. Raises OSError if the file cannot be written."""
+    _write(surface, file, triangles=False)
 
 
-def _write(surface: Surface, file: Path, *, normals: bool, triangles: bool) -> None:
+def _write(surface: Surface, file: Path, *, triangles: bool) -> None:
     columns = {"x y z": surface.vertices.astype("<f4")}
-    if normals:
+    if not triangles:
         columns["nx ny nz"] = surface.normals.astype("<f4")
     if surface.colours is not None:
         columns["red green blue"] = surface.colours

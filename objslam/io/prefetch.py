@@ -1,6 +1,4 @@
-"""Work on items ahead of the one who takes them, in threads."""
-
-from __future__ import annotations
+"""Process items in threads before the consumer needs them."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -8,16 +6,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 _In = TypeVar("_In")
-
-
 _Out = TypeVar("_Out")
-
-
-_THREADS = 2  # a PNG takes longer to decode than a network on a GPU takes
+_THREADS = 2  # The number of threads. A single thread decodes PNG images slower than a network on a GPU runs.
 
 
 def ahead(work: Callable[[_In], _Out], items: Iterable[_In], depth: int) -> Iterator[_Out]:
-    """work(item) for each item, in order, done in threads that are at most `depth` items ahead."""
+    """Yield work(item) for each item in order. Threads process at most `depth` items in advance."""
     waiting: deque[Future[_Out]] = deque()
     pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="objslam-images")
     try:

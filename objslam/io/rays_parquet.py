@@ -1,6 +1,4 @@
-"""rays.parquet, the file of a result's rays: the one place that writes and reads it."""
-
-from __future__ import annotations
+"""Read and write rays.parquet, the file with the rays of a result."""
 
 import io
 from dataclasses import dataclass
@@ -16,29 +14,25 @@ from objslam.io.atomic_files import encode
 
 @dataclass(frozen=True)
 class RaysTable:
-    """All rays of a result, one row each."""
+    """All rays of a result, with one row per ray."""
 
-    object: Ints  # (R,) the object's id; -1 for none.
-    stamp: Floats  # (R,) s.
-    origin: Floats  # (R, 3) m in map.
-    direction: Floats  # (R, 3) unit vectors in map.
-    residual: Floats  # (R,) rad, the angle of the object off its ray; NaN without object.
-    weight: Floats  # (R,) the robust weight, in [0, 1].
-    score: Floats  # (R,) that of the box.
-    camera: Any  # (R,) names.
-    box: Floats  # (R, 4) x1, y1, x2, y2 in px of the raw image.
-    label: Any  # (R,) the label of the box.
+    object: Ints  # (R,) object id, -1 for an unassigned ray.
+    stamp: Floats  # (R,) timestamp, s.
+    origin: Floats  # (R, 3) m, in map.
+    direction: Floats  # (R, 3) unit vector, in map.
+    residual: Floats  # (R,) angle between ray and object, rad, NaN for an unassigned ray.
+    weight: Floats  # (R,) robust weight, in [0, 1].
+    score: Floats  # (R,) score of the box.
+    camera: Any  # (R,) camera name.
+    box: Floats  # (R, 4) x1, y1, x2, y2, px of the raw image.
+    label: Any  # (R,) label of the box.
 
     def __len__(self) -> int:
         return len(self.object)
 
 
 def dump_rays(rays: RaysTable) -> bytes:
-    """The content of rays.parquet; an object of -1 and a residual of NaN become null.
-
-    Raises:
-        OutputError: a label or the name of a camera is no text that a file can hold.
-    """
+    """Return the content of rays.parquet. Object -1 and residual NaN become null. Raises OutputError for invalid text."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -70,36 +64,34 @@ def dump_rays(rays: RaysTable) -> bytes:
 
 
 def read_rays(file: Path) -> RaysTable:
-    """The rays that `dump_rays` wrote; OutputError where the file is missing, damaged, or of an older version."""
+    """Read a rays.parquet. Raises OutputError if the file is missing, damaged or from an older version."""
     import pyarrow as pa
     import pyarrow.parquet as pq
+
+    def numbers(name: str) -> Floats:
+        return np.asarray(table[name].to_numpy(), dtype=np.float64)
+
+    def rows(name: str, length: int) -> Floats:
+        return np.asarray(table[name].combine_chunks().flatten().to_numpy(), dtype=np.float64).reshape(-1, length)
 
     try:
         table = pq.read_table(file)
         index = table["object"]
         return RaysTable(
             object=np.where(index.is_null(), -1, index.fill_null(-1).to_numpy()).astype(np.int64),
-            stamp=_numbers(table["stamp"]),
-            origin=_rows(table["origin"], 3),
-            direction=_rows(table["direction"], 3),
-            residual=_numbers(table["residual"]),
-            weight=_numbers(table["weight"]),
-            score=_numbers(table["score"]),
+            stamp=numbers("stamp"),
+            origin=rows("origin", 3),
+            direction=rows("direction", 3),
+            residual=numbers("residual"),
+            weight=numbers("weight"),
+            score=numbers("score"),
             camera=np.array(table["camera"].to_pylist(), dtype=object),
-            box=_rows(table["box"], 4),
+            box=rows("box", 4),
             label=np.array(table["label"].to_pylist(), dtype=object),
         )
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
     except KeyError as error:
-        raise OutputError(f"there is no column {error}", where=str(file), hint="run again") from error
+        raise OutputError(f"the column {error} is missing", where=str(file), hint="run again") from error
     except (pa.ArrowException, ValueError) as error:
         raise OutputError(f"is damaged: {str(error).splitlines()[0]}", where=str(file), hint="run again") from error
-
-
-def _rows(column: Any, length: int) -> Floats:
-    return _numbers(column.combine_chunks().flatten()).reshape(-1, length)
-
-
-def _numbers(column: Any) -> Floats:
-    return np.asarray(column.to_numpy(), dtype=np.float64)

@@ -1,6 +1,4 @@
-"""Files that a log names must lie inside the log."""
-
-from __future__ import annotations
+"""Check that the files that a log lists are inside its folder."""
 
 import os
 import stat
@@ -8,33 +6,31 @@ from pathlib import Path
 
 
 class Inside:
-    """Tells which files are regular files that lie inside a folder, symbolic links followed."""
+    """Check whether files are regular files inside a folder after resolving symbolic links."""
 
     def __init__(self, folder: Path) -> None:
         self._root = os.path.realpath(folder)
-        self._folders: dict[str, bool] = {}  # the many files of a log lie in few folders: each is followed once
+        self._folders: dict[str, bool] = {}  # A cache, because the many files of a log are in few folders.
 
     def reason_against(self, path: Path) -> str | None:
-        """Why the path, below the folder as it is written, is not to be used; None if it is."""
-        if not self._folder_inside(str(path.parent)):
+        """Return the reason to reject a path below the folder, None if the path is valid."""
+        folder = str(path.parent)
+        if folder not in self._folders:
+            self._folders[folder] = self._contains(folder)
+        if not self._folders[folder]:
             return "leaves the folder"
         try:
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode):
-                if not self._within(os.path.realpath(path)):
+                if not self._contains(path):
                     return "leaves the folder"
                 mode = path.stat().st_mode
-        except (OSError, ValueError):  # ValueError: a NUL in the path
+        except (OSError, ValueError):  # A path with a NUL character raises ValueError.
             return "is missing"
         return None if stat.S_ISREG(mode) else "is not a regular file"
 
-    def _folder_inside(self, folder: str) -> bool:
-        if folder not in self._folders:
-            try:
-                self._folders[folder] = self._within(os.path.realpath(folder))
-            except (OSError, ValueError):
-                self._folders[folder] = False
-        return self._folders[folder]
-
-    def _within(self, real: str) -> bool:
-        return os.path.commonpath([self._root, real]) == self._root
+    def _contains(self, path: str | Path) -> bool:
+        try:
+            return os.path.commonpath([self._root, os.path.realpath(path)]) == self._root
+        except (OSError, ValueError):
+            return False

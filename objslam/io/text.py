@@ -1,12 +1,10 @@
-"""Text files of a log, read line by line without trust: what is malformed is dropped and counted by file and line."""
-
-from __future__ import annotations
+"""Read text files of a log line by line. Malformed lines are dropped and counted with file and line."""
 
 import gzip
 import io
 import stat
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -18,26 +16,22 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
-_PLACES = 3  # as many places as a ledger keeps
-_MAX_UNPACKED = 1 << 30  # bytes; a day of poses at 200 Hz
+_PLACES = 3  # The number of places that a ledger keeps per reason.
+_MAX_UNPACKED = 1 << 30  # The size limit of an unpacked file, bytes, enough for a day of poses at 200 Hz.
 
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers read from a text file.
+    """Numbers of a text file."""
 
-    values: (N, C), finite. lines: (N,) line numbers in the file, from 1. rows: (N,) which row of the file each one is, from
-    0, malformed rows counted too: files that belong together row by row stay in step.
-    """
-
-    values: Floats
-    lines: Ints
-    rows: Ints
+    values: Floats  # (N, C), finite.
+    lines: Ints  # (N,) line numbers, from 1.
+    rows: Ints  # (N,) row numbers, from 0. Dropped rows count too, so that rows of several files can be matched by number.
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn what the file system refuses into a LogError that names the file, `path` where the system names none."""
+    """Convert OSError to LogError with the name of the failing file, or `path` if the error has no file name."""
     try:
         yield
     except OSError as error:
@@ -46,7 +40,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The content of a regular file, unpacked if its name ends in .gz; LogError names the file otherwise."""
+    """Return the content of a regular file, unpacked if its suffix is .gz. Raises LogError if the file is unreadable."""
     with reading(path):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -66,12 +60,12 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_lines(path: Path, ledger: Ledger) -> list[tuple[int, str]]:
-    """The lines of a UTF-8 text file that hold something, with their numbers from 1, stripped; '#' lines are comments."""
+    """Return line number, from 1, and stripped text of all lines of a UTF-8 file except empty lines and '#' comments."""
     return split_lines(read_bytes(path), str(path), ledger)
 
 
 def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]]:
-    """As `read_lines`, from bytes; `place` names where they came from. Lines that are not UTF-8 are dropped and counted."""
+    """Split bytes as `read_lines` does. Lines that are not UTF-8 are dropped and counted at `place`."""
     damaged = False
     try:
         text = data.decode("utf-8-sig")
@@ -89,12 +83,11 @@ def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]
 
 
 def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
-    """The rows of a text file of numbers in `columns` columns apart by white space.
+    """Read a text file of `columns` numbers per row, separated by white space. Raises LogError if no row is valid.
 
-    A row with another number of columns, with something that is no number, or with a value that is not finite is dropped and
-    counted as a `what` line. LogError where no row is left.
+    Rows with a wrong number of columns or a value that is not finite are dropped and counted as `what` lines.
     """
-    values, lines, rows = [], [], []
+    values, places = [], []
     numbered = read_lines(path, ledger)
     for row, (line, text) in enumerate(numbered):
         numbers = parse_numbers(text.split())
@@ -102,9 +95,8 @@ def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
             ledger.drop(f"{what} line that is not {columns} numbers", where=f"{path}:{line}")
             continue
         values.append(numbers)
-        lines.append(line)
-        rows.append(row)
-    table = Table(np.array(values).reshape(-1, columns), np.array(lines, dtype=np.int64), np.array(rows, dtype=np.int64))
+        places.append((line, row))
+    table = Table(np.array(values).reshape(-1, columns), *np.array(places, dtype=np.int64).reshape(-1, 2).T)
     finite = np.asarray(np.isfinite(table.values).all(axis=1))
     table = select(table, finite, f"{what} line with a value that is not finite", path, ledger)
     if not len(table.lines):
@@ -114,23 +106,27 @@ def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
 
 
 def select(table: Table, keep: Bools, reason: str, path: Path, ledger: Ledger) -> Table:
-    """The rows of a table where `keep`; the others are counted for `reason`."""
-    if keep.all():
-        return table
+    """Return the rows of a table that `keep` (N,) marks, and count the other rows as drops for `reason`."""
     count_drops(reason, int((~keep).sum()), (f"{path}:{line}" for line in table.lines[~keep]), ledger)
     return Table(table.values[keep], table.lines[keep], table.rows[keep])
 
 
 def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) -> None:
-    """Count `count` drops for `reason`, naming the first of their places."""
+    """Count `count` drops for `reason`, with the first of their places."""
     first = list(islice(places, min(count, _PLACES)))
     for place in first:
         ledger.drop(reason, where=place)
     ledger.drop(reason, count - len(first))
 
 
+def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
+    """Count the rows that `bad` (N,) marks as drops for `reason`. `places` has the place of each row."""
+    rows = np.flatnonzero(bad).tolist()
+    count_drops(reason, len(rows), (places[i] for i in rows), ledger)
+
+
 def parse_numbers(fields: list[str]) -> list[float] | None:
-    """The fields as numbers, None if one is not; what only Python takes for a number (1_000, other digits) is not one."""
+    """Return the fields as numbers, None if one is invalid. Python-only numbers (1_000, other digits) are invalid."""
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
@@ -140,11 +136,11 @@ def parse_numbers(fields: list[str]) -> list[float] | None:
 
 
 def in_order(stamps: Floats, repeats: bool = False) -> Bools:
-    """Which of the stamps (N,) go forward in time, (N,): those after every stamp before them.
+    """Return which timestamps (N,) are later than all previous timestamps, (N,).
 
-    What comes after the clock jumped back is left out until it passes the latest stamp: it is not sorted into the past. A
-    stamp that alone stands out into the future, so that two or more after it go on from the one before it, is itself left
-    out. With `repeats`, a stamp may equal the one before.
+    After a backward jump of the clock, timestamps are rejected until they pass the latest timestamp. A single outlier in
+    the future is rejected if the next two timestamps continue from the timestamp before it. With `repeats`, a timestamp may
+    equal its predecessor.
     """
     before = np.concatenate([[-np.inf], stamps])[:-1]
     alone = np.zeros(len(stamps), dtype=bool)

@@ -1,6 +1,4 @@
-"""Trajectories in TUM format: "stamp tx ty tz qx qy qz qw" a line, '#' comments."""
-
-from __future__ import annotations
+"""Trajectories in TUM format, with "stamp tx ty tz qx qy qz qw" per line and '#' comments."""
 
 from pathlib import Path
 
@@ -16,15 +14,15 @@ _HEADER = "# stamp tx ty tz qx qy qz qw\n"
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
-    """Read a trajectory file (also packed, .gz); stamps in s, translations in m, quaternions x y z w of any length but zero.
+    """Read a trajectory file, also with suffix .gz, with timestamps in s, translations in m and quaternions x y z w.
 
-    Malformed lines and stamps that repeat or go back are dropped and counted. LogError where no pose is left.
+    Malformed lines, zero quaternions and late timestamps are dropped and counted. Raises LogError if no pose is valid.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
 
 def read_pose_table(path: Path, ledger: Ledger) -> Table:
-    """As `read_trajectory`, as a table of 8 columns."""
+    """Read a trajectory file as `read_trajectory` does, and return a table of 8 columns."""
     table = read_table(path, 8, ledger, "pose")
     with np.errstate(over="ignore"):
         length = np.linalg.norm(table.values[:, 4:], axis=1)
@@ -42,12 +40,12 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
 
 
 def to_trajectory(table: Table) -> Trajectory:
-    """The trajectory of a table that `read_pose_table` gave."""
+    """Return the trajectory of a table from `read_pose_table`."""
     return Trajectory(table.values[:, 0], pose_from_quaternion(table.values[:, 1:4], table.values[:, 4:]))
 
 
 def write_trajectory(trajectory: Trajectory, path: Path) -> None:
-    """Write a trajectory file; every number reads back as the same float."""
+    """Write a trajectory file. Every number is read back as the same float."""
     poses = trajectory.poses
     values = np.column_stack([trajectory.stamps, poses[:, :3, 3], quaternion(poses)]).tolist()
     path.write_text(_HEADER + "".join(" ".join(map(repr, row)) + "\n" for row in values), encoding="utf-8")

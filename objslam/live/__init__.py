@@ -1,4 +1,1 @@
-"""Live: the map while the robot drives, shown and published as it grows.
-
-A log that is complete is mapped by `mapping`; the session here shares its rooms with it, but for the driver.
-"""
+"""Live: the map of a running robot, which is shown while it grows. `mapping` maps a complete log offline."""

@@ -1,6 +1,4 @@
-"""What a session counts: accepted messages, drops by reason, and how long updates take."""
-
-from __future__ import annotations
+"""Counters of a session: accepted messages, dropped messages by reason, and the duration of map updates."""
 
 import threading
 from collections import Counter, deque
@@ -10,8 +8,7 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.sources.journal.records import FrameMessage
 
-_WINDOW = 2000
-"""Updates that the percentiles are of; more follow a change later."""
+_WINDOW = 2000  # The number of updates behind the percentiles. A larger number makes the percentiles follow a change later.
 
 
 class _Guarded(Ledger):
@@ -31,7 +28,7 @@ class _Guarded(Ledger):
 
 
 class Counters:
-    """Counts from any thread; `ledger` holds the drops with the first few places, as everywhere."""
+    """Counters that any thread may change. `ledger` holds the drops with their first few places."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -40,36 +37,36 @@ class Counters:
         self.ledger: Ledger = _Guarded(self._lock)
 
     def accept(self, kind: str, count: int = 1) -> None:
-        """One more message, or event, of a kind."""
+        """Count accepted messages or events of a kind."""
         with self._lock:
             self._accepted[kind] += count
 
     def drop(self, reason: str, where: str | None = None, count: int = 1) -> None:
-        """One more message dropped for a reason."""
+        """Count dropped messages by their reason."""
         self.ledger.drop(reason, count, where)
 
     def drop_frame(self, frame: FrameMessage, reason: str) -> None:
-        """One more frame that is not looked at, and its boxes."""
+        """Count a dropped frame and its boxes."""
         self.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
-        self.drop(reason.replace("frames", "boxes", 1), count=len(frame.labels))
+        self.drop(reason.replace("frames", "boxes", 1), count=len(frame))
 
     def updated(self, seconds: float) -> None:
-        """A frame is in the map; seconds: from its push until then."""
+        """Record the time, s, from the push of a frame until the map contains it."""
         with self._lock:
             self._seconds.append(seconds)
 
     def accepted(self) -> dict[str, int]:
-        """Messages and events by kind."""
+        """Return the number of accepted messages and events by kind."""
         with self._lock:
             return dict(self._accepted)
 
     def dropped(self) -> dict[str, int]:
-        """Drops by reason."""
+        """Return the number of dropped messages by reason."""
         with self._lock:
             return dict(self.ledger.dropped)
 
     def update(self) -> tuple[float, float]:
-        """Median and 99th percentile of the last updates, s; 0 before the first."""
+        """Return the median and the 99th percentile of the recent update times, s; 0 before the first update."""
         with self._lock:
             seconds = np.array(self._seconds)
         return (float(np.median(seconds)), float(np.quantile(seconds, 0.99))) if len(seconds) else (0.0, 0.0)

@@ -1,6 +1,4 @@
-"""What an adapter pushes, and what a session shows of itself: the seam between middleware and the map."""
-
-from __future__ import annotations
+"""The interface between adapters, which push messages, and a session, which maps them."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -10,27 +8,23 @@ from objslam.core.camera import Camera
 
 
 class Sink(Protocol):
-    """Where messages go. A push returns at once: True, accepted, or False, dropped and counted.
+    """Receives messages from any thread. A push returns at once: True if accepted, False if dropped and counted.
 
-    Callable from any thread. No message, however bad (not finite, back in time, a camera that nobody knows), raises.
-    Frames as everywhere: `map`, `odom`, `base`, and a camera's optical frame, which goes by the camera's name.
+    No message raises an error, even if it is not finite, goes back in time or names an unknown camera.
+    The frames are `map`, `odom`, `base`, and the optical frame of each camera, which has the camera's name.
     """
 
     def push_camera(self, camera: Camera) -> bool:
-        """A calibrated camera (a CameraInfo, say); its base_T_camera holds until a transform says otherwise."""
-        ...
+        """Push a calibrated camera. Its base_T_camera holds until `push_mount` replaces it."""
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """odom_T_base (4, 4) at stamp, s; covariance: (6, 6) in the order of ROS, x, y, z, roll, pitch, yaw."""
-        ...
+        """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6) in the order of ROS, x, y, z, roll, pitch, yaw."""
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """map_T_base (4, 4) at stamp, s, from a localisation; covariance likewise."""
-        ...
+        """Push map_T_base (4, 4) of a localisation at a stamp, s. covariance: as in `push_odometry`."""
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
-        """base_T_camera (4, 4) of a camera that moves on the robot, from this stamp, s, until the next."""
-        ...
+        """Push base_T_camera (4, 4) of a camera that moves on the robot. It holds from the stamp, s, to the next."""
 
     def push_detections(
         self,
@@ -43,9 +37,8 @@ class Sink(Protocol):
         track_ids: Sequence[int] | None = None,
         whole: bool = False,
     ) -> bool:
-        """All boxes of one image: (B, 4) raw px, labels B, scores (B,), depths (B,) z in m or NaN, track_ids B or -1.
+        """Push all boxes of one image. Push an image without a box too, because a missed object is evidence.
 
-        An image without a box is pushed too: what was not seen is evidence. whole: as `types.Detections` has it, for
-        fiducials, which are used up to the image's edge.
+        boxes: (B, 4) raw px. scores: (B,). depths: (B,) z in m, NaN where unknown. track_ids: B ids, -1 where unknown.
+        whole: as in `types.Detections`, True for fiducials, which are used up to the image's edge.
         """
-        ...

@@ -1,4 +1,4 @@
-"""The offline driver: a whole log becomes a map of objects, in turns of association and solve.
+"""The offline driver: association and solve alternate until a whole log has become a map of objects.
 
-The live driver is `live`; what a result looks like on disk or on the screen is `output`.
+The live driver is in `live`, and the output on disk or screen is in `output`.
 """

@@ -1,9 +1,10 @@
-"""Association and solve: once where the poses are known, in turns where they move each other."""
+"""Alternate association and solve until the association is stable, or do each once if the poses are fixed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,26 +27,26 @@ if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
-# What solved poses still err by, seen from the objects: with it an association at them is neither too sure nor too tolerant.
-_SOLVED_XY = 0.02  # m
-_SOLVED_YAW = 0.005  # rad
-_FIRST = 2.0  # times that, before the first solve
-_USUAL = 0.12  # share of boxes that are false, or of moving things, in any log
-
+_SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
+"""The noise (m, rad) of solved poses, as the objects see it. Larger values let an association tolerate larger residuals."""
+_FIRST = 2.0
+"""The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
+_USUAL = 0.12
+"""The usual share of boxes that are false or show moving objects. A larger share warns less often."""
 MANY, SECOND = 5, 0.25
-"""How many of a label's rays, and what share of them, disagree with its one object if there is a second; larger believes in
-fewer second objects."""
+"""The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
+values accept fewer second objects."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage's name, what is done and the total (0 when it is not known)."""
+"""A function of the stage's name, the work done, and the total work (0 if it is unknown)."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Which ray belongs to which object, the estimate, and what each round of the two did.
+    """The association, the estimate, and counts of each round.
 
-    rays, keyframes: those that were solved, the keyframes without a ray left out; rays.keyframe counts in them. trace: for
-    the recording, empty where there is none.
+    keyframes: the solved keyframes, which have at least one ray. rays: their rays, with indices into these keyframes. trace:
+    the rounds for the recording, empty without a recording.
     """
 
     keyframes: Keyframes
@@ -66,16 +67,16 @@ def solve(
     start: InitialEstimate | None = None,
     errors: SharedErrors | None = None,
 ) -> Solution:
-    """Find and solve the objects of a log; frames are all that have a pose, those without a ray too.
+    """Find and solve the objects of a log.
 
-    start: what is known already of the keyframes with a ray, where the joint mode need not explore nor trust labels.
-    errors: the errors that all measurements share, for the keyframes with a ray. Joint mode estimates them.
+    In fixed mode the association runs once, at the given poses. In joint mode the poses are explored first. Then association
+    and solve alternate until no ray changes its object. If the settings ask for it, every label is one object instead. The
+    joint mode also tries this if no frame has two boxes of one label, and keeps it if the rays agree.
 
-    Where the settings say so, every label is one object; in joint mode also where no frame has two boxes of one label, and
-    the rays bear it out: the graph grows with that knowledge. Else the association is global: in fixed mode once, at the
-    poses as they are; in joint mode the poses are explored first, then association and solve take turns until no ray changes
-    its object.
-    SolveError where joint mode has neither odometry nor localisation.
+    frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With a start, the
+    joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. The joint mode
+    estimates them, and takes them out of the solution's keyframes and rays. SolveError if the joint mode has neither odometry
+    nor localisation.
     """
     from objslam.graph import batch_solver
     from objslam.graph.fixed_pose_triangulation import pose_noise, triangulate_at
@@ -84,7 +85,7 @@ def solve(
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     if settings.mode == "fixed":
         if not frames.localized_every:
-            ledger.warn("the poses are odometry, taken as they are: the map drifts as they do (--mode joint corrects both)")
+            ledger.warn("the poses are plain odometry, so the map drifts with them (--mode joint corrects both)")
         progress("association", 0, 0)
         if settings.association.method == "by_label":
             association = associate_by_label(rays_of_keyframes)
@@ -96,18 +97,24 @@ def solve(
         estimate = batch_solver.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
         if trace is not None:
             trace.end_round("fixed", association, estimate)
-        _count_unexplained(rays_of_keyframes, association, ledger)
-        return Solution(keyframes, rays_of_keyframes, association, estimate, (), tuple(trace.rounds if trace else ()))
-    if not frames.localized_every and frames.odom_T_base is None:
-        raise SolveError("the joint mode needs odometry or localisation")
-    return _joint(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start, errors)
+        rounds: list[dict[str, int]] = []
+    elif not frames.localized_every and frames.odom_T_base is None:
+        raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
+    else:
+        association, estimate, rounds = _joint(
+            frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start, errors
+        )
+        if errors is not None and estimate.calibration is not None:
+            keyframes, rays_of_keyframes, _ = errors.at(estimate.calibration.values)
+    _count_unexplained(rays_of_keyframes, association, ledger)
+    recorded = tuple(trace.rounds if trace else ())
+    return Solution(keyframes, rays_of_keyframes, association, estimate, tuple(rounds), recorded)
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Only the keyframes that have a ray: the others would be poses that nothing but the odometry holds."""
+    """Return the keyframes that have a ray, and the rays with indices into them. Only odometry holds other poses."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
-    values = {**vars(rays), "keyframe": keyframe.astype(np.int64)}
-    return keyframes.take(kept), Rays(**values)
+    return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
 
 
 def _joint(
@@ -122,19 +129,21 @@ def _joint(
     trace: Trace | None,
     start: InitialEstimate | None,
     errors: SharedErrors | None,
-) -> Solution:
+) -> tuple[Association, Estimate, list[dict[str, int]]]:
     from objslam.graph import batch_solver
     from objslam.graph.init_unknown_correspondences import initialize_unknown
 
-    def tell(done: int, total: int) -> None:
-        progress("solve", done, total)
-
     theta: Floats | None = None
+    measured = frames, all_rays
 
     def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
-        nonlocal theta
-        solved = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, tell, start, trace, errors, theta)
-        theta = None if solved.calibration is None else solved.calibration.values
+        nonlocal theta, keyframes, rays
+        solved = batch_solver.solve_joint(
+            keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, theta
+        )
+        if errors is not None and solved.calibration is not None:
+            theta = solved.calibration.values
+            keyframes, rays, _ = errors.at(theta)
         if trace is not None:
             trace.end_round(why, association, solved)
         return solved
@@ -143,26 +152,22 @@ def _joint(
         by_label = associate_by_label(rays)
         solved = solve_round("labels", by_label)
         if _labels_tell(settings, by_label, solved.weight):
-            _count_unexplained(rays, by_label, ledger)
-            keyframes, rays = _corrected(errors, theta, keyframes, rays)
-            return Solution(keyframes, rays, by_label, solved, (), tuple(trace.rounds if trace else ()))
+            return by_label, solved, []
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
     if start is None and not keyframes.localized_every:
-        start = initialize_unknown(keyframes, rays, cameras, settings, lambda done, total: progress("explore", done, total))
+        start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
-    seen, seen_rays, everything = keyframes, rays, (frames, all_rays)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
     estimate: Estimate | None = None
     for number in range(settings.joint.max_rounds):
         progress(f"association, round {number + 1}", 0, 0)
         if errors is not None and theta is not None:
-            frames, all_rays = _corrected(errors, theta, *everything)
-            keyframes, rays = _corrected(errors, theta, seen, seen_rays)
+            frames, all_rays, _ = errors.take(*measured).at(theta, drift=False)
         at = correct_poses(frames.stamps, frames.map_T_base, keyframes.stamps, keyframes.map_T_base, map_T_base)
         scale = 1.0 if rounds else _FIRST
         noise = np.hypot(all_rays.sigma, scale * _SOLVED_YAW), scale * _SOLVED_XY
@@ -185,18 +190,7 @@ def _joint(
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
     assert estimate is not None
-    _count_unexplained(rays, association, ledger)
-    keyframes, rays = _corrected(errors, theta, seen, seen_rays)
-    return Solution(keyframes, rays, association, estimate, tuple(rounds), tuple(trace.rounds if trace else ()))
-
-
-def _corrected(
-    errors: SharedErrors | None, theta: Floats | None, keyframes: Keyframes, rays: Rays
-) -> tuple[Keyframes, Rays]:
-    """Some of the log's keyframes and rays with the shared errors theta (P,) taken out."""
-    if errors is None or theta is None:
-        return keyframes, rays
-    return errors.take(keyframes, rays).at(theta)[:2]
+    return association, estimate, rounds
 
 
 def _associate(
@@ -225,7 +219,7 @@ def _associate(
 
 
 def rays_moved(before: Ints, after: Ints) -> int:
-    """How many rays (R,) went to another object, whatever numbers the objects have: -1 is no object."""
+    """Return how many rays (R,) changed their object. Renumbered objects count as the same. -1 means no object."""
     from scipy.optimize import linear_sum_assignment
 
     shared = np.zeros((before.max(initial=-1) + 1, after.max(initial=-1) + 1), dtype=np.int64)
@@ -236,11 +230,11 @@ def rays_moved(before: Ints, after: Ints) -> int:
 
 
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
-    """Objects of one label that are no further apart than their covariances allow, and never seen in one frame, are one.
+    """Merge pairs of objects of one label whose positions agree within their covariances, and that share no frame.
 
-    Poses that drifted between two visits leave one object twice, and each of the two then holds the poses of its visit: no
-    association at these poses finds out. Joined, they close the loop. Nearest pairs (by Mahalanobis distance) first; an
-    object takes part in one pair at a time.
+    If poses drift between two visits, an object appears twice, and each copy holds the poses of its visit. So no association
+    at these poses can find the error, and a merge closes the loop. The nearest pairs by Mahalanobis distance merge first. An
+    object takes part in one merge at a time. farthest: the largest distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
@@ -265,7 +259,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
     number = np.searchsorted(kept, into)
     weights, existence = association.label_weights, association.existence
     return Association(
-        object=np.append(number, -1)[association.object],  # -1 takes the last
+        object=np.append(number, -1)[association.object],  # -1 indexes the last
         label=association.label[kept],
         label_weights=None if weights is None else weights[kept],
         existence=None if existence is None else existence[kept],
@@ -273,7 +267,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
 
 
 def _may_be_by_label(settings: Settings, rays: Rays) -> bool:
-    """Whether every label may be one object: as set, or because no frame ever has two boxes of one label."""
+    """Return whether every label may be one object: by the settings, or because no frame has two boxes of one label."""
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
     pairs = np.stack([rays.keyframe, rays.label])
@@ -281,7 +275,7 @@ def _may_be_by_label(settings: Settings, rays: Rays) -> bool:
 
 
 def _labels_tell(settings: Settings, association: Association, weight: Floats) -> bool:
-    """Whether the rays bear out that every label is one object: of no label has a large part been rejected (weight 0)."""
+    """Return whether every label is one object: by the settings, or because no label has many rejected rays (weight 0)."""
     if settings.association.method == "by_label":
         return True
     held = association.object >= 0
@@ -291,11 +285,11 @@ def _labels_tell(settings: Settings, association: Association, weight: Floats) -
 
 
 def _count_unexplained(rays: Rays, association: Association, ledger: Ledger) -> None:
-    """Say how many boxes no object explains, where it is more than the usual false boxes, or all of them."""
+    """Warn if there is no object, or if more boxes than usual belong to no object."""
     left = association.object < 0
-    number = np.bincount(rays.label[left], minlength=len(rays.label_names))
     if association.count and left.mean() <= _USUAL:
         return
+    number = np.bincount(rays.label[left], minlength=len(rays.label_names))
     worst = ", ".join(f"{rays.label_names[i]} {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
-    why = "" if association.count else "; an object takes three boxes from three places at least"
+    why = "" if association.count else "; an object needs at least three boxes from three places"
     ledger.warn(f"{left.sum()} of {len(left)} boxes are explained by no object at rest ({worst}){why}")

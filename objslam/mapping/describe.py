@@ -1,6 +1,4 @@
-"""What can be said of a solution: each object with its evidence, and the summary of the run."""
-
-from __future__ import annotations
+"""Describe a solution: each object with its evidence, and the summary of the run."""
 
 import importlib.metadata
 import platform
@@ -23,7 +21,7 @@ from objslam.mapping.alternation import Solution
 
 
 def describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> tuple[ObjectMap, Floats]:
-    """The objects with what can be said of each, counting rays not rejected; and how far off the rays are (R,), rad."""
+    """Return the map of the objects, and the residual (R,), rad, of each ray. Counts of rays leave out rejected rays."""
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
     origins, directions = rays.in_map(map_T_camera)
@@ -90,11 +88,10 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """What summary.json gets; counts: what the driver counted on the way to the solution."""
+    """Return the content of summary.json. counts: numbers of images, frames and boxes from the driver."""
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
-    total = np.bincount(rays.label, minlength=len(rays.label_names))
-    left = np.bincount(unexplained, minlength=len(rays.label_names))
+    total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
     packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,

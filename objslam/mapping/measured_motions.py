@@ -1,21 +1,20 @@
-"""The odometry between the poses of a result, for exports and other optimisers."""
-
-from __future__ import annotations
+"""Compute the odometry between the poses of a result, for exports and other optimisers."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from objslam.core.result import RunResult
+from objslam.core.result import RunResult
 from objslam.io.odometry_parquet import Motions
 
 _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def motions_of(result: RunResult) -> Motions | None:
-    """What the odometry measured between the poses of trajectory.txt, None where the run used none, as in fixed mode."""
+    """Return the motions by odometry between the poses of trajectory.txt, or None if the run used no odometry (fixed mode).
+
+    Their covariances have the translation first.
+    """
     from objslam.graph.factors.odometry import motions
 
     keyframes = result.keyframes

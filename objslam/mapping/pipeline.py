@@ -1,12 +1,9 @@
-"""The offline driver: a whole log becomes a map of objects."""
-
-from __future__ import annotations
+"""Run the offline mapping: turn a whole log into a map of objects."""
 
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +11,6 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
@@ -22,16 +18,15 @@ from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import Progress, Solution, seen_something, solve
+from objslam.mapping.alternation import Progress, seen_something, solve
 from objslam.mapping.describe import describe, summarise
-from objslam.mapping.reconstruction import has_depth, reconstruct
+from objslam.mapping.reconstruction import reconstruct
 
 
 def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
-    """The object map of a log, with everything that a result holds.
+    """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    SolveError when no ray is left to solve; LogError when no frame lies on the path. What was dropped is in the ledger, and
-    with it in the summary.
+    LogError if no frame lies on the path. SolveError if no box gives a usable ray.
     """
     log = _chosen_poses(log, settings)
     seconds: dict[str, float] = {}
@@ -53,14 +48,21 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     path = log.localization or log.odometry
-    assert path is not None  # build_keyframes has refused such a log
+    assert path is not None  # build_keyframes raises LogError otherwise
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     surface, before = None, None
-    if settings.reconstruction.use and has_depth(log):
+    if settings.reconstruction.use and any(c.depth is not None for c in log.cameras):
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # what it drops has been said
+                before = reconstruct(log, path, settings, Ledger(), progress)  # the ledger has its drops already
+    found = [c.detections for c in log.cameras if c.detections is not None]
+    counts = {
+        "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
+        "detection_frames": sum(len(detections.frame_stamps) for detections in found),
+        "frames_on_path": len(frames),
+        "detections": sum(len(detections) for detections in found),
+    }
     return RunResult(
         map=objects,
         keyframes=keyframes,
@@ -71,7 +73,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         directions=directions,
         residual=residual,
         weight=estimate.weight,
-        summary=_summary(log, settings, ledger, len(frames), solution, objects, seconds),
+        summary=summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
         settings=settings,
         cameras=cameras,
         path=path,
@@ -84,10 +86,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
-    """The path through the solved poses (K, 4, 4) of the keyframes.
-
-    Between two of them the odometry tells the way, in joint mode: a localisation's jitter is what the solve has taken out.
-    """
+    """Return the path through the solved poses (K, 4, 4). In joint mode it follows the odometry between keyframes."""
+    # The localisation between two keyframes would bring back its jitter.
     after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
     way = log.odometry
     if settings.mode == "fixed" or way is None or way is path:
@@ -103,7 +103,7 @@ def _chosen_poses(log: Log, settings: Settings) -> Log:
     if use == "auto":
         return log
     if (log.odometry if use == "odometry" else log.localization) is None:
-        raise LogError(f"the log has no {use}", where=log.name, hint="leave poses.use at auto")
+        raise LogError(f"the log has no {use}", where=log.name, hint="set poses.use to auto")
     return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
 
 
@@ -113,22 +113,3 @@ def _stage(name: str, seconds: dict[str, float], progress: Progress) -> Iterator
     begin = time.perf_counter()
     yield
     seconds[name] = round(time.perf_counter() - begin, 4)
-
-
-def _summary(
-    log: Log,
-    settings: Settings,
-    ledger: Ledger,
-    frames: int,
-    solution: Solution,
-    objects: ObjectMap,
-    seconds: dict[str, float],
-) -> dict[str, Any]:
-    found = [c.detections for c in log.cameras if c.detections is not None]
-    counts = {
-        "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
-        "detection_frames": sum(len(detections.frame_stamps) for detections in found),
-        "frames_on_path": frames,
-        "detections": sum(len(detections) for detections in found),
-    }
-    return summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds)

@@ -1,13 +1,12 @@
-"""The room around the objects: depth images fused at the solved poses into one coloured surface (Open3D's VoxelBlockGrid).
+"""Reconstruct the surroundings: fuse depth images at the solved poses into one coloured surface.
 
-Truncated signed distances (Curless & Levoy, SIGGRAPH 1996) in blocks of 6^3 voxels that exist only near surfaces (Dong et
-al., ASH, T-PAMI 2022).
+Open3D's VoxelBlockGrid fuses truncated signed distances (Curless & Levoy, SIGGRAPH 1996) in blocks of 6^3 voxels. The blocks
+exist only near surfaces (Dong et al., ASH, T-PAMI 2022).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,25 +19,34 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
-from objslam.core.types import CameraLog, Log, Surface, Trajectory
+from objslam.core.types import Log, Surface, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_depth
 from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 
-_BLOCK = 6  # voxels along a block's edge: a tenth less time and a quarter less memory than with 8, 16 takes twice the time
-_FIRST_BLOCKS = 32_768  # what the grid begins with, enough for a room; it doubles as it fills
-_SPARE = 1024  # blocks kept free: Open3D grows by itself unless all that a call touches would fit, be it there already
-_AHEAD = 4  # images that may be decoded ahead
-_TOUCH = 4  # Open3D looks at one pixel in this many for the blocks that a frame touches.
+_BLOCK = 6
+"""The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
+number is slower. 16 takes twice the time."""
+_FIRST_BLOCKS = 32_768
+"""The first capacity of the grid, in blocks. A larger value takes more memory in a small scene. The present value is
+enough for a room. The grid doubles when it is full."""
+_SPARE = 1024
+"""The number of blocks that stay free. A larger number wastes more memory. Open3D grows by itself if a call touches more
+blocks than are free, and it counts the existing blocks too."""
+_AHEAD = 4
+"""The number of images that are decoded ahead. A larger number takes more memory."""
+_TOUCH = 4
+"""The step (px) at which Open3D samples a depth image for the blocks that a frame touches. It must equal Open3D's own step.
+A larger step drops more images as out of reach."""
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image to fuse, its colour image (None where no camera has some), and where it was taken from (4, 4)."""
+    """A depth image to fuse, its colour image, and the camera pose (4, 4). Without colour, rgb is None."""
 
     camera: int
     depth: Path
@@ -46,24 +54,15 @@ class Shot:
     map_T_camera: Floats
 
 
-def has_depth(log: Log) -> bool:
-    """Whether there are depth images at all."""
-    return any(camera_log.depth is not None for camera_log in log.cameras)
-
-
 def reconstruct(
-    log: Log,
-    path: Trajectory,
-    settings: Settings,
-    ledger: Ledger,
-    progress: Progress = lambda stage, done, total: None,
+    log: Log, path: Trajectory, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None
 ) -> Surface | None:
-    """The surface that a log's depth images show from the poses of a path (map_T_base); None, with a warning, without one.
+    """Fuse the depth images of a log, at the poses of a path (map_T_base), into a surface.
 
-    Frames off the path or the mount, images that cannot be decoded or have another size than the camera, frames without a
-    colour image within 20 ms and frames without a depth in reach are dropped and counted. Depth images are z in the camera
-    image's own pixels. Memory is bounded by reconstruction.max_blocks: what lies in further blocks is left out, with a
-    warning. Where Open3D cannot be imported, or its device has no memory left, there is a warning and no surface.
+    Depth images contain z at the pixels of the camera image. The ledger counts frames without a pose, a colour image within
+    20 ms, or a depth in reach, and images that are damaged or not in the camera's size. Blocks beyond
+    reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be imported,
+    the result is None with a warning.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
@@ -73,13 +72,14 @@ def reconstruct(
         return _fuse(shots, tuple(c.camera for c in log.cameras), settings, ledger, progress)
     except ImportError as error:
         ledger.warn(f"no reconstruction: Open3D cannot be imported ({error}); tools/setup.sh names the libraries it needs")
-    except RuntimeError as error:  # what Open3D raises, out of memory on a GPU for example; the map is worth more than this
-        ledger.warn(f"no reconstruction: Open3D failed ({_last_line(error)})")
+    except RuntimeError as error:  # from Open3D, for example out of memory on a GPU
+        reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # without colours and signature
+        ledger.warn(f"no reconstruction: Open3D failed ({reason})")
     return None
 
 
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
-    """Every reconstruction.stride-th depth image with a pose, in the order of time; at most max_frames, evenly."""
+    """Choose every reconstruction.stride-th depth image with a pose, in the order of time, and evenly if over max_frames."""
     chosen = settings.reconstruction
     colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)
     shots: list[tuple[float, Shot]] = []
@@ -87,7 +87,12 @@ def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger)
         if camera_log.depth is None:
             continue
         stamps = camera_log.depth.stamps
-        poses, valid = _camera_poses(camera_log, path, stamps, settings.poses.max_gap)
+        poses, valid = interpolate(path.stamps, path.poses, stamps, settings.poses.max_gap)
+        base_T_camera, mount = camera_log.camera.base_T_camera, camera_log.mount
+        if mount is not None:
+            base_T_camera, mounted = interpolate(mount.stamps, mount.poses, stamps, settings.poses.max_gap)
+            valid &= mounted
+        poses = poses @ base_T_camera
         ledger.drop("depth images off the path", int((~valid).sum()), _first(stamps, ~valid))
         rgb: list[Path | None] = [None] * len(stamps)
         if colour and camera_log.rgb is not None:
@@ -103,25 +108,18 @@ def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger)
     return taken[:: -(-len(taken) // chosen.max_frames)] if taken else []
 
 
-def _camera_poses(camera_log: CameraLog, path: Trajectory, stamps: Floats, max_gap: float) -> tuple[Floats, Bools]:
-    """map_T_camera (N, 4, 4) at the stamps, and where it is known (N,)."""
-    map_T_base, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
-    if camera_log.mount is None:
-        return map_T_base @ camera_log.camera.base_T_camera, valid
-    base_T_camera, mounted = interpolate(camera_log.mount.stamps, camera_log.mount.poses, stamps, max_gap)
-    return map_T_base @ base_T_camera, valid & mounted
-
-
 def _fuse(
     shots: list[Shot], cameras: tuple[Camera, ...], settings: Settings, ledger: Ledger, progress: Progress
 ) -> Surface | None:
+    import open3d as o3d
+
     chosen = settings.reconstruction
     grid: Grid | None = None
-    with _quiet():
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):  # no warnings on stdout
         lenses = [Lens.of(camera) for camera in cameras]
 
         def load(shot: Shot) -> tuple[Shot, NDArray[np.float32] | None, NDArray[np.float32] | None, Ledger]:
-            noted = Ledger()  # threads must not share one
+            noted = Ledger()  # threads cannot share a ledger
             return shot, *load_shot(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
 
         for done, (shot, depth, colour, noted) in enumerate(ahead(load, shots, _AHEAD)):
@@ -136,8 +134,8 @@ def _fuse(
             return None
         if grid.left_out:
             ledger.warn(
-                f"the reconstruction is not whole: {grid.left_out} times a block of it had no room "
-                "(reconstruction.max_blocks, or a larger voxel)"
+                f"the reconstruction is not whole: {grid.left_out} times a block had no room "
+                "(raise reconstruction.max_blocks or reconstruction.voxel)"
             )
         surface = grid.surface(chosen.min_views)
     if surface is None:
@@ -147,25 +145,24 @@ def _fuse(
 
 @dataclass(frozen=True)
 class Lens:
-    """How to straighten a camera's images: maps for cv2.remap, None where there is no distortion."""
+    """The undistortion of a camera's images: maps for cv2.remap, or None without distortion."""
 
     maps: tuple[NDArray[Any], NDArray[Any]] | None
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
-        """Onto a pinhole camera with the same matrix."""
+        """Make the maps to a pinhole camera with the same matrix."""
         import cv2
 
-        if camera.distortion_model != "equidistant" and not camera.distortion.any():
-            return cls(None)
         fisheye = camera.distortion_model == "equidistant"
+        if not fisheye and not camera.distortion.any():
+            return cls(None)
         make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
         size = (camera.width, camera.height)
-        first, second = make(camera.matrix, camera.distortion, np.eye(3), camera.matrix, size, cv2.CV_16SC2)
-        return cls((first, second))
+        return cls(make(camera.matrix, camera.distortion, np.eye(3), camera.matrix, size, cv2.CV_16SC2))
 
     def straighten(self, image: NDArray[Any], *, smooth: bool) -> NDArray[Any]:
-        """The image, straightened; smooth: between pixels, as colour wants and depth must not."""
+        """Undistort an image. smooth: interpolate between pixels, which suits colour and falsifies depth."""
         import cv2
 
         if self.maps is None:
@@ -176,12 +173,15 @@ class Lens:
 def load_shot(
     shot: Shot, camera: Camera, lens: Lens, max_depth: float, ledger: Ledger
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Depth (H, W), m, 0 where none is in reach, and RGB (H, W, 3) in [0, 1], both straightened; None where unusable."""
+    """Read the undistorted depth (H, W), m, and RGB (H, W, 3) in [0, 1] of a shot. Depth out of reach is 0.
+
+    The depth is None if one of the two images cannot be used. The colour is None without a colour image.
+    """
     raw = read_depth(shot.depth, camera, ledger)
     if raw is None:
         return None, None
     depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
-    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # what is not a number compares false
+    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # NaN compares false
     if not depth[::_TOUCH, ::_TOUCH].any():
         ledger.drop("depth images without a depth in reach", where=str(shot.depth))
         return None, None
@@ -198,9 +198,9 @@ def load_shot(
 
 
 class Grid:
-    """A voxel block grid that grows up to reconstruction.max_blocks blocks of 6^3 voxels, 20 bytes each (8 without colour).
+    """A voxel block grid that grows to reconstruction.max_blocks blocks. A voxel takes 20 bytes (8 without colour).
 
-    left_out: how many times a frame touched a block that had no room.
+    left_out: how many times a frame touched a block without room.
     """
 
     def __init__(self, settings: Settings, *, coloured: bool) -> None:
@@ -214,7 +214,7 @@ class Grid:
         self._max_blocks = chosen.max_blocks
         self._max_depth = chosen.max_depth
         self._truncation = max(chosen.truncation / chosen.voxel, 2.0)  # voxels
-        # floats throughout: with its 16-bit colours Open3D rounds each average down, and walls darken by a tenth
+        # Colours are floats, because Open3D rounds averages of 16-bit colours down, which darkens walls by a tenth.
         names, channels = (("tsdf", "weight", "color"), (1, 1, 3)) if coloured else (("tsdf", "weight"), (1, 1))
         first = min(_FIRST_BLOCKS, self._max_blocks)
         dtypes = (o3d.core.float32,) * len(names)
@@ -223,13 +223,14 @@ class Grid:
 
     @property
     def blocks(self) -> int:
-        """How many blocks there are."""
+        """The number of blocks in use."""
         return int(self._grid.hashmap().size())
 
     def add(self, depth: NDArray[np.float32], colour: NDArray[np.float32] | None, matrix: Floats, pose: Floats) -> None:
-        """Fuse one frame: depth (H, W) m, colour (H, W, 3) in [0, 1], seen from map_T_camera (4, 4) by a pinhole camera."""
-        images = [self._image(image) for image in (depth, colour) if image is not None]
-        # Open3D takes the pixel at the whole number below, we have pixel centres there: half a pixel makes it the nearest
+        """Fuse depth (H, W), m, and colour (H, W, 3) in [0, 1] of a pinhole camera with pose map_T_camera (4, 4)."""
+        tensor, image_of = self._core.Tensor.from_numpy, self._geometry.Image
+        images = [image_of(tensor(image)).to(self._device) for image in (depth, colour) if image is not None]
+        # Open3D rounds a pixel position down. With half a pixel added, it takes the nearest pixel.
         shift = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
         k, camera_T_map = self._core.Tensor(matrix + shift), self._core.Tensor(inverse(pose))
         reach = (1.0, self._max_depth, self._truncation)
@@ -238,7 +239,7 @@ class Grid:
             self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
 
     def _with_room(self, touched: Any) -> Iterator[Any]:
-        """The touched blocks (M, 3) that exist or have room, in portions that make Open3D grow no further than it may."""
+        """Yield the touched blocks (M, 3) that exist or have room, in portions that do not make Open3D grow by itself."""
         hashmap = self._grid.hashmap()
 
         def room() -> int:
@@ -256,14 +257,11 @@ class Grid:
         for start in range(0, len(kept), _SPARE):
             yield touched[self._core.Tensor(kept[start : start + _SPARE], device=self._device)]
 
-    def _image(self, image: NDArray[np.float32]) -> Any:
-        return self._geometry.Image(self._core.Tensor.from_numpy(image)).to(self._device)
-
     def surface(self, min_views: int) -> Surface | None:
-        """The triangles between voxels that enough frames saw; None without one."""
+        """Extract the triangles between voxels with at least min_views observations, or None without triangles."""
         if not self.blocks:
             return None
-        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D wants more than it is told
+        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D requires more than its limit
         if not len(mesh.triangle.indices):
             return None
         colours = None
@@ -275,17 +273,3 @@ class Grid:
 
 def _first(stamps: Floats, mask: Bools) -> str | None:
     return f"stamp {stamps[mask][0]:.3f}" if mask.any() else None
-
-
-def _last_line(error: Exception) -> str:
-    """What an error of Open3D says, without the colours and the signature before it."""
-    return str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Open3D prints its warnings to stdout: not here."""
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        yield

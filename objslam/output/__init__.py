@@ -1,4 +1,4 @@
-"""Everything that a result becomes: the result folder, the picture, the recording, the report, the exports.
+"""The outputs of a run: the result folder, the picture map.png, the rerun recording, the report and the exports.
 
-Nothing here computes a map; what reads a result back is `results`.
+This folder computes no map, and the code that reads a result folder is in `results`.
 """

@@ -1,6 +1,4 @@
-"""The result folder: what writes each of its files, and how a new result takes the place of an older one."""
-
-from __future__ import annotations
+"""The result folder: the functions that write its files, clear it, and replace an older result by a new result."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -31,32 +29,35 @@ from objslam.results.read import load_map
 from objslam.sources.log_folder import resembles_log
 
 _FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
-"""Every file that a new result replaces or removes, what was exported of the older one included."""
+"""The files that a new result replaces or deletes. The exports of the older result are among them."""
 
 
 def prepare_output(out: Path) -> None:
-    """Make the folder for a result and try to write there, before the long work.
+    """Make the folder for a result and try to write there; call this function before a long computation.
 
     Raises:
-        OutputError: no result could be written there, or only in the place of files that no run wrote: those of a log, those
-            of a ground truth, or others with the names of ours.
+        OutputError: the folder cannot be written, or the result would replace files that no run wrote: files of a log, files
+            of a ground truth, or foreign files with the name of a result file.
     """
     with disk_errors(out):
         if out.exists() and not out.is_dir():
             raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
-        _check_foreign(out)
+        if resembles_log(out):
+            hint = "name another folder with -o"
+            raise OutputError("this is a log, not a place for its result", where=str(out), hint=hint)
+        names = _existing_files(out)
+        if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
+            what = f"in the way of a result, and not written by a run: {', '.join(names)}"
+            raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
         for name in _FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
-                raise OutputError("a folder stands where a file of the result goes", where=str(out / name))
+                raise OutputError("a folder stands where a file of the result goes: move it", where=str(out / name))
     try_folder(out, _FILES)
 
 
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
-    """Make the folder for a result, and check that it can be written before the work in the `with` block begins.
-
-    If the work fails, no new empty folder is left behind.
-    """
+    """Call `prepare_output`, then run the `with` block; if the block fails, delete the new folder if it is empty."""
     with no_empty_folders(out):
         prepare_output(out)
         yield
@@ -65,31 +66,31 @@ def output_folder(out: Path) -> Iterator[None]:
 def write_result(
     result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()
 ) -> tuple[str, ...]:
-    """Write the whole result into a folder, in place of an older one; other files there stay.
+    """Write a result into the folder `out` and replace an older result there; other files stay.
 
-    A run that is killed, at any moment, leaves no half file and no mix of two results. There is a summary.json only with
-    everything that belongs to it.
+    A run that is killed leaves no partial file and no mix of two results. summary.json exists only beside all other files of
+    its result.
 
     Args:
-        truth: kept beside the result for `load_truth`, and drawn as it lies on the map.
-        detected: cameras whose boxes this run found. They are kept as detections.jsonl (of several cameras, with the
-            camera's name in front), which a log can take over.
+        truth: the ground truth. It is stored for `load_truth`, and drawn after its alignment with the map.
+        detected: the cameras whose boxes this run detected. The boxes are stored as detections.jsonl, which a log can use.
+            With several cameras, the file name starts with the camera's name.
     Returns:
-        The names of the older result's files that went and have no successor, such as an export or a report.
+        The names of the deleted files of the older result that have no successor, such as an export or a report.
     Raises:
-        OutputError: the disk refuses, or another run writes there.
+        OutputError: the folder cannot be written, or another run writes there.
     """
     prepare_output(out)
     return replace_files(out, _FILES, _writers(result, truth, detected))
 
 
 def clear_result(out: Path) -> tuple[str, ...]:
-    """Remove what an earlier run wrote, except objects.json, which a live session replaces; the names of what went.
+    """Delete the files of an earlier run and return their names; objects.json stays, because a live session replaces it.
 
-    What stayed would be taken for the session's own. summary.json goes last: as long as it is there, the folder is known as
-    a result.
+    A file of the earlier run would look like a file of the session. summary.json marks the folder as a result, so it is
+    deleted last.
     """
-    names = tuple(name for name in reversed(_FILES.names(out)) if name != files.OBJECTS and (out / name).is_file())
+    names = tuple(name for name in reversed(_existing_files(out)) if name != files.OBJECTS)
     with disk_errors(out):
         for name in names:
             (out / name).unlink(missing_ok=True)
@@ -97,7 +98,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
 
 
 def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:
-    """What writes each file of a result, by the file's name."""
+    """Return the function that writes each file of a result, by file name."""
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     writers: dict[str, Callable[[Path], object]] = {
         files.OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
@@ -110,8 +111,8 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
     if motions is not None:
         writers[files.MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))
     if truth is not None and truth.objects:
-        true = truth.objects
-        writers[files.TRUTH_OBJECTS] = lambda file: file.write_bytes(encode(dump_truth_objects(true)))
+        objects = truth.objects
+        writers[files.TRUTH_OBJECTS] = lambda file: file.write_bytes(encode(dump_truth_objects(objects)))
     if truth is not None and truth.trajectory is not None:
         writers[files.TRUTH_TRAJECTORY] = partial(write_trajectory, truth.trajectory)
     for camera_log in detected:
@@ -137,13 +138,12 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
 
 
 def _rays_table(result: RunResult) -> RaysTable:
-    """The rays of a run as rays.parquet holds them; an object is its id in objects.json."""
+    """Return the content of rays.parquet; the object of a ray is an id in objects.json, or -1."""
     rays, keyframes = result.rays, result.keyframes
-    index = result.association.object
     ids = np.array([*(o.id for o in result.map.objects), -1], dtype=np.int64)
     cameras = np.array([camera.name for camera in result.cameras], dtype=object)
     return RaysTable(
-        object=ids[index],
+        object=ids[result.association.object],
         stamp=keyframes.stamps[rays.keyframe],
         origin=result.origins,
         direction=result.directions,
@@ -156,21 +156,12 @@ def _rays_table(result: RunResult) -> RaysTable:
     )
 
 
-def _check_foreign(out: Path) -> None:
-    """OutputError where the folder holds files that a result would replace and that no run wrote."""
-    if resembles_log(out):
-        raise OutputError("this is a log, not a place for its result", where=str(out), hint="name another folder with -o")
-    names = [name for name in _FILES.names(out) if (out / name).is_file()]
-    if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
-        raise OutputError(
-            f"in the way of a result, and not written by a run: {', '.join(names)}",
-            where=str(out),
-            hint="name another folder with -o, or move them",
-        )
+def _existing_files(out: Path) -> list[str]:
+    return [name for name in _FILES.names(out) if (out / name).is_file()]
 
 
 def _is_result(out: Path, names: list[str]) -> bool:
-    """Whether the files with these names are those of a result, or of a live session that has not ended."""
+    """Return whether the named files belong to a result, or to a live session that has not ended."""
     if out.resolve().name == files.GROUNDTRUTH:
         return False
     try:

@@ -1,6 +1,4 @@
-"""The names of the files of a result, and how plain data becomes JSON."""
-
-from __future__ import annotations
+"""The file names of a result, and the conversion of plain data to JSON."""
 
 import json
 import math
@@ -9,42 +7,42 @@ from typing import Any
 
 import numpy as np
 
-OBJECTS = "objects.json"  # The map.
-TRAJECTORY = "trajectory.txt"  # map_T_base at each keyframe's stamp.
-RAYS = "rays.parquet"  # Every ray, with its object.
+OBJECTS = "objects.json"  # The map of objects.
+TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
+RAYS = "rays.parquet"  # Each ray with its object.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
 CONFIG = "config.yaml"  # All settings of the run.
-SUMMARY = "summary.json"  # Counts, times and warnings; it is written last, so it says that the result is whole.
-DETECTIONS = "detections.jsonl"  # The boxes that the run's own detector found.
-SURFACE = "reconstruction.ply"  # The room as a mesh.
-SURFACE_BEFORE = "reconstruction_before.ply"  # The same mesh at the poses that the log brought.
+SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
+DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
+SURFACE = "reconstruction.ply"  # The mesh of the room.
+SURFACE_BEFORE = "reconstruction_before.ply"  # The mesh of the room at the poses of the log.
 CLOUD = "reconstruction_cloud.ply"  # The vertices of the mesh as a point cloud.
 PICTURE = "map.png"  # The map from above.
-RECORDING = "recording.rrd"  # What the viewer plays.
-EVALUATION = "evaluation.json"  # What `objslam eval` found.
-REPORT = "report.html"  # What `objslam report` wrote.
-TRUTH_OBJECTS = "groundtruth_objects.json"  # The true objects that the log brought.
-TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path that the log brought.
-GROUNDTRUTH = "groundtruth"  # The folder of a log in which OBJECTS and TRAJECTORY are the truth.
+RECORDING = "recording.rrd"  # The recording for the viewer.
+EVALUATION = "evaluation.json"  # The evaluation by `objslam eval`.
+REPORT = "report.html"  # The page by `objslam report`.
+TRUTH_OBJECTS = "groundtruth_objects.json"  # The true objects of the log.
+TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path of the log.
+GROUNDTRUTH = "groundtruth"  # The folder of a log with the truth as OBJECTS and TRAJECTORY.
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
     *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT),
 )
-"""Every file of a result but SUMMARY and what was exported; those of the commands that come after the run are among them."""
+"""The files of a result, including the files of later commands. SUMMARY and exported files are not included."""
 
 
 def hint_below(folder: Path) -> str | None:
-    """A hint that names the results in the folders of a folder; None where there is none."""
+    """Return a hint that lists the results in the subfolders of a folder, or None if there are no results."""
     below = sorted(str(file.parent) for file in folder.glob(f"*/{SUMMARY}"))
     if not below:
         return None
     more = f" and {len(below) - 5} more" if len(below) > 5 else ""
-    return f"its results lie in folders of their own: {', '.join(below[:5])}{more}"
+    return f"its subfolders have results: {', '.join(below[:5])}{more}"
 
 
 def dump_json(data: Any) -> str:
-    """Data as JSON text; arrays become lists, and what is not finite becomes null."""
+    """Convert data to JSON text. Arrays become lists, and non-finite numbers become null."""
     return json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

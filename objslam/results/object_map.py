@@ -1,6 +1,4 @@
-"""The map of objects as users hold it: one that is loaded from a result and saved to a file."""
-
-from __future__ import annotations
+"""The map of objects for users of the package, which can be loaded and saved."""
 
 from os import PathLike
 from pathlib import Path
@@ -12,19 +10,16 @@ from objslam.io.objects_json import dump_objects, read_objects
 
 
 class ObjectMap(object_map.ObjectMap):
-    """The objects of one map, in `frame`, with the way from and to disk."""
+    """Hold the objects of one map in the frame `frame`, and load and save them."""
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """The map of a result folder, or of a file as `save` writes it. OutputError, saying where, if it is not one."""
-        from objslam.results.read import load_map  # it brings scipy along: a map in memory is light
+        """Load the map of a result folder or of a file written by `save`. OutputError with the place if it is invalid."""
+        from objslam.results.read import load_map  # deferred, because it imports scipy
 
         found = read_objects(Path(path)) if Path(path).is_file() else load_map(Path(path))
         return cls(found.objects, found.frame)
 
     def save(self, file: str | PathLike[str]) -> None:
-        """Write the map as JSON (objects.json). `load` gives the same map back, to the last bit.
-
-        OutputError when the file cannot be written.
-        """
+        """Write the map as JSON. `load` returns the same map, bit by bit. OutputError if the file cannot be written."""
         write_file(Path(file), dump_objects(self).encode())

@@ -1,6 +1,4 @@
-"""A result folder read back: its map, path, rays, odometry and ground truth."""
-
-from __future__ import annotations
+"""Readers of a result folder: its map, path, rays, odometry and ground truth."""
 
 from pathlib import Path
 
@@ -17,42 +15,43 @@ from objslam.results import files
 
 
 def load_map(out: Path) -> ObjectMap:
-    """The object map of the result in the folder `out`; OutputError says what is missing or malformed."""
+    """Read the object map of the result folder `out`. OutputError names a missing or malformed part."""
     return read_objects(_existing(out, files.OBJECTS))
 
 
 def load_trajectory(out: Path) -> Trajectory:
-    """map_T_base of the result in the folder `out`; OutputError, with file and line, says what is missing or malformed."""
+    """Read the poses map_T_base of the result folder `out`. OutputError names a missing or malformed part with its line."""
     file, ledger = _existing(out, files.TRAJECTORY), Ledger()
     try:
         trajectory = read_trajectory(file, ledger)
     except LogError as error:
         raise OutputError(error.message, where=error.where, hint=error.hint) from error
-    if ledger.dropped:  # a log may be damaged, a result of our own may not
+    if ledger.dropped:  # a log may have damaged lines, but a result must not
         raise OutputError(f"the trajectory is damaged: {ledger.lines()[0]}", where=str(file))
     return trajectory
 
 
 def load_motions(out: Path) -> Motions | None:
-    """The odometry between the poses of the result in the folder `out`, None where it had none; OutputError as above."""
+    """Read the odometry between the poses of the result folder `out`, or None if it has none. OutputError if it is
+    invalid."""
     _existing(out, files.OBJECTS)
     file = out / files.MOTIONS
     return read_motions(file) if file.is_file() else None
 
 
 def load_rays(out: Path) -> RaysTable:
-    """The rays of the result in the folder `out`; OutputError where the file is missing, damaged, or of an older version."""
+    """Read the rays of the result folder `out`. OutputError if the file is missing, damaged or of an older version."""
     return read_rays(out / files.RAYS)
 
 
 def load_truth(path: Path) -> Truth | None:
-    """The ground truth in a path, None when a folder holds none.
+    """Read the ground truth in a path, or return None if a folder has none.
 
     Args:
-        path: an objects file, a folder named groundtruth, a log folder with one, or a result whose log brought a truth. The
-            objects.json of a result folder is its estimate, never its truth: to compare two results, name that file itself.
+        path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
+            of its log. The objects.json of a result folder is not its truth. Give that file itself to compare two results.
     Raises:
-        LogError: there is no such path, or the truth is malformed.
+        LogError: the path does not exist, or the truth is malformed.
     """
     if path.is_file():
         return Truth(read_truth_objects(path))
@@ -75,6 +74,6 @@ def _existing(out: Path, name: str) -> Path:
     if not out.is_dir():
         raise OutputError("there is no such result folder", where=str(out))
     if not (out / name).is_file():
-        hint = "was its run killed? run again" if has_staging(out) else files.hint_below(out)
+        hint = "its run did not finish: run it again" if has_staging(out) else files.hint_below(out)
         raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
     return out / name

@@ -1,4 +1,1 @@
-"""ROS without ROS: files of bags, messages and tf, shared by recorded bags and by live robots.
-
-Which topic plays which part is decided where a log or a session is made: `sources.ros_bag` and `live.ros`.
-"""
+"""Read ROS bags, messages and tf without a ROS installation. Topics are chosen in `sources.ros_bag` and `live.ros`."""

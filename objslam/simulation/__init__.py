@@ -1,10 +1,6 @@
-"""Drives that never happened: a robot, cameras and objects in a room, with every error of a real log, and the truth.
-
-The same settings and seed give the same log. Each part (path, objects, every noise) draws from a random generator of its
-own, so that switching one noise on leaves the others as they were.
+"""Simulate drives of a robot among objects in a room, with the errors of real logs and with ground truth. The path, the
+objects and each noise have their own random generators, so a change of one noise leaves the others unchanged.
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -13,28 +9,25 @@ from objslam.core.types import CameraLog, Log, Trajectory, Truth, TruthObject
 from objslam.simulation.detector import Boxes, detect, detections, imagine, views
 from objslam.simulation.scene import furnish, roam
 from objslam.simulation.settings import PRESETS, DepthNoise, DriveSettings, PoseNoise, make_camera, pair, preset
-from objslam.simulation.trajectory import START, Path, localization, odometry
+from objslam.simulation.trajectory import Path, frame_stamps, localization, odometry
 
 __all__ = ["PRESETS", "DepthNoise", "DriveSettings", "PoseNoise", "make_camera", "pair", "preset", "simulate"]
 
 
 def simulate(settings: DriveSettings, seed: int) -> Log:
-    """A log of the drive, with its truth: the objects, and map_T_base at the stamps of the frames.
+    """Simulate a drive. The same settings and seed give the same log.
 
-    odom is where map is at the first pose, from which odometry drifts. ConfigError where the objects find no place that
-    the path sees well enough.
+    The ground truth holds the objects, and map_T_base at the frames' stamps. The frames odom and map coincide at the start.
+    Raises ConfigError if there are not enough places for objects that the path sees well.
     """
     seeds = np.random.SeedSequence(seed).spawn(6)
     path_rng, scene_rng, roam_rng, odometry_rng, localization_rng = (np.random.default_rng(s) for s in seeds[:5])
     path = Path.lay(settings, path_rng)
-    cameras = len(settings.cameras)
-    turns = np.arange(settings.frames)[:, None] + np.arange(cameras) / cameras  # cameras of a robot fire one after the other
-    frame_stamps = START + turns / settings.frame_rate
-    scene = furnish(settings, path, frame_stamps, scene_rng)
+    fired = frame_stamps(settings)
+    scene = furnish(settings, path, fired, scene_rng)
     roamers = roam(settings, scene, roam_rng)
-
     logs = []
-    for camera, stamps, seed_of_camera in zip(settings.cameras, frame_stamps.T, seeds[5].spawn(cameras), strict=True):
+    for camera, stamps, seed_of_camera in zip(settings.cameras, fired.T, seeds[5].spawn(len(settings.cameras)), strict=True):
         map_T_camera = lift_se2(path.at(stamps)) @ camera.base_T_camera
         standing = views(settings, camera, map_T_camera, scene.position, scene.extent)
         moving = views(settings, camera, map_T_camera, roamers.at(stamps), roamers.extent)
@@ -45,9 +38,8 @@ def simulate(settings: DriveSettings, seed: int) -> Log:
             imagine(settings, camera, len(scene.classes), false_seed),
         )
         logs.append(CameraLog(camera, detections(settings, boxes, stamps, scene.classes)))
-
     labelled = zip(scene.label, scene.position, strict=True)
-    stamps = frame_stamps.ravel()
+    stamps = fired.ravel()
     return Log(
         name=settings.name,
         cameras=tuple(logs),

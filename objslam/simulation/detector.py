@@ -1,6 +1,4 @@
-"""What the cameras see of the objects, and what their detector makes of it."""
-
-from __future__ import annotations
+"""Simulate the views of the cameras, and the boxes of their detector."""
 
 from dataclasses import dataclass, fields
 from typing import Self
@@ -13,16 +11,16 @@ from objslam.core.geometry import inverse
 from objslam.core.types import Detections
 from objslam.simulation.settings import DriveSettings
 
-FALSE_SIZES = (20.0, 120.0)
-"""px; between these are width and height of a box of nothing."""
-
-TRACK_PATIENCE = 1.0
-"""s; a tracker gives up an object that was out of sight for longer."""
+FALSE_SIZES = (20.0, 120.0)  # The least and largest side of a false box, px.
+TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an object, s.
 
 
 @dataclass(frozen=True)
 class Views:
-    """Objects in the image before any error: frame (M,), object (M,), box centre and size (M, 2) px, depth (M,) z in m."""
+    """The M visible objects in all frames of a camera, without errors.
+
+    frame, object: (M,) indices. centre, size: (M, 2) of the box, px. depth: (M,) z, m.
+    """
 
     frame: Ints
     object: Ints
@@ -33,7 +31,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes of one camera, in no order: like Detections, but object (M,) says what each box is of, -1 for nothing."""
+    """Unordered boxes of one camera. object: (M,) the true object of each box, -1 for a false box."""
 
     frame: Ints
     object: Ints
@@ -44,16 +42,19 @@ class Boxes:
 
     @classmethod
     def join(cls, *parts: Self) -> Self:
-        """All boxes of several parts."""
+        """Concatenate boxes."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
-    def take(self, boxes: Bools) -> Self:
-        """A selection of the boxes."""
+    def take(self, boxes: Bools | Ints) -> Self:
+        """Select boxes by a mask (M,) or by indices."""
         return type(self)(*(getattr(self, f.name)[boxes] for f in fields(self)))
 
 
 def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points: Floats, extents: Floats) -> Views:
-    """What a camera at poses (F, 4, 4) sees of points (N, 3) or, moving, (F, N, 3), of extents (N, 2), m, in map."""
+    """Compute the objects that a camera sees at poses (F, 4, 4).
+
+    points: the centres of the objects in map, (N, 3) or if they move (F, N, 3), m. extents: (N, 2) width and height, m.
+    """
     camera_T_map = inverse(map_T_camera)
     local = points @ np.swapaxes(camera_T_map[:, :3, :3], 1, 2) + camera_T_map[:, None, :3, 3]  # (F, N, 3)
     distance = np.linalg.norm(local, axis=-1)
@@ -62,60 +63,42 @@ def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points:
     local = local[frame, index]
     size = extents[index] * np.diag(camera.matrix)[:2] / depths(camera, local)[:, None]
     reach = _reach(settings, size)
-    seen, centre = in_view(camera, local, reach, _corner(camera) - reach)
+    seen, centre = in_view(camera, local, reach, camera.size - 1 - reach)
     return Views(frame[seen], index[seen], centre, size[seen], local[seen, 2])
 
 
 def _reach(settings: DriveSettings, size: Floats) -> Floats:
-    """How far (M, 2), px, the centres of boxes of a size (M, 2) must stay from the image's edge."""
+    """Return the least distance (M, 2), px, of the centres of boxes of a size (M, 2) from the image's edge."""
     return np.zeros_like(size) if settings.cut_off else size / 2
-
-
-def _corner(camera: Camera) -> Floats:
-    return np.array([camera.width - 1.0, camera.height - 1.0])
 
 
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """The boxes of what is seen, with noise and misses.
-
-    label: (N,) the label of each object. first_id: the id of the first object in the boxes.
-    """
+    """Detect visible objects, with noise and misses. label: (N,) of the objects. first_id: the id of the first object."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
     box = np.column_stack([centre - seen.size / 2, centre + seen.size / 2])
     if settings.cut_off:
-        box = np.clip(box, 0.0, np.tile(_corner(camera), 2))
-    boxes = Boxes(
-        frame=seen.frame,
-        object=seen.object + first_id,
-        label=label[seen.object],
-        box=box,
-        score=score.uniform(0.5, 1.0, count),
-        depth=_depths(settings, seen.depth, depth),
-    )
+        box = np.clip(box, 0.0, np.tile(camera.size - 1, 2))
+    scores, z = score.uniform(0.5, 1.0, count), _depths(settings, seen.depth, depth)
+    boxes = Boxes(seen.frame, seen.object + first_id, label[seen.object], box, scores, z)
     reach = _reach(settings, seen.size)
-    inside = np.asarray(((centre - reach >= 0) & (centre + reach <= _corner(camera))).all(axis=1))
+    inside = np.asarray(((centre - reach >= 0) & (centre + reach <= camera.size - 1)).all(axis=1))
     return boxes.take(inside & (miss.random(count) >= settings.missed))
 
 
 def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.random.SeedSequence) -> Boxes:
-    """Boxes of nothing, anywhere in the image: in each frame, for each class, one with the given probability."""
+    """Draw false boxes in the image. In each frame, each class has a box with the probability `settings.false`."""
     rng, depth = (np.random.default_rng(s) for s in seed.spawn(2))
     frame, label = np.nonzero(rng.random((settings.frames, classes)) < settings.false)
     count = len(frame)
     size = rng.uniform(*FALSE_SIZES, (count, 2))
-    corner = rng.random((count, 2)) * (_corner(camera) - size)
-    return Boxes(
-        frame=frame,
-        object=np.full(count, -1),
-        label=label,
-        box=np.column_stack([corner, corner + size]),
-        score=rng.uniform(0.3, 0.8, count),
-        depth=_depths(settings, depth.uniform(0.3, settings.max_range, count), depth),
-    )
+    corner = rng.random((count, 2)) * (camera.size - 1 - size)
+    box, scores = np.column_stack([corner, corner + size]), rng.uniform(0.3, 0.8, count)
+    z = _depths(settings, depth.uniform(0.3, settings.max_range, count), depth)
+    return Boxes(frame, np.full(count, -1), label, box, scores, z)
 
 
 def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> Floats:
@@ -128,19 +111,10 @@ def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> 
 
 
 def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
-    """The boxes as a detector hands them out: frame by frame, the surest first."""
+    """Turn boxes into detections, sorted by frame and by falling score."""
     order = np.lexsort((-boxes.score, boxes.frame))
-    tracks = _tracks(settings, boxes)
-    return Detections(
-        frame_stamps=frame_stamps,
-        frame=boxes.frame[order],
-        boxes=boxes.box[order],
-        label=boxes.label[order],
-        scores=boxes.score[order],
-        depths=boxes.depth[order],
-        track_ids=tracks[order],
-        label_names=classes,
-    )
+    b, tracks = boxes.take(order), _tracks(settings, boxes)[order]
+    return Detections(frame_stamps, b.frame, b.box, b.label, b.score, b.depth, tracks, classes)
 
 
 def _tracks(settings: DriveSettings, boxes: Boxes) -> Ints:

@@ -1,6 +1,4 @@
-"""A furnished room for rendered drives: walls, tables, shelves and cabinets, with things standing on them."""
-
-from __future__ import annotations
+"""Make random furnished rooms for rendered drives: walls, tables, shelves and cabinets, with objects on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +10,13 @@ from objslam.core.geometry import lift_se2
 from objslam.errors import ConfigError
 from objslam.simulation.shapes import Material, Part, Pattern, ball, box, make_object, paint, torus, turned
 
-CEILING = 2.6
-"""m."""
-SLOT = 0.34
-"""m of a top's width that each thing on it has for itself."""
+CEILING = 2.6  # The height of the ceiling, m.
+SLOT = 0.34  # The width on a piece of furniture for each object, m. A larger value leaves fewer places.
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A point light: position (3,) m and the light it gives, linear colour (3,), at 1 m."""
+    """A point light. position: (3,) in map, m. power: (3,) the linear colour of its light."""
 
     position: Floats
     power: Floats
@@ -28,9 +24,10 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Room:
-    """What is rendered: parts; owner (P,), the object a part belongs to, -1 for the rest; objects' labels and middles.
+    """The content of a rendered room.
 
-    middle: (N, 3) m in map, the middle of each object's bounding box. lamps and the ambient light (3,), linear.
+    owner: (P,) the object of each part, -1 for furniture and other things. labels: the label of each object.
+    middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear colour of ambient light.
     """
 
     parts: tuple[Part, ...]
@@ -42,19 +39,19 @@ class Room:
 
 
 def furnish_room(size: tuple[float, float], labels: Sequence[str], rng: np.random.Generator) -> Room:
-    """A room of a size along x and y (m), the middle of its floor at the origin, with objects of the given labels.
+    """Make a room of a size along x and y (m), with the centre of the floor at the origin and objects with the labels.
 
-    Furniture stands along the walls and reaches at most 0.6 m into the room; each object stands on a piece of it, next to
-    other things. ConfigError where the furniture has no place for all the objects.
+    Furniture along the walls reaches at most 0.6 m into the room. Each object stands on a piece of furniture among other
+    things. Raises ConfigError if the furniture has fewer places than there are objects.
     """
-    parts = [*_shell(size, rng)]
+    parts = _shell(size, rng)
     spots = []
     for wall in range(4):
         pieces, tops = _wall_row(size, wall, rng)
         parts += pieces
         spots += tops
     if len(spots) < len(labels):
-        raise ConfigError(f"the furniture has {len(spots)} places, not the {len(labels)} needed", hint="a larger room")
+        raise ConfigError(f"the furniture has {len(spots)} places, not the {len(labels)} needed", hint="set a larger room")
     order = rng.permutation(len(spots))
     owner = [-1] * len(parts)
     middles = []
@@ -66,15 +63,14 @@ def furnish_room(size: tuple[float, float], labels: Sequence[str], rng: np.rando
         owner += [number] * len(standing)
     for spot in order[len(labels) :]:
         if rng.random() < 0.75:
-            thing = [part.moved(spots[spot] @ _spin(rng)) for part in _distractor(rng)]
-            parts += thing
-            owner += [-1] * len(thing)
-    lamps, ambient = _light(size, rng)
-    return Room(tuple(parts), np.array(owner), tuple(labels), np.array(middles).reshape(-1, 3), lamps, ambient)
+            parts += [part.moved(spots[spot] @ _spin(rng)) for part in _distractor(rng)]
+    owner += [-1] * (len(parts) - len(owner))
+    middle = np.array(middles).reshape(-1, 3)
+    return Room(tuple(parts), np.array(owner), tuple(labels), middle, *_light(size, rng))
 
 
 def any_material(rng: np.random.Generator, scale: tuple[float, float] = (0.01, 0.08)) -> Material:
-    """A material of any colour and pattern."""
+    """Draw a material of any colour and pattern. scale: the range of the pattern's scale, m."""
     patterns: tuple[Pattern, ...] = ("plain", "noise", "stripes", "checks")
     pattern = patterns[rng.choice(4, p=[0.4, 0.3, 0.2, 0.1])]
     first = paint(rng, rng.random(), rng.random() ** 1.5, rng.uniform(0.05, 0.95))
@@ -90,11 +86,11 @@ def _light(size: tuple[float, float], rng: np.random.Generator) -> tuple[tuple[L
     warmth = rng.uniform(-0.15, 0.15)
     tint = np.array([1 + warmth, 1.0, 1 - warmth])
     count = int(rng.integers(1, 3))
-    lamps = []
-    for _ in range(count):
-        place = np.array([*(rng.uniform(-0.35, 0.35, 2) * np.array(size)), CEILING - 0.15])
-        lamps.append(Lamp(place, rng.uniform(1.8, 3.2) / count * tint))
-    return tuple(lamps), rng.uniform(0.25, 0.5) * (tint + 1) / 2
+    lamps = tuple(
+        Lamp(np.append(rng.uniform(-0.35, 0.35, 2) * size, CEILING - 0.15), rng.uniform(1.8, 3.2) / count * tint)
+        for _ in range(count)
+    )
+    return lamps, rng.uniform(0.25, 0.5) * (tint + 1) / 2
 
 
 def _wood(rng: np.random.Generator) -> Material:
@@ -119,8 +115,7 @@ def _shell(size: tuple[float, float], rng: np.random.Generator) -> list[Part]:
         box((0.1, y, CEILING), (-x / 2 - 0.05, 0, CEILING / 2), walls if rng.random() < 0.6 else _flat(rng)),
         box((0.1, y, CEILING), (x / 2 + 0.05, 0, CEILING / 2), walls),
     ]
-    corners = [(sx * (x / 2 - 0.3), sy * (y / 2 - 0.3)) for sx in (-1, 1) for sy in (-1, 1)]
-    for cx, cy in corners:
+    for cx, cy in [(sx * (x / 2 - 0.3), sy * (y / 2 - 0.3)) for sx in (-1, 1) for sy in (-1, 1)]:
         if rng.random() < 0.6:
             bottom, height = rng.uniform(0.1, 0.22), rng.uniform(0.3, 1.6)
             bin_or_lamp = turned([(bottom, 0.0), (bottom * rng.uniform(0.4, 1.1), height)], any_material(rng))
@@ -129,9 +124,8 @@ def _shell(size: tuple[float, float], rng: np.random.Generator) -> list[Part]:
 
 
 def _wall_row(size: tuple[float, float], wall: int, rng: np.random.Generator) -> tuple[list[Part], list[Floats]]:
-    """The furniture along one wall, and poses (4, 4) of the places on its tops."""
-    along, across = (size[0], size[1]) if wall % 2 == 0 else (size[1], size[0])
-    # the row is laid out along x with the wall at y = 0 and the room below it, then turned to its wall
+    along, across = size if wall % 2 == 0 else size[::-1]
+    # In the frame of the row, the wall is at y = 0 and the room at negative y.
     to_wall = lift_se2(np.array([0.0, 0.0, wall * np.pi / 2])) @ lift_se2(np.array([0.0, across / 2, 0.0]))
     parts: list[Part] = []
     spots: list[Floats] = []
@@ -140,10 +134,8 @@ def _wall_row(size: tuple[float, float], wall: int, rng: np.random.Generator) ->
     while at + 0.45 <= end:
         width = float(min(rng.uniform(0.45, 1.4), end - at))
         depth, height = float(rng.uniform(0.36, 0.58)), float(rng.uniform(0.35, 0.75))
-        middle = at + width / 2
-        style = rng.integers(3)
-        piece = (_table, _shelf, _cabinet)[style](width, depth, height, rng)
-        pose = to_wall @ lift_se2(np.array([middle, -depth / 2 - 0.02, 0.0]))
+        piece = (_table, _shelf, _cabinet)[rng.integers(3)](width, depth, height, rng)
+        pose = to_wall @ lift_se2(np.array([at + width / 2, -depth / 2 - 0.02, 0.0]))
         parts += [part.moved(pose) for part in piece]
         columns = max(int(width / SLOT), 1)
         for column in range(columns):
@@ -162,8 +154,8 @@ def _wall_row(size: tuple[float, float], wall: int, rng: np.random.Generator) ->
 def _table(width: float, depth: float, height: float, rng: np.random.Generator) -> list[Part]:
     top, legs = (_wood(rng) if rng.random() < 0.6 else any_material(rng)), any_material(rng)
     feet = [(sx * (width / 2 - 0.04), sy * (depth / 2 - 0.04)) for sx in (-1, 1) for sy in (-1, 1)]
-    parts = [box((width, depth, 0.03), (0, 0, height - 0.015), top)]
-    return parts + [box((0.04, 0.04, height - 0.03), (x, y, (height - 0.03) / 2), legs) for x, y in feet]
+    posts = [box((0.04, 0.04, height - 0.03), (x, y, (height - 0.03) / 2), legs) for x, y in feet]
+    return [box((width, depth, 0.03), (0, 0, height - 0.015), top), *posts]
 
 
 def _shelf(width: float, depth: float, height: float, rng: np.random.Generator) -> list[Part]:
@@ -182,14 +174,12 @@ def _shelf(width: float, depth: float, height: float, rng: np.random.Generator) 
 def _cabinet(width: float, depth: float, height: float, rng: np.random.Generator) -> list[Part]:
     case = any_material(rng, (0.02, 0.1)) if rng.random() < 0.5 else _wood(rng)
     knob = any_material(rng)
-    parts = [box((width, depth, height), (0, 0, height / 2), case)]
-    for x in (-width / 4, width / 4):
-        parts.append(box((0.02, 0.03, 0.12), (x, -depth / 2 - 0.015, height * 0.65), knob))
-    return parts
+    knobs = [box((0.02, 0.03, 0.12), (x, -depth / 2 - 0.015, height * 0.65), knob) for x in (-width / 4, width / 4)]
+    return [box((width, depth, height), (0, 0, height / 2), case), *knobs]
 
 
 def _distractor(rng: np.random.Generator) -> list[Part]:
-    """Something that is none of the seven: boxes, tins, bottles, balls, cones, rings and posts of other forms."""
+    """Draw a thing that is none of the seven objects: a box, tin, bottle, ball, cone, ring or post."""
     first, second = any_material(rng), any_material(rng)
     r, h = float(rng.uniform(0.03, 0.08)), float(rng.uniform(0.06, 0.28))
     w, d = rng.uniform(0.06, 0.22, 2)

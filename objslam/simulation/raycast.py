@@ -1,6 +1,4 @@
-"""Images of a furnished room by casting rays (Open3D on the CPU, no display): colour, depth, and what each pixel shows."""
-
-from __future__ import annotations
+"""Render colour, depth and objects of a furnished room by ray casting with Open3D on the CPU, without a display."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,17 +14,17 @@ from objslam.simulation.furniture import Room
 
 Reals = NDArray[np.floating]
 
-NEAR = 0.05
-"""m; what reaches nearer to the camera than this has no box."""
-_NOISE = 64
+NEAR = 0.05  # The least depth of all points of an object with a box, m.
+_NOISE = 64  # The number of grid points of the solid noise along each axis. A larger value repeats later.
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 
 
 @dataclass(frozen=True)
 class Cast:
-    """What the rays of one image hit: depth (H, W) z in m, inf where nothing; part (H, W), -1 there.
+    """The surfaces that the rays of an image hit.
 
-    normal (H, W, 3) and point (H, W, 3), m, are in map.
+    depth: (H, W) z, m, inf without a hit. part: (H, W) indices of parts, -1 without a hit. normal: (H, W, 3) in map.
+    point: (H, W, 3) in map, m.
     """
 
     depth: Reals
@@ -37,7 +35,7 @@ class Cast:
 
 @dataclass(frozen=True)
 class Caster:
-    """A room ready to be looked at through a camera; `seed` fixes the grain of its textures."""
+    """A room and the camera that looks at it. seed: the seed of the noise in the textures."""
 
     room: Room
     camera: Camera
@@ -45,7 +43,7 @@ class Caster:
 
     @cached_property
     def directions(self) -> Reals:
-        """(H, W, 3) the direction with z = 1, camera frame, of every pixel; pixel centres lie at whole numbers."""
+        """The directions (H, W, 3) of the pixel centres in the camera frame, with z = 1."""
         v, u = np.mgrid[0 : self.camera.height, 0 : self.camera.width]
         directions, _ = undistort(self.camera, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
         return np.asarray((directions / directions[:, 2:]).reshape(*u.shape, 3), dtype=np.float32)
@@ -56,12 +54,11 @@ class Caster:
 
     @cached_property
     def _alone(self) -> list[Any]:
-        """A scene for each object that holds nothing else."""
         return [_scene(self.room, np.flatnonzero(self.room.owner == i)) for i in range(len(self.room.labels))]
 
     @cached_property
     def _grain(self) -> Reals:
-        """(64^3) smooth solid noise in [0, 1] that repeats."""
+        """Smooth periodic noise in [0, 1] on a cube of _NOISE^3 points, flattened."""
         from scipy.ndimage import gaussian_filter
 
         rng = np.random.default_rng(self.seed)
@@ -70,27 +67,26 @@ class Caster:
         return np.clip(0.5 + mixed / (4 * mixed.std()), 0.0, 1.0).astype(np.float32).ravel()
 
     def prepare(self) -> None:
-        """Build all that is built once: after this, several threads may look through it at a time."""
+        """Build the cached data. Afterwards, several threads may use the caster at the same time."""
         _ = self.directions, self._scene, self._alone, self._grain
 
     def cast(self, map_T_camera: Floats) -> Cast:
-        """The first surface on the ray of every pixel from a camera at map_T_camera (4, 4)."""
+        """Find the first surface on the ray of every pixel of a camera at map_T_camera (4, 4)."""
         rays = _rays(self.directions, map_T_camera)
         hit = self._scene.cast_rays(_tensor(rays), 1)
         depth = hit["t_hit"].numpy()
         part = hit["geometry_ids"].numpy().astype(np.int64)
         part[~np.isfinite(depth)] = -1
-        normal = hit["primitive_normals"].numpy()
         reach = np.where(np.isfinite(depth), depth, 0.0)[..., None]
         point = rays[..., :3] + reach * rays[..., 3:]
-        return Cast(depth, part, normal, point)
+        return Cast(depth, part, hit["primitive_normals"].numpy(), point)
 
     def owners(self, cast: Cast) -> Ints:
-        """(H, W) the object that each pixel shows, -1 for none."""
+        """Return the object (H, W) at each pixel, -1 for none."""
         return np.append(self.room.owner, -1)[cast.part]
 
     def silhouettes(self, map_T_camera: Floats, chosen: Ints) -> Ints:
-        """How many pixels (M,) of the image each of the chosen objects (M,) would cover if nothing stood before it."""
+        """Count the pixels (M,) that the chosen objects (M,) would cover if nothing hid them."""
         counts = np.zeros(len(chosen), dtype=np.int64)
         for i, number in enumerate(chosen):
             window = self._window(number, map_T_camera)
@@ -100,9 +96,9 @@ class Caster:
         return counts
 
     def full_sizes(self, map_T_camera: Floats, chosen: Ints) -> Floats:
-        """Width and height (M, 2), px, of the boxes that the chosen objects (M,) would have in an image without edges.
+        """Return the width and height (M, 2), px, of the boxes of the chosen objects (M,) in an image without edges.
 
-        inf where an object reaches out of the lens' field.
+        The size is inf if a part of the object is outside the field of the lens model.
         """
         sizes = np.full((len(chosen), 2), np.inf)
         for i, number in enumerate(chosen):
@@ -112,13 +108,12 @@ class Caster:
         return sizes
 
     def _local(self, number: int, map_T_camera: Floats) -> Floats:
-        """The vertices (V, 3) of an object in the camera frame, m."""
         camera_T_map = inverse(map_T_camera)
         points = np.concatenate([self.room.parts[p].vertices for p in np.flatnonzero(self.room.owner == number)])
         return np.asarray(points @ camera_T_map[:3, :3].T + camera_T_map[:3, 3])
 
     def _window(self, number: int, map_T_camera: Floats) -> tuple[slice, slice] | None:
-        """The part of the image that may show an object, None where it reaches behind the camera or lies outside."""
+        """Return the part of the image around an object, None if the object is outside or partly behind the camera."""
         local = self._local(number, map_T_camera)
         if local[:, 2].min() < NEAR:
             return None
@@ -129,7 +124,7 @@ class Caster:
         return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
     def shade(self, cast: Cast, eye: Floats) -> Reals:
-        """Linear colour (H, W, 3) of what was hit, seen from `eye` (3,): diffuse and glossy light, with shadows."""
+        """Compute the linear colour (H, W, 3) seen from `eye` (3,), with diffuse and glossy reflection and shadows."""
         albedo, gloss = self._albedo(cast)
         view = _unit(eye.astype(np.float32) - cast.point)
         normal = np.where(_dot(cast.normal, view)[..., None] < 0, -cast.normal, cast.normal)
@@ -142,21 +137,20 @@ class Caster:
             dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0, 1).numpy()
             towards = _unit(to)
             power = np.where(dark, 0.0, 1.0 / (0.4 + 0.3 * _dot(to, to))).astype(np.float32)
-            glint = np.maximum(_dot(_unit(towards + view), normal), 0.0) ** 4
+            glint = (np.maximum(_dot(_unit(towards + view), normal), 0.0) ** 4) ** 4
             colour = lamp.power.astype(np.float32)
             light = light + (power * np.maximum(_dot(towards, normal), 0.0))[..., None] * colour
-            glint **= 4
             shine += (power * glint**2 * gloss)[..., None] * colour
         return np.asarray(np.where(cast.part[..., None] >= 0, albedo * light + shine, 0.0), dtype=np.float32)
 
     def _albedo(self, cast: Cast) -> tuple[Reals, Reals]:
-        """The colour (H, W, 3) and the gloss (H, W) of the surface at each pixel."""
+        """Return the colour (H, W, 3) and the gloss (H, W) of the surface at each pixel."""
         materials = [part.material for part in self.room.parts]
-        first = np.array([m.colour for m in materials], dtype=np.float32)[cast.part]
-        second = np.array([m.second for m in materials], dtype=np.float32)[cast.part]
-        gloss = np.array([m.gloss for m in materials], dtype=np.float32)[cast.part]
-        pattern = np.array([_PATTERNS[m.pattern] for m in materials])[cast.part]
-        scale = np.array([m.scale for m in materials], dtype=np.float32)[cast.part]
+        first, second, gloss, scale = (
+            np.array([getattr(material, name) for material in materials], dtype=np.float32)[cast.part]
+            for name in ("colour", "second", "gloss", "scale")
+        )
+        pattern = np.array([_PATTERNS[material.pattern] for material in materials])[cast.part]
         share = np.zeros(cast.part.shape, dtype=np.float32)
         for kind in (1, 2, 3):
             chosen = pattern == kind
@@ -165,7 +159,7 @@ class Caster:
         return first + share[..., None] * (second - first), gloss
 
     def _pattern(self, kind: int, at: Reals) -> Reals:
-        """The share (M,) of the second colour at points (M, 3) in units of the pattern's scale."""
+        """Return the share (M,) of the second colour at points (M, 3), in units of the pattern's scale."""
         if kind == 3:
             return (np.floor(at + 0.37).astype(np.int64).sum(axis=1) & 1).astype(np.float32)
         cell = np.floor(at * 2).astype(np.int64) & (_NOISE - 1)
@@ -188,10 +182,10 @@ def _unit(v: Reals) -> Reals:
     return np.asarray(v / np.sqrt(_dot(v, v) + np.float32(1e-12))[..., None])
 
 
-def _tensor(rays: Reals) -> Any:
+def _tensor(values: NDArray[Any]) -> Any:
     import open3d as o3d
 
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays))
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values))
 
 
 def _scene(room: Room, chosen: Any) -> Any:
@@ -200,9 +194,7 @@ def _scene(room: Room, chosen: Any) -> Any:
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     for p in chosen:
         part = room.parts[p]
-        vertices = o3d.core.Tensor.from_numpy(part.vertices.astype(np.float32))
-        triangles = o3d.core.Tensor.from_numpy(part.triangles.astype(np.uint32))
-        scene.add_triangles(vertices, triangles)
-    # the first ray makes Open3D build its tree, which two threads must not do at once
+        scene.add_triangles(_tensor(part.vertices.astype(np.float32)), _tensor(part.triangles.astype(np.uint32)))
+    # The first ray makes Open3D build its search tree. Two threads must not build the tree at the same time.
     scene.cast_rays(_tensor(np.array([[0, 0, 0, 0, 0, 1]], dtype=np.float32)), 1)
     return scene

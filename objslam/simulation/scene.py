@@ -1,10 +1,8 @@
-"""What stands and roams in the room."""
+"""Draw the standing and the moving objects of a simulated drive."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import count, islice
+from itertools import chain, count, islice
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,34 +16,22 @@ from objslam.simulation.settings import DriveSettings
 from objslam.simulation.trajectory import START, Path
 
 EXTENTS = {
-    "cup": (0.09, 0.11),
-    "bottle": (0.08, 0.26),
-    "plant": (0.28, 0.38),
-    "book": (0.16, 0.23),
-    "clock": (0.25, 0.25),
-    "vase": (0.14, 0.24),
-    "backpack": (0.32, 0.42),
-    "teddy bear": (0.26, 0.32),
-    "laptop": (0.33, 0.23),
-    "ball": (0.22, 0.22),
-    "bowl": (0.18, 0.1),
-    "lamp": (0.22, 0.4),
-}
-"""Width and height, m, of the classes, in the order in which a drive takes them."""
-
-OTHER_EXTENT = (0.2, 0.2)
-WALL = 0.3
-"""m; random objects keep this off the walls."""
-CLEARANCE = 0.4
-"""m; random objects keep this off the path, seen from above."""
+    "cup": (0.09, 0.11), "bottle": (0.08, 0.26), "plant": (0.28, 0.38), "book": (0.16, 0.23),
+    "clock": (0.25, 0.25), "vase": (0.14, 0.24), "backpack": (0.32, 0.42), "teddy bear": (0.26, 0.32),
+    "laptop": (0.33, 0.23), "ball": (0.22, 0.22), "bowl": (0.18, 0.1), "lamp": (0.22, 0.4),
+}  # fmt: skip
+"""The width and height of each class, m. Drives use the classes in this order."""
+OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m.
+WALL = 0.3  # The least distance of random objects from the walls, m.
+CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
-"""frames of each camera, evenly spread, in which a place is looked at to see whether it is a good one."""
-ROUNDS = 50
+"""The largest number of frames of each camera in which the views of a place are counted. They are evenly spaced."""
+ROUNDS = 50  # The number of rounds of random places. A larger value finds places for more objects.
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects that stand: label (N,) index into classes; position (N, 3) m, in map; extent (N, 2) m."""
+    """The standing objects. label: (N,) indices into classes. position: (N, 3) in map, m. extent: (N, 2), m."""
 
     classes: tuple[str, ...]
     label: Ints
@@ -55,9 +41,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class Roamers:
-    """Objects that swing through the room.
+    """The moving objects, which oscillate along each axis.
 
-    label: (K,). extent: (K, 2) m. middle, reach (m), rate (rad/s) and phase (rad) of the swing along each axis: (K, 3).
+    label: (K,). extent: (K, 2), m. middle (m), reach (m), rate (rad/s) and phase (rad) of each oscillation: (K, 3).
     """
 
     label: Ints
@@ -68,16 +54,17 @@ class Roamers:
     phase: Floats
 
     def at(self, stamps: Floats) -> Floats:
-        """Positions (F, K, 3), m, in map at stamps (F,)."""
+        """Return the positions (F, K, 3), m, in map at stamps (F,), s."""
         return self.middle + self.reach * np.sin(self.rate * (stamps - START)[:, None, None] + self.phase)
 
 
 def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Scene:
-    """The given objects and then the random ones, where the path sees them well; frame_stamps: (F, cameras).
+    """Place the given objects, then random objects where the path sees them well. frame_stamps: (F, C) for C cameras, s.
 
-    ConfigError where there are not enough such places.
+    Raises ConfigError if there are not enough places.
     """
-    names = list(islice(_class_names(), settings.classes or settings.objects))
+    numbered = (f"{name} {number}" for number in count(2) for name in EXTENTS)
+    names = list(islice(chain(EXTENTS, numbered), settings.classes or settings.objects))
     labels = [name for name, _ in settings.placed] + [names[i % len(names)] for i in range(settings.objects)]
     classes, label = label_table(labels)
     random_extent = _extents(labels[len(settings.placed) :])
@@ -87,7 +74,7 @@ def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.r
 
 
 def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roamers:
-    """Objects of the scene's classes that swing through the whole room at some 0.3 m/s."""
+    """Draw objects of the scene's classes that move through the whole room at about 0.3 m/s."""
     moving = settings.moving
     label = rng.integers(max(len(scene.classes), 1), size=moving)
     low, high = _bounds(settings)
@@ -98,24 +85,18 @@ def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roa
     return Roamers(label, extent, middle, reach, rate, rng.uniform(0.0, 2 * np.pi, (moving, 3)))
 
 
-def _class_names() -> Iterator[str]:
-    yield from EXTENTS
-    for number in count(2):
-        yield from (f"{name} {number}" for name in EXTENTS)
-
-
 def _extents(labels: Sequence[str]) -> Floats:
     return np.array([EXTENTS.get(label.rstrip(" 0123456789"), OTHER_EXTENT) for label in labels]).reshape(-1, 2)
 
 
 def _bounds(settings: DriveSettings) -> tuple[Floats, Floats]:
-    """The lowest and the highest corner of where random objects may be, (3,) m each."""
+    """Return the lower and the upper bounds of the positions of random objects, (3,) each, m."""
     half = np.array(settings.room) / 2 - WALL
     return np.array([*-half, settings.heights[0]]), np.array([*half, settings.heights[1]])
 
 
 def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: Floats, rng: np.random.Generator) -> Floats:
-    """Places (N, 3) for random objects of extents (N, 2): proposed at random, kept when good and apart."""
+    """Draw good places (N, 3) at least `min_distance` apart for objects of extents (N, 2)."""
     places = np.zeros((0, 3))
     for _ in range(ROUNDS):
         if len(places) == settings.objects:
@@ -126,15 +107,15 @@ def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: F
                 places = np.vstack([places, place])
     if len(places) < settings.objects:
         raise ConfigError(
-            f"only {len(places)} of {settings.objects} objects find a place that the path sees well",
+            f"only {len(places)} of {settings.objects} objects have a place that the cameras see well",
             where=settings.name,
-            hint="fewer objects, a longer drive, or a lower min_distance, min_view_share or min_parallax_deg",
+            hint="set fewer objects, more frames, or a lower min_distance, min_view_share or min_parallax_deg",
         )
     return places
 
 
 def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Floats, extent: Floats) -> Bools:
-    """Which places (C, 3) an object of `extent` could take: not on the path, and seen often enough, widely enough."""
+    """Return which places (P, 3) are off the path and are seen in enough frames and under enough parallax."""
     way = path.at(START + np.linspace(0.0, path.lap, 1000))[:, :2]
     free = cKDTree(way).query(places[:, :2])[0] >= CLEARANCE
     checked = np.linspace(0, settings.frames - 1, min(settings.frames, CHECKED_FRAMES)).astype(int)
@@ -151,10 +132,8 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
-    """A lower bound (C,), rad, of the widest angle between lines of view (V, C, 3) where seen (V, C).
-
-    The direction furthest from the first one seen, and the one furthest from that: for the fan of a planar path, the widest.
-    """
+    """Return a lower bound (P,), rad, of the widest angle between the directions (V, P, 3) where seen (V, P)."""
+    # Each step finds the direction furthest from the last one. For directions in a plane, the result is the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)
     for _ in range(2):

@@ -1,6 +1,4 @@
-"""What a simulated drive is: the room, the robot, its cameras, the objects and every error; named drives."""
-
-from __future__ import annotations
+"""The settings of a simulated drive: the room, the robot, the cameras, the objects and every error."""
 
 from math import gcd
 from typing import Annotated, Any, Literal, Self
@@ -29,9 +27,9 @@ def make_camera(
     distortion_model: DistortionModel = "plumb_bob",
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0),
 ) -> Camera:
-    """A camera at `position` (m, in base) that looks along base x, turned left by `yaw` and up by `pitch` (rad).
+    """Make a camera at `position` (m, in base) that looks along base x, turned left by `yaw` and up by `pitch` (rad).
 
-    width, height, focal in px; the principal point is the middle of the image.
+    width, height and focal are in px. The principal point is the centre of the image.
     """
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     right, forward = np.array([sy, -cy, 0.0]), np.array([cy * cp, sy * cp, sp])
@@ -42,87 +40,69 @@ def make_camera(
 
 
 class PoseNoise(Section):
-    """Standard deviations of a planar pose, or of a step between two: per axis in m, and in rad."""
+    """The standard deviations of a planar pose, or of a step between two poses: per axis in m, and of the yaw in rad."""
 
     xy: NotNegative = 0.0
     yaw: NotNegative = 0.0
 
 
 class DepthNoise(Section):
-    """How the depth at a box errs: z along the optical axis."""
+    """The errors of the depths of boxes. A depth is z along the optical axis."""
 
-    sigma: NotNegative = 0.03
-    """m; the part that does not depend on the distance."""
-    sigma_per_m: NotNegative = 0.02
-    """m per m; the part that grows with it."""
-    missing: Probability = 0.0
-    """share of the boxes without a depth (NaN)."""
-    wrong: Probability = 0.0
-    """share of the depths that belong to something else: anywhere up to max_range."""
+    sigma: NotNegative = 0.03  # The constant part of the standard deviation, m.
+    sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
+    missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
+    wrong: Probability = 0.0  # The share of boxes with the depth of something else, at random up to max_range.
 
 
-class DriveSettings(Section):
-    """A drive and its errors. The defaults are a drive without any error."""
+class CourseSettings(Section):
+    """The path of the robot, and the errors of its odometry and its localisation."""
 
     name: str = "simulated drive"
     room: tuple[Positive, Positive] = (8.0, 6.0)
-    """m along x and y; the map's origin is the middle of the floor."""
+    """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
-    """swings along x and y in a lap (a Lissajous curve, no common divisor): (1, 1) is an ellipse, (1, 2) an eight."""
-    margin: Positive = 1.0
-    """m between the path and the walls."""
+    """The swings along x and y in a lap of a Lissajous curve, without a common divisor. (1, 1) is an ellipse."""
+    margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
-    """frames of each camera; several cameras take turns."""
-    frame_rate: Positive = 5.0
-    """Hz."""
-    speed: Positive = 0.6
-    """m/s on average; slower where the path bends."""
-    laps: Positive | None = None
-    """laps in the whole drive: then the speed follows from it."""
-
-    cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
-    max_range: Positive = 6.0
-    """m; objects further from the camera are not seen."""
-    cut_off: bool = False
-    """boxes that reach over the image's edge are cut off there, as a detector's are; else such an object is not seen."""
-
-    objects: Annotated[int, Field(ge=0)] = 15
-    """objects at random places."""
-    classes: Annotated[int, Field(ge=1)] | None = None
-    """among this many classes, in turn; None: each object is the only one of its class."""
-    placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
-    """further objects at given places in the map: label and x, y, z (m), with the first ids."""
-    heights: tuple[float, float] = (0.1, 1.5)
-    """m; between these stand the objects' centres."""
-    min_distance: NotNegative = 0.6
-    """m between any two random objects."""
-    min_view_share: Probability = 0.1
-    """random objects stand where at least this share of one camera's number of frames could see them,"""
-    min_parallax_deg: NotNegative = 30.0
-    """and under at least this parallax."""
-    moving: Annotated[int, Field(ge=0)] = 0
-    """objects that roam the room, of the classes that are there; no part of the truth."""
-
-    pixel_sigma: NotNegative = 0.0
-    """px; one standard deviation of a box centre, per axis."""
-    missed: Probability = 0.0
-    """share of the visible objects without a box."""
-    false: Probability = 0.0
-    """probability of a box of nothing, in each frame for each class."""
-    depth: DepthNoise | None = None
-    """boxes carry a depth."""
-    tracks: Literal["none", "broken", "perfect"] = "none"
-    """track ids of the boxes: `perfect` ones are the objects' ids in the truth (moving objects come after them), `broken`
-    ones start again after a second out of sight; boxes of nothing have none."""
-
+    """The number of frames of each camera. Several cameras fire one after the other."""
+    frame_rate: Positive = 5.0  # The frames of each camera per second, Hz.
+    laps: Positive | None = None  # The laps in the whole drive. They determine the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """its drift: a random walk with the way (floors are for estimators: unused), or so much a frame; None: no odometry."""
-    odometry_rate: Positive | None = 30.0
-    """Hz; None: at the stamps of the frames."""
-    localization: PoseNoise | None = PoseNoise()
-    """the error of each pose; None: no localisation."""
-    localization_rate: Positive | None = 10.0
-    """Hz; None: at the stamps of the frames."""
+    """The drift, per distance (config.Odometry, whose floors are unused) or per frame (PoseNoise). None: no odometry."""
+    localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
+
+
+class DriveSettings(CourseSettings):
+    """The settings of a drive. The default is a drive without errors."""
+
+    speed: Positive = 0.6  # The mean speed, m/s, if `laps` is None. The robot is slower in bends.
+    cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
+    max_range: Positive = 6.0  # The largest distance at which a camera sees an object, m.
+    cut_off: bool = False
+    """Whether boxes are cut off at the image's edge, as a real detector does. Otherwise objects at the edge get no box."""
+    objects: Annotated[int, Field(ge=0)] = 15
+    """The number of objects at random places."""
+    classes: Annotated[int, Field(ge=1)] | None = None
+    """The number of classes of the objects, assigned in turn. None gives each object a class of its own."""
+    placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
+    """The label and the x, y, z (m, in map) of additional objects. They have the first ids."""
+    heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
+    min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
+    min_view_share: Probability = 0.1
+    """The least number of views of a random object without detector errors, as a share of one camera's frames."""
+    min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
+    moving: Annotated[int, Field(ge=0)] = 0
+    """The number of moving objects. They have the classes of the others and are no part of the ground truth."""
+    pixel_sigma: NotNegative = 0.0  # The standard deviation of a box centre, px per axis.
+    missed: Probability = 0.0  # The share of visible objects without a box.
+    false: Probability = 0.0  # The probability of a false box, in each frame for each class.
+    depth: DepthNoise | None = None  # The errors of depths. None: boxes have no depths.
+    tracks: Literal["none", "broken", "perfect"] = "none"
+    """The track ids of boxes. `perfect` ids are the ids of the objects in the ground truth, then those of moving objects.
+    `broken` ids start again after one second without a box. False boxes have no id."""
+    odometry_rate: Positive | None = 30.0  # The rate of odometry, Hz. None: at the frames' stamps.
+    localization_rate: Positive | None = 10.0  # The rate of the localisation, Hz. None: at the frames' stamps.
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -133,9 +113,9 @@ class DriveSettings(Section):
         if 2 * self.margin >= min(self.room):
             raise ValueError("the margin leaves no room for the path")
         if self.moving and not self.objects and not self.placed:
-            raise ValueError("moving objects take their class from standing ones, and there are none")
+            raise ValueError("moving objects have the classes of standing objects, so a drive needs one of these")
         if not self.cameras or len({camera.name for camera in self.cameras}) < len(self.cameras):
-            raise ValueError("a drive needs cameras with a name of their own each")
+            raise ValueError("a drive needs cameras, and each needs a name of its own")
         return self
 
 
@@ -154,18 +134,18 @@ PRESETS: dict[str, dict[str, Any]] = {
     "large": {**_INDOOR, "room": (30.0, 20.0), "path": (4, 5), "objects": 200, "classes": 10, "frames": 10_000,
               "laps": 4.0, "min_view_share": 0.005, "pixel_sigma": 2.0},
 }  # fmt: skip
-"""Named drives, as changes to the defaults."""
+"""The named drives, as changes to the defaults of `DriveSettings`."""
 
 
 def preset(name: str, **changes: Any) -> DriveSettings:
-    """The settings of a named drive, with changes to single fields. ConfigError: unknown name; ValueError: a field."""
+    """Return the settings of a named drive with changes. Raises ConfigError (unknown name) or ValueError (a bad field)."""
     if name not in PRESETS:
-        raise ConfigError(f"there is no simulated drive {name!r}", hint=f"there are {', '.join(PRESETS)}")
+        raise ConfigError(f"there is no simulated drive {name!r}", hint=f"choose {', '.join(PRESETS)}")
     return DriveSettings(**{"name": name, **PRESETS[name], **changes})
 
 
 def pair(distance: float, label: str = "cup", **changes: Any) -> DriveSettings:
-    """A drive around two objects of one class `distance` (m) apart, seen from 1 to 4 m by a camera that looks left."""
+    """Return a drive around two objects of a class, `distance` (m) apart. The camera looks left, from 1 to 4 m away."""
     camera = make_camera("left", focal=380.0, position=(0.0, 0.0, 0.3), yaw=np.pi / 2)
     places = ((label, (1.5, -distance / 2, 0.4)), (label, (1.5, distance / 2, 0.4)))
     drive = {"name": "pair", "room": (7.0, 7.0), "path": (1, 1), "laps": 1.0, "objects": 0, "placed": places}

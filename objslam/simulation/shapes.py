@@ -1,8 +1,7 @@
-"""Triangle meshes of what stands in a rendered room: primitives, materials, and the paper's seven objects made of them."""
+"""Make the triangle meshes of rendered rooms: primitives, materials, and the paper's seven objects."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,12 +9,14 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 
+LABELS = ("ring", "sponge", "dispenser_button", "probe", "button", "stand_a", "stand_b")
+"""The labels of the paper's seven objects."""
 Pattern = Literal["plain", "noise", "stripes", "checks"]
 
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks: two linear colours (3,) that a solid pattern mixes, its scale in m, and the share of gloss."""
+    """A surface. A solid pattern mixes two linear colours (3,). scale: the pattern's scale, m. gloss: the share of gloss."""
 
     colour: Floats
     second: Floats
@@ -26,39 +27,39 @@ class Material:
 
 @dataclass(frozen=True)
 class Part:
-    """A triangle mesh of one material: vertices (V, 3) m, triangles (T, 3), counter-clockwise seen from outside."""
+    """A mesh of one material: vertices (V, 3), m, and triangles (T, 3), counter-clockwise seen from outside."""
 
     vertices: Floats
     triangles: Ints
     material: Material
 
     def moved(self, pose: Floats) -> Part:
-        """The part at a pose (4, 4)."""
+        """Return the part at a pose (4, 4)."""
         return replace(self, vertices=self.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
 def box(size: tuple[float, float, float], middle: tuple[float, float, float], material: Material) -> Part:
-    """A box of a size along x, y, z around its middle, m."""
+    """Make a box from its size along x, y, z and its centre, m."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     return Part(corners * np.array(size) + np.array(middle), _split(np.array(quads)), material)
 
 
 def turned(profile: list[tuple[float, float]], material: Material, segments: int = 28) -> Part:
-    """The body of revolution around z of a profile of (radius, height) points, m, from the bottom up; ends are closed."""
+    """Make a closed body of revolution around z from a profile of (radius, height), m, from the bottom up."""
     rings = np.array([(0.0, profile[0][1]), *profile, (0.0, profile[-1][1])])
-    return _swept(rings, closed=False, middle=0.0, material=material, segments=segments)
+    return _swept(rings, False, material, segments)
 
 
 def torus(radius: float, thickness: float, height: float, material: Material, segments: int = 36) -> Part:
-    """A ring lying flat: radius of its middle line, radius of its tube, and height of its middle, m."""
+    """Make a horizontal ring. radius: of the centre line. thickness: the tube's radius. height: of the centre. All in m."""
     angle = np.linspace(0.0, 2 * np.pi, 14, endpoint=False)
-    rings = np.column_stack([thickness * np.cos(angle), height + thickness * np.sin(angle)])
-    return _swept(rings, closed=True, middle=radius, material=material, segments=segments)
+    rings = np.column_stack([radius + thickness * np.cos(angle), height + thickness * np.sin(angle)])
+    return _swept(rings, True, material, segments)
 
 
 def ball(radius: float, height: float, material: Material) -> Part:
-    """A sphere with its middle at a height, m."""
+    """Make a sphere with its centre on the z axis at a height, m."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, 15)[1:-1]
     return turned([(radius * np.cos(a), height + radius * np.sin(a)) for a in angle], material)
 
@@ -67,9 +68,9 @@ def _split(quads: Ints) -> Ints:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def _swept(rings: Floats, closed: bool, middle: float, material: Material, segments: int) -> Part:
+def _swept(rings: Floats, closed: bool, material: Material, segments: int) -> Part:
     turn = np.linspace(0.0, 2 * np.pi, segments, endpoint=False)
-    radius = middle + rings[:, :1]
+    radius = rings[:, :1]
     vertices = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.tile(rings[:, 1:], (1, segments))], axis=-1)
     count = len(rings)
     ring = np.arange(count if closed else count - 1)[:, None]
@@ -81,7 +82,7 @@ def _swept(rings: Floats, closed: bool, middle: float, material: Material, segme
 
 
 def paint(rng: np.random.Generator, hue: float, saturation: float, value: float) -> Floats:
-    """A linear colour (3,) near a hue (in turns), saturation and value; no two things are dyed alike."""
+    """Draw a linear colour (3,) near a hue (0 to 1), saturation and value."""
     hue += rng.normal(0.0, 0.012)
     saturation = float(np.clip(saturation + rng.normal(0.0, 0.05), 0.0, 1.0))
     value = float(np.clip(value + rng.normal(0.0, 0.05), 0.02, 1.0))
@@ -94,78 +95,47 @@ def _plastic(rng: np.random.Generator, hue: float, saturation: float, value: flo
     return Material(colour, colour, gloss=float(rng.uniform(0.1, 0.4)))
 
 
-def _ring(rng: np.random.Generator) -> list[Part]:
-    first, second = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)
-    banded = Material(first.colour, second.colour, "noise", 0.03, 0.3)
-    return [torus(0.095, 0.026, 0.026, replace(banded, second=first.colour * 0.75))]
-
-
-def _sponge(rng: np.random.Generator) -> list[Part]:
-    foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)
-    return [
-        box((0.17, 0.11, 0.055), (0, 0, 0.0275), Material(foam, foam * 0.55, "noise", 0.006, 0.0)),
-        box((0.17, 0.11, 0.022), (0, 0, 0.066), Material(pad, pad * 0.6, "noise", 0.004, 0.0)),
-    ]
-
-
-def _dispenser_button(rng: np.random.Generator) -> list[Part]:
-    body, key = _plastic(rng, 0.58, 0.05, 0.85), _plastic(rng, 0.6, 0.85, 0.7)
-    dark = _plastic(rng, 0.0, 0.0, 0.08)
-    return [
-        turned([(0.06, 0.0), (0.062, 0.15), (0.045, 0.17)], body),
-        turned([(0.063, 0.05), (0.063, 0.085)], dark),
-        turned([(0.04, 0.17), (0.042, 0.2), (0.03, 0.215)], key),
-    ]
-
-
-def _probe(rng: np.random.Generator) -> list[Part]:
-    steel, tip = _plastic(rng, 0.6, 0.05, 0.5), _plastic(rng, 0.985, 0.9, 0.65)
-    return [
-        turned([(0.055, 0.0), (0.05, 0.02), (0.014, 0.03), (0.014, 0.19)], steel),
-        ball(0.036, 0.22, tip),
-    ]
-
-
-def _button(rng: np.random.Generator) -> list[Part]:
-    case, head = _plastic(rng, 0.15, 0.9, 0.85), _plastic(rng, 0.99, 0.9, 0.7)
-    return [
-        box((0.15, 0.15, 0.07), (0, 0, 0.035), case),
-        turned([(0.03, 0.07), (0.03, 0.09), (0.058, 0.095), (0.055, 0.12), (0.03, 0.13)], head),
-    ]
-
-
-def _stand_a(rng: np.random.Generator) -> list[Part]:
-    blue, white = _plastic(rng, 0.62, 0.85, 0.55), _plastic(rng, 0.0, 0.0, 0.9)
-    return [
-        turned([(0.1, 0.0), (0.1, 0.015), (0.07, 0.02), (0.05, 0.105)], blue),
-        turned([(0.05, 0.105), (0.04, 0.15)], white),
-        turned([(0.04, 0.15), (0.025, 0.21)], blue),
-    ]
-
-
-def _stand_b(rng: np.random.Generator) -> list[Part]:
-    green = _plastic(rng, 0.4, 0.8, 0.5)
-    return [
-        box((0.2, 0.14, 0.02), (0, 0, 0.01), green),
-        *(box((0.02, 0.14, 0.15), (x, 0, 0.095), green) for x in (-0.08, 0.0, 0.08)),
-    ]
-
-
-MAKERS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
-    "ring": _ring,
-    "sponge": _sponge,
-    "dispenser_button": _dispenser_button,
-    "probe": _probe,
-    "button": _button,
-    "stand_a": _stand_a,
-    "stand_b": _stand_b,
-}
-"""The seven objects of the paper, each standing on z = 0 around the z axis; colours vary a little from one to the next."""
-
-LABELS = tuple(MAKERS)
-
-
 def make_object(label: str, rng: np.random.Generator) -> list[Part]:
-    """One of the seven objects, in a size that differs by up to 8 % from one to the next."""
+    """Make one of the seven objects on z = 0 around the z axis, with a random size factor of 0.92 to 1.08."""
     scale = float(rng.uniform(0.92, 1.08))
-    return [replace(part, vertices=part.vertices * scale) for part in MAKERS[label](rng)]
+    return [replace(part, vertices=part.vertices * scale) for part in _parts(label, rng)]
+
+
+def _parts(label: str, rng: np.random.Generator) -> list[Part]:
+    if label == "ring":
+        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The second draw keeps later draws the same.
+        return [torus(0.095, 0.026, 0.026, Material(first.colour, first.colour * 0.75, "noise", 0.03, 0.3))]
+    if label == "sponge":
+        foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)
+        return [
+            box((0.17, 0.11, 0.055), (0, 0, 0.0275), Material(foam, foam * 0.55, "noise", 0.006, 0.0)),
+            box((0.17, 0.11, 0.022), (0, 0, 0.066), Material(pad, pad * 0.6, "noise", 0.004, 0.0)),
+        ]
+    if label == "dispenser_button":
+        body, key, dark = _plastic(rng, 0.58, 0.05, 0.85), _plastic(rng, 0.6, 0.85, 0.7), _plastic(rng, 0.0, 0.0, 0.08)
+        return [
+            turned([(0.06, 0.0), (0.062, 0.15), (0.045, 0.17)], body),
+            turned([(0.063, 0.05), (0.063, 0.085)], dark),
+            turned([(0.04, 0.17), (0.042, 0.2), (0.03, 0.215)], key),
+        ]
+    if label == "probe":
+        steel, tip = _plastic(rng, 0.6, 0.05, 0.5), _plastic(rng, 0.985, 0.9, 0.65)
+        return [turned([(0.055, 0.0), (0.05, 0.02), (0.014, 0.03), (0.014, 0.19)], steel), ball(0.036, 0.22, tip)]
+    if label == "button":
+        case, head = _plastic(rng, 0.15, 0.9, 0.85), _plastic(rng, 0.99, 0.9, 0.7)
+        return [
+            box((0.15, 0.15, 0.07), (0, 0, 0.035), case),
+            turned([(0.03, 0.07), (0.03, 0.09), (0.058, 0.095), (0.055, 0.12), (0.03, 0.13)], head),
+        ]
+    if label == "stand_a":
+        blue, white = _plastic(rng, 0.62, 0.85, 0.55), _plastic(rng, 0.0, 0.0, 0.9)
+        return [
+            turned([(0.1, 0.0), (0.1, 0.015), (0.07, 0.02), (0.05, 0.105)], blue),
+            turned([(0.05, 0.105), (0.04, 0.15)], white),
+            turned([(0.04, 0.15), (0.025, 0.21)], blue),
+        ]
+    if label == "stand_b":
+        green = _plastic(rng, 0.4, 0.8, 0.5)
+        plates = [box((0.02, 0.14, 0.15), (x, 0, 0.095), green) for x in (-0.08, 0.0, 0.08)]
+        return [box((0.2, 0.14, 0.02), (0, 0, 0.01), green), *plates]
+    raise ValueError(f"no object is called {label!r}")

@@ -1,17 +1,14 @@
-"""Sources: whatever a robot recorded, read into a `Log`.
+"""Read recordings of any kind into a `Log`.
 
-`SOURCES` is the table of the kinds of recordings, one file or folder each; messages that come live are in `live`. A new kind
-is one more file and one more row. If it has options of its own, it declares them as `options` says, and `SourceOptions`
-inherits them.
+`SOURCES` lists the kinds, each with the functions that detect and read it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import ConfigError, LogError
@@ -27,19 +24,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SourceOptions(BagOptions, TumOptions, MrclamOptions, AnyOptions):
-    """What a recording of any kind does not say itself: the options of all sources, the last class's first in `--help`."""
+    """The options of all sources. `--help` shows the options of the last base class first."""
 
 
 @dataclass(frozen=True)
 class Source:
     """A kind of recording.
 
-    Attributes:
-        name: what `--format` calls it.
-        looks_for: how to tell it, in words.
-        detector: "module:function", where function(path) says whether a path is one; imported when it is first asked.
-        reader: "module:function", where function(path, ledger) reads one, or function(path, ledger, options).
-        options: the class of the options that it takes, which `SourceOptions` inherits; None: it takes none.
+    name: the value of `--format` that selects this kind. looks_for: the files that identify this kind, for error messages.
+    detector: "module:function" that takes a path and returns whether the path is of this kind.
+    reader: "module:function" that takes (path, ledger), and also the options if the kind has any.
+    options: the class of the kind's options, a base class of `SourceOptions`. None if the kind has no options.
     """
 
     name: str
@@ -49,19 +44,13 @@ class Source:
     options: type[Any] | None = None
 
     def detects(self, path: Path) -> bool:
-        """Whether a path is a recording of this kind."""
-        return bool(_function(self.detector)(path))
+        """Return whether a path is a recording of this kind."""
+        return resolve_name(f"objslam.{self.detector}")(path)
 
     def reads(self, path: Path, ledger: Ledger, options: SourceOptions) -> Log:
-        """Read a recording of this kind; LogError where it cannot be read."""
-        log: Log = _function(self.reader)(path, ledger, *((options,) if self.options is not None else ()))
-        return log
-
-
-def _function(place: str) -> Callable[..., Any]:
-    module, _, name = place.partition(":")
-    found: Callable[..., Any] = getattr(import_module(f"objslam.{module}"), name)
-    return found
+        """Read a recording of this kind into a `Log`. Raises LogError if it cannot be read."""
+        more = () if self.options is None else (options,)
+        return resolve_name(f"objslam.{self.reader}")(path, ledger, *more)
 
 
 SOURCES = (
@@ -94,7 +83,7 @@ SOURCES = (
     ),
     Source(
         "journal",
-        "journal.objslam, what a live session accepted",
+        "journal.objslam, the journal of a live session",
         "sources.journal.file:is_journal",
         "sources.journal.file:read_journal",
     ),
@@ -106,19 +95,15 @@ SOURCES = (
         BagOptions,
     ),
 )
-"""The kinds of recordings in the order in which they are looked for: the first that fits is taken."""
+"""The kinds of recordings. `choose` tries them in this order and takes the first that fits."""
 
 
 def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Log:
-    """Read a recording of any kind that `SOURCES` lists.
+    """Read a recording of any kind in `SOURCES`.
 
-    Args:
-        path: what was recorded; its kind is guessed from what it holds unless the options name it.
-        ledger: takes what was dropped, and a warning of each option that the kind does not take.
-        options: what the recording does not say itself.
-    Raises:
-        LogError: when nothing fits or the recording cannot be read.
-        ConfigError: for a format that does not exist.
+    The content of the recording determines its kind, unless `options.format` names the kind. The ledger counts dropped data,
+    and gets a warning for each given option that this kind does not take.
+    Raises LogError if no kind fits or the recording cannot be read, and ConfigError if `options.format` is unknown.
     """
     options = options or SourceOptions()
     source = choose(path, options.format)
@@ -128,10 +113,10 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
 
 
 def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:
-    """Read a recording of any kind and write it as a log folder, with the images and depth images that it brings.
+    """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
-    Images that a recording holds inside it are extracted right beside the log folder and then take their place in it: they
-    are written once. Errors as in `read` and `log_folder.write_log_folder`.
+    Images inside a bag are extracted into a folder beside the log folder and then linked into it, so that their bytes are
+    written once. Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder
 
@@ -144,12 +129,12 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
 
 
 def choose(path: Path, name: str | None = None) -> Source:
-    """The kind of recording that a path holds, or the one with that name; errors as in `read`."""
+    """Return the kind called `name`, or without a name the kind of the recording at a path. Raises the errors of `read`."""
     if name is not None:
-        for source in SOURCES:
-            if source.name == name:
-                return source
-        raise ConfigError(f"there is no format {name!r}", hint=f"known: {', '.join(source.name for source in SOURCES)}")
+        named = {source.name: source for source in SOURCES}
+        if name not in named:
+            raise ConfigError(f"there is no format {name!r}", hint=f"choose {', '.join(named)}")
+        return named[name]
     try:
         path.stat()
         for source in SOURCES:
@@ -157,11 +142,11 @@ def choose(path: Path, name: str | None = None) -> Source:
                 return source
         from objslam.sources.log_folder import resembles_log
 
-        if resembles_log(path):  # reading it says what is missing
+        if resembles_log(path):  # The reader of log folders then reports the missing file.
             return choose(path, "log")
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+    except (OSError, ValueError) as error:  # A NUL in the path raises ValueError.
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
     if (path / "objects.json").is_file() and (path / "summary.json").is_file():
-        raise LogError("this is a result, not a log", where=str(path), hint="log_path in its summary.json names the log")
+        raise LogError("this is a result, not a log", where=str(path), hint="give the log_path in its summary.json")
     looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)
     raise LogError("nothing here that objslam reads", where=str(path), hint=f"looked for {looked_for}")

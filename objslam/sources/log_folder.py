@@ -1,6 +1,4 @@
-"""A log folder: the one form on disk that holds everything a `Log` can hold."""
-
-from __future__ import annotations
+"""Read and write log folders, the format on disk that holds everything in a `Log`."""
 
 import json
 import os
@@ -13,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Images, Log, Trajectory, Truth, TruthObject
+from objslam.core.types import CameraLog, Images, Log, Trajectory, Truth
 from objslam.errors import LogError, OutputError
 from objslam.io.camera_yaml import read_camera, write_camera
 from objslam.io.detections_jsonl import read_detections, write_detections
@@ -32,50 +30,51 @@ _T = TypeVar("_T")
 
 
 def is_log_folder(path: Path) -> bool:
-    """Whether the folder holds a camera and a path, as a log folder must."""
+    """Return whether the folder holds a camera and a path, which every log folder has."""
     camera = (path / CAMERA).is_file() or (path / CAMERAS).is_dir()
     return camera and ((path / ODOMETRY).is_file() or (path / LOCALIZATION).is_file())
 
 
 def resembles_log(path: Path) -> bool:
-    """Whether the folder holds any part that a log folder must have, be it all or not."""
+    """Return whether the folder holds a camera or a path."""
     return any((path / name).exists() for name in (CAMERA, CAMERAS, ODOMETRY, LOCALIZATION))
 
 
 def read_log_folder(path: Path, ledger: Ledger) -> Log:
     """Read a log folder.
 
-    Malformed lines are dropped and counted with file and line; of odometry and localisation, one that cannot be used at all
-    is left out with a warning if the other can, and so are images and ground truth. LogError where a camera, its
-    detections or its mount, or every path cannot be used. Images are listed, not opened.
+    Malformed lines are dropped and counted with file and line. Unusable images and ground truth are left out with a warning.
+    An unusable odometry is left out with a warning if the localisation is usable, and vice versa. Images are not opened.
+    Raises LogError if a camera, its detections or its mount is unusable, or if no path is usable.
     """
     with reading(path):
         if not path.is_dir():
             raise LogError("not a folder" if path.exists() else "no such folder", where=str(path))
-        cameras = _read_cameras(path, ledger)
-        odometry, localization = _read_paths(path, ledger)
-        return Log(path.resolve().name, cameras, odometry, localization, read_truth(path / TRUTH, ledger))
+        cameras, paths = _read_cameras(path, ledger), _read_paths(path, ledger)
+        return Log(path.resolve().name, cameras, *paths, read_truth(path / TRUTH, ledger))
 
 
 def read_truth(folder: Path, ledger: Ledger) -> Truth | None:
-    """The ground truth in a folder, None where there is none; what of it cannot be read is left out with a warning."""
+    """Read the ground truth in a folder. Returns None if it has none. Unreadable files are left out with a warning."""
     objects = _optional(read_truth_objects, folder / TRUTH_OBJECTS, ledger)
     trajectory = _optional(lambda file: read_trajectory(file, ledger), folder / TRUTH_TRAJECTORY, ledger)
     return None if objects is None and trajectory is None else Truth(objects or (), trajectory)
 
 
 def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
-    """Write a log folder; every number reads back as the same float (rotations as unit quaternions).
+    """Write a log folder. Every number reads back as the same float. Rotations are written as unit quaternions.
 
-    All is written into a folder beside it that is renamed at the end. Image files are linked, or copied, below rgb/ and
-    depth/; those that lie in the camera's folder already keep their place. Detections without a frame are not written.
-    OutputError when there is a log already (unless `overwrite`), something else, or no camera or path in the log.
+    The content is written into a temporary folder that is renamed at the end. Images are linked or copied into rgb/ and
+    depth/. Images that are already in the camera's folder keep their place. Detections without frames are not written.
+    Raises OutputError if the log lacks a camera or a path, or if `check_target` refuses the path.
     """
     path = Path(os.path.realpath(path))
     if not log.cameras or not (log.odometry or log.localization):
-        raise OutputError("a log without a camera or without a path cannot be written", where=log.name)
+        missing = "odometry or localization" if log.cameras else "cameras"
+        raise OutputError(f"cannot write a log without {missing}", where=log.name)
     names = [camera_log.camera.name for camera_log in log.cameras]
-    if len(set(names)) < len(names) or (len(names) > 1 and not all(_is_file_name(name) for name in names)):
+    files = all(name and not name.startswith(".") and "/" not in name and name.isprintable() for name in names)
+    if len(set(names)) < len(names) or (len(names) > 1 and not files):
         raise OutputError(f"the cameras' names must differ and be file names, got {names}", where=log.name)
     check_target(path, overwrite)
     with beside(path) as work, _writing(path):
@@ -93,7 +92,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """An empty folder next to where a log folder is to be: what is made in it can be moved there. It is gone afterwards."""
+    """Make an empty folder beside a path, on the same disk, and remove it afterwards."""
     path = Path(os.path.realpath(path))
     with no_empty_folders(path.parent):
         with _writing(path):
@@ -106,18 +105,14 @@ def beside(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: Path, overwrite: bool) -> None:
-    """OutputError where a log folder could not be written: something is there already that must not be replaced."""
+    """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced."""
     with _writing(path):
-        if not path.exists():
-            return
-        if not path.is_dir():
-            raise OutputError("a file is in the way", where=str(path))
-        if not any(path.iterdir()):
+        if path.exists() and not path.is_dir():
+            raise OutputError("a file is in the way", where=str(path), hint="name another folder")
+        if not path.exists() or not any(path.iterdir()):
             return
         if not is_log_folder(path):
-            raise OutputError(
-                "the folder holds something that is no log", where=str(path), hint="name a new or empty folder"
-            )
+            raise OutputError("the folder has files but is no log", where=str(path), hint="name a new or empty folder")
         if not overwrite:
             raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
 
@@ -134,12 +129,12 @@ def _writing(path: Path) -> Iterator[None]:
 def _read_cameras(path: Path, ledger: Ledger) -> tuple[CameraLog, ...]:
     single, several = path / CAMERA, path / CAMERAS
     if single.exists() and several.exists():
-        raise LogError(f"{CAMERA} and {CAMERAS}/ are both there", where=str(path), hint="keep one of the two")
+        raise LogError(f"the folder has both {CAMERA} and {CAMERAS}/", where=str(path), hint="keep one of the two")
     if not several.exists():
         return (_read_camera_log(path, None, ledger),)
     folders = sorted(f for f in several.iterdir() if f.is_dir() and not f.name.startswith("."))
     if not folders:
-        raise LogError("no camera in it", where=str(several), hint=f"each camera is a folder with its {CAMERA}")
+        raise LogError("no camera in it", where=str(several), hint=f"put each camera into a folder with a {CAMERA}")
     return tuple(_read_camera_log(folder, folder.name, ledger) for folder in folders)
 
 
@@ -156,16 +151,16 @@ def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLo
 
 
 def _read_paths(path: Path, ledger: Ledger) -> tuple[Trajectory | None, Trajectory | None]:
-    there = [file for file in (path / ODOMETRY, path / LOCALIZATION) if file.exists()]
     paths: dict[str, Trajectory] = {}
     refused = []
-    for file in there:
+    for name in (ODOMETRY, LOCALIZATION):
         try:
-            paths[file.name] = read_trajectory(file, ledger)
+            if (path / name).exists():
+                paths[name] = read_trajectory(path / name, ledger)
         except LogError as error:
             refused.append(error)
-    if not there:
-        raise LogError(f"the log has neither {ODOMETRY} nor {LOCALIZATION}", where=str(path), hint="it needs one of the two")
+    if not paths and not refused:
+        raise LogError(f"the log has neither {ODOMETRY} nor {LOCALIZATION}", where=str(path), hint="add one of the two")
     if not paths:
         raise refused[0]
     for reason in refused:
@@ -174,52 +169,42 @@ def _read_paths(path: Path, ledger: Ledger) -> tuple[Trajectory | None, Trajecto
 
 
 def _optional(read: Callable[[Path], _T], file: Path, ledger: Ledger) -> _T | None:
-    if not file.exists():
-        return None
     try:
-        return read(file)
+        return read(file) if file.exists() else None
     except LogError as error:
         ledger.warn(f"{error}: left out")
         return None
-
-
-def _is_file_name(name: str) -> bool:
-    return bool(name) and not name.startswith(".") and "/" not in name and name.isprintable()
 
 
 def _write_content(log: Log, folder: Path, final: Path) -> None:
     single = len(log.cameras) == 1
     for camera_log in log.cameras:
         place = Path() if single else Path(CAMERAS, camera_log.camera.name)
-        (folder / place).mkdir(parents=True, exist_ok=True)
-        _write_camera_log(camera_log, folder / place, final / place)
+        own = folder / place
+        own.mkdir(parents=True, exist_ok=True)
+        write_camera(camera_log.camera, own / CAMERA)
+        if camera_log.mount is not None:
+            write_trajectory(camera_log.mount, own / MOUNT)
+        if camera_log.detections is not None and len(camera_log.detections.frame_stamps):
+            write_detections(camera_log.detections, own / DETECTIONS)
+        for images, kind in ((camera_log.rgb, RGB), (camera_log.depth, DEPTH)):
+            if images is not None and images.paths:
+                write_images(_link_images(images, kind, own, final / place), own / f"{kind}.txt")
     truth = log.truth or Truth()
-    for trajectory, file in (
-        (log.odometry, folder / ODOMETRY),
-        (log.localization, folder / LOCALIZATION),
-        (truth.trajectory, folder / TRUTH / TRUTH_TRAJECTORY),
-    ):
+    paths = {ODOMETRY: log.odometry, LOCALIZATION: log.localization, f"{TRUTH}/{TRUTH_TRAJECTORY}": truth.trajectory}
+    for name, trajectory in paths.items():
         if trajectory is not None:
-            file.parent.mkdir(exist_ok=True)
-            write_trajectory(trajectory, file)
+            (folder / name).parent.mkdir(exist_ok=True)
+            write_trajectory(trajectory, folder / name)
     if truth.objects:
         (folder / TRUTH).mkdir(exist_ok=True)
-        (folder / TRUTH / TRUTH_OBJECTS).write_text(_dump_truth(truth.objects), encoding="utf-8")
-
-
-def _write_camera_log(camera_log: CameraLog, folder: Path, final: Path) -> None:
-    write_camera(camera_log.camera, folder / CAMERA)
-    if camera_log.mount is not None:
-        write_trajectory(camera_log.mount, folder / MOUNT)
-    if camera_log.detections is not None and len(camera_log.detections.frame_stamps):
-        write_detections(camera_log.detections, folder / DETECTIONS)
-    for images, kind in ((camera_log.rgb, RGB), (camera_log.depth, DEPTH)):
-        if images is not None and images.paths:
-            write_images(_link_images(images, kind, folder, final), folder / f"{kind}.txt")
+        entries = [{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in truth.objects]
+        text = json.dumps({"format": FORMAT, "frame": "map", "objects": entries}, indent=1, allow_nan=False) + "\n"
+        (folder / TRUTH / TRUTH_OBJECTS).write_text(text, encoding="utf-8")
 
 
 def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images:
-    """The images, linked or copied into the folder, which is to become `final`."""
+    """Link or copy images into a temporary folder that is renamed to `final` later, and return them with their new paths."""
     sources = [path.resolve() for path in images.paths]
     distinct = list(dict.fromkeys(sources))
     names = [source.name for source in distinct]
@@ -231,20 +216,11 @@ def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images
         places = [Path(kind, f"{index:06d}{source.suffix}") for index, source in enumerate(distinct)]
     targets = {source: folder / place for source, place in zip(distinct, places, strict=True)}
     for source, target in targets.items():
-        _link(source, target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():  # Two streams may list the same file.
+            continue
+        try:
+            os.link(source, target)
+        except OSError:  # The source is on another disk or has another owner.
+            shutil.copyfile(source, target)
     return replace(images, paths=tuple(targets[source] for source in sources))
-
-
-def _link(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if target.exists():  # two streams may list one file
-        return
-    try:
-        os.link(source, target)
-    except OSError:  # another disk, or a file of somebody else: a copy serves as well
-        shutil.copyfile(source, target)
-
-
-def _dump_truth(objects: tuple[TruthObject, ...]) -> str:
-    entries = [{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects]
-    return json.dumps({"format": FORMAT, "frame": "map", "objects": entries}, indent=1, allow_nan=False) + "\n"

@@ -1,6 +1,4 @@
-"""What is inside a log that was read, of whatever kind, and what a run would miss in it."""
-
-from __future__ import annotations
+"""A summary of a log for `objslam info`: its streams, its cameras and the data that a run needs but the log lacks."""
 
 from dataclasses import dataclass
 
@@ -8,12 +6,14 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory
+from objslam.core.types import Detections, Images, Log, Trajectory
+
+FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When the messages of a stream come: how many, the first and the last (s), rate (Hz), the longest gap (s)."""
+    """The stamps of a stream: their count, the first and last (s), the mean rate (Hz) and the longest gap (s)."""
 
     count: int
     start: float
@@ -24,7 +24,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Stream:
-    """One stream of a log. role: what a run uses it for. detail: what it holds, in a few words."""
+    """One stream of a log. role: its use in a run. detail: a short description of its content."""
 
     role: str
     timing: Timing
@@ -33,7 +33,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class Contents:
-    """A log at a glance: its streams, its cameras, and what a run needs and does not find."""
+    """The summary of a log. missing: one line for each thing that a run needs but the log lacks."""
 
     name: str
     streams: tuple[Stream, ...]
@@ -42,21 +42,22 @@ class Contents:
 
 
 def timing(stamps: Floats) -> Timing:
-    """The timing of stamps (N,), N > 0, in any order."""
+    """Compute the timing of stamps (N,), N > 0, in any order."""
     times = np.sort(stamps)
     span = float(times[-1] - times[0])
-    return Timing(
-        count=len(times),
-        start=float(times[0]),
-        end=float(times[-1]),
-        rate=(len(times) - 1) / span if span > 0 else 0.0,
-        longest_gap=float(np.diff(times).max()) if len(times) > 1 else 0.0,
-    )
+    rate = (len(times) - 1) / span if span > 0 else 0.0
+    gap = float(np.diff(times).max()) if len(times) > 1 else 0.0
+    return Timing(len(times), float(times[0]), float(times[-1]), rate, gap)
 
 
 def contents(log: Log) -> Contents:
-    """What a log holds."""
+    """Summarise a log."""
     streams = [_path("odometry", log.odometry), _path("localization", log.localization)]
+    missing = []
+    if log.odometry is None and log.localization is None:
+        missing.append("there is neither odometry nor localisation")
+    if not log.cameras:
+        missing.append("there is no camera")
     for camera_log in log.cameras:
         name = f"{camera_log.camera.name}." if len(log.cameras) > 1 else ""
         streams += [
@@ -65,42 +66,29 @@ def contents(log: Log) -> Contents:
             _images(f"{name}depth", camera_log.depth),
             _path(f"{name}camera_poses", camera_log.mount),
         ]
+        where, frames = f"camera {camera_log.camera.name}", np.zeros(0)
+        if camera_log.detections is not None:
+            frames = camera_log.detections.frame_stamps
+        elif camera_log.rgb is not None:
+            frames = camera_log.rgb.stamps
+            missing.append(f"{where}: no detections; {FIND_BOXES}")
+        else:
+            missing.append(f"{where}: neither detections nor images")
+        missing += off_path(where, frames, log.localization or log.odometry)
     if log.truth is not None:
         streams.append(_path("truth", log.truth.trajectory))
     cameras = tuple(camera_log.camera for camera_log in log.cameras)
-    return Contents(log.name, tuple(s for s in streams if s is not None), cameras, _missing(log))
-
-
-def _missing(log: Log) -> tuple[str, ...]:
-    missing = []
-    if log.odometry is None and log.localization is None:
-        missing.append("there is neither odometry nor localisation")
-    if not log.cameras:
-        missing.append("there is no camera")
-    for camera_log in log.cameras:
-        where = f"camera {camera_log.camera.name}"
-        frames = _frames(camera_log)
-        if camera_log.detections is None:
-            images = "run a detector on its images (--detector)" if camera_log.rgb is not None else "and no images either"
-            missing.append(f"{where}: no detections; {images}")
-        missing += off_path(where, frames, log.localization or log.odometry)
-    return tuple(missing)
+    return Contents(log.name, tuple(stream for stream in streams if stream), cameras, tuple(missing))
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
-    """What to say where none of a camera's frames (N,), s, lies on the path; nothing where one does."""
+    """Return a message if none of a camera's frames (N,), s, is within the time of the path, else an empty list."""
     if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
         return []
     return [
         f"{where}: none of its frames ({frames.min():.3f} to {frames.max():.3f} s) is on the path "
-        f"({path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s); do both use one clock?"
+        f"({path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s); check that both use one clock"
     ]
-
-
-def _frames(camera_log: CameraLog) -> Floats:
-    if camera_log.detections is not None:
-        return camera_log.detections.frame_stamps
-    return np.zeros(0) if camera_log.rgb is None else camera_log.rgb.stamps
 
 
 def _path(role: str, path: Trajectory | None) -> Stream | None:

@@ -1,4 +1,4 @@
-"""Objects from rays whose poses are known: Eq. 1 for a whole log at once, on the rays that agree, in torch.
+"""Triangulates objects from rays with known poses: Eq. 1 for a whole log at once, on the rays that agree, in torch.
 
-Which ray belongs to which object is decided in `association`; poses that move with the objects are in `graph`.
+`association` decides which ray belongs to which object, and `graph` optimises poses together with objects.
 """

@@ -1,13 +1,9 @@
-"""Which rays of an object agree, for many objects at once, in torch: a-contrario consensus over ray pairs.
+"""A-contrario consensus over ray pairs (AC-RANSAC): which rays of an object agree, for many objects at once, in torch.
 
-How far real rays miss their object is not known beforehand: the box of a large object wanders by many times the pixel
-noise. So there is no fixed threshold. A point is judged by how unlikely it is that chance would make its rays agree so
-well (Moisan & Stival, IJCV 57, 2004; AC-RANSAC: Moisan, Moulon & Monasse, IPOL 2, 2012). Each share of the rays is weighed
-against the angle that it takes, and the share that chance explains least is the consensus. `triangulate` imports this
-module only when something is triangulated.
+No fixed threshold fits, because the box of a large object wanders by many times the pixel noise. So the consensus is the
+share of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon & Monasse, IPOL
+2, 2012).
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator
@@ -16,21 +12,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from objslam.triangulation.point_to_lines import least_squares, minimise_distances, object_sum, perpendicular
+from objslam.triangulation.point_to_lines import least_squares, minimise_distances, object_sum
 
-_VIEW_CAP = 1 - math.cos(math.radians(45))  # The view in which chance throws a wrong box: a cone of 45 degrees' half angle.
-_NOISE_SIGMAS = 3.0  # The standard deviations within which a closer agreement is no better.
-_MOST_NOISE = 0.25  # The greatest share of the view that noise may take; larger lets very noisy rays agree with anything.
-_PAIRS_AT_ONCE = 1 << 19  # The pairs of a ray and a hypothesis computed together; larger needs more memory.
-_MAX_ROUNDS = 20  # The most turns of Eq. 1 and selection; they end earlier when the agreement no longer grows.
+_VIEW_CAP = 1 - math.cos(math.radians(45))  # The view over which wrong boxes are uniform, a cone with 45 degrees half angle.
+_NOISE_SIGMAS = 3.0  # The standard deviations within which a closer agreement scores no better.
+_MOST_NOISE = 0.25  # The largest share of the view that noise may take; larger lets very noisy rays agree with any point.
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together; larger needs more memory.
+_MAX_ROUNDS = 20  # The most alternations of Eq. 1 and selection, which end earlier once the agreement stops growing.
 
 
 @dataclass(frozen=True)
 class Bundle:
     """Rays of many objects, sorted by object.
 
-    origin: (R, 3) m, in the coordinates of their object. direction: (R, 3) unit. sigma: (R,) rad. position_sigma: m, of the
-    origins. index: (R,) the object of each ray. number: (N,) rays of each object.
+    origin: (R, 3) m, in coordinates of their object. direction: (R, 3) unit. sigma: (R,) rad. position_sigma: m, noise of
+    the origins. index: (R,) object of each ray. number: (N,) rays of each object.
     """
 
     origin: Tensor
@@ -41,13 +37,13 @@ class Bundle:
     number: Tensor
 
     def chunks(self, objects: Tensor, hypotheses: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Objects (indices) in chunks of similar size: their indices (B,), their rays (B, n), which of these are real."""
+        """Split objects (indices) into chunks of similar size: objects (B,), their rays (B, n), and which rays are real."""
         first = torch.cumsum(self.number, 0) - self.number
         objects = objects[torch.argsort(self.number[objects], stable=True)]
         while len(objects):
             size = self.number[objects]
             fits = torch.arange(1, len(objects) + 1, device=size.device) * size * hypotheses <= _PAIRS_AT_ONCE
-            end = max(1, int(fits.sum()))  # sizes increase: what fits comes first
+            end = max(1, int(fits.sum()))  # The sizes increase, so the fitting objects come first.
             slot = torch.arange(int(size[end - 1]), device=size.device)
             real = slot < size[:end, None]
             yield objects[:end], first[objects[:end], None] + torch.where(real, slot, 0), real
@@ -56,7 +52,7 @@ class Bundle:
 
 @dataclass(frozen=True)
 class PointSolution:
-    """Eq. 1's solutions: point (N, 3), determined (N,) whether its rays fix it, gradient (N,), iterations."""
+    """Solution of Eq. 1. point: (N, 3). determined: (N,) whether the rays fix it. gradient: (N,) norm. iterations."""
 
     point: Tensor
     determined: Tensor
@@ -64,70 +60,62 @@ class PointSolution:
     iterations: int
 
 
-def solve_points(bundle: Bundle, use: Tensor, start: Tensor | None = None) -> PointSolution:
-    """Eq. 1 on the rays in use (R,), from the least squares, or from a start (N, 3) where that is better.
+def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
+    """Solve Eq. 1 on the rays in use (R,), from the least-squares points.
 
-    Objects that their rays do not fix get the point of `least_squares` and a NaN gradient.
+    Objects that their rays do not fix keep the point of `least_squares` and get a NaN gradient.
     """
-    count = len(bundle.number)
     origin, direction, index = bundle.origin[use], bundle.direction[use], bundle.index[use]
-    point, determined = least_squares(origin, direction, index, count)
+    point, determined = least_squares(origin, direction, index, len(bundle.number))
     gradient = torch.full_like(point[:, 0], torch.nan)
     rays = determined[index]
     number = (torch.cumsum(determined, 0) - 1)[index[rays]]
-    origin, direction, begin = origin[rays], direction[rays], point[determined]
-    if start is not None:  # a start far from the lines would also cost precision
-        mine = start[determined]
-        cost, own = (
-            object_sum(perpendicular(p[number] - origin, direction).norm(dim=1), number, len(begin)) for p in (begin, mine)
-        )
-        begin = torch.where((own < cost)[:, None], mine, begin)
-    point[determined], iterations, gradient[determined] = minimise_distances(origin, direction, number, len(begin), begin)
+    solved = minimise_distances(origin[rays], direction[rays], number, point[determined])
+    point[determined], iterations, gradient[determined] = solved
     return PointSolution(point, determined, gradient, iterations)
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
-    """Eq. 1 on the rays that agree: the solution, inlier (R,), log NFA (N,). `best_pair` explains hypotheses and jitter.
+    """Solve Eq. 1 on the rays that agree, and return the solution, inlier (R,) and log NFA (N,).
 
-    The candidates are Eq. 1 on all rays, ray pairs, and a point far ahead, on which nearly parallel rays agree. From the
-    best one Eq. 1 and the selection take turns as long as the agreement grows. An object without two rays that agree
-    keeps all its rays.
+    The candidates are Eq. 1 on all rays, ray pairs, and a point far ahead, on which nearly parallel rays agree. Eq. 1 and
+    the selection then alternate from the best candidate while the agreement grows. An object without two agreeing rays keeps
+    all its rays. hypotheses and jitter are as in `best_pair`.
     """
-    everything = torch.ones(len(bundle.origin), dtype=torch.bool, device=bundle.origin.device)
-    result = solve_points(bundle, everything)
-    start = result.point
-    inlier, log_nfa = consensus_about(bundle, start)
-    searched = torch.nonzero((bundle.number > 2) & ~_within_noise(bundle, start))[:, 0]
-    pair_point, pair_nfa = start.clone(), torch.full_like(log_nfa, torch.inf)
-    pair_point[searched], pair_nfa[searched] = best_pair(bundle, searched, hypotheses, jitter)
-    for candidate in (pair_point, _far_ahead(bundle)):
+    used = torch.ones(len(bundle.origin), dtype=torch.bool, device=bundle.origin.device)
+    result = solve_points(bundle, used)
+    inlier, log_nfa = consensus_about(bundle, result.point)
+
+    def improve(candidate: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
         agreeing, nfa = consensus_about(bundle, candidate)
-        better = nfa < log_nfa
-        inlier = torch.where(better[bundle.index], agreeing, inlier)
-        log_nfa = torch.where(better, nfa, log_nfa)
+        better = objects & (nfa < log_nfa)
+        return torch.where(better[bundle.index], agreeing, inlier), torch.where(better, nfa, log_nfa)
+
+    searched = torch.nonzero((bundle.number > 2) & ~_within_noise(bundle, result.point))[:, 0]
+    pair_point = result.point.clone()
+    pair_point[searched] = best_pair(bundle, searched, hypotheses, jitter)
+    for candidate in (pair_point, _far_ahead(bundle)):
+        inlier, log_nfa = improve(candidate, torch.ones_like(result.determined))
     alone = object_sum(inlier.to(log_nfa.dtype), bundle.index, len(log_nfa)) < 2
     inlier |= alone[bundle.index]
-    used, point, iterations = everything, result.point, result.iterations
-    determined, gradient = result.determined, result.gradient
     for _ in range(_MAX_ROUNDS):
         changed = object_sum((inlier != used).to(log_nfa.dtype), bundle.index, len(log_nfa)) > 0
         if not changed.any():
             break
         again = solve_points(bundle, inlier & changed[bundle.index])
-        point = torch.where(changed[:, None], again.point, point)
-        determined = torch.where(changed, again.determined, determined)
-        gradient = torch.where(changed, again.gradient, gradient)
-        iterations += again.iterations
+        result = PointSolution(
+            torch.where(changed[:, None], again.point, result.point),
+            torch.where(changed, again.determined, result.determined),
+            torch.where(changed, again.gradient, result.gradient),
+            result.iterations + again.iterations,
+        )
         used = inlier
-        agreeing, nfa = consensus_about(bundle, point)
-        better = changed & (nfa < log_nfa)
-        inlier = torch.where(better[bundle.index], agreeing, inlier)
-        log_nfa = torch.where(better, nfa, log_nfa)
-    return PointSolution(point, determined, gradient, iterations), used, log_nfa
+        inlier, log_nfa = improve(result.point, changed)
+    return result, used, log_nfa
 
 
 def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
-    """Objects (N,) all of whose rays pass their point within the noise: no candidate can be better."""
+    """Return which objects (N,) have all rays within the noise of their point, so that no candidate can be better."""
     to_point = points[bundle.index] - bundle.origin
     distance = to_point.norm(dim=1).clamp(min=1e-12)
     cos = (to_point * bundle.direction).sum(1) / distance
@@ -137,7 +125,7 @@ def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
 
 
 def _far_ahead(bundle: Bundle) -> Tensor:
-    """Points (N, 3) so far along each object's mean direction that all its rays see them in one direction."""
+    """Return points (N, 3) on each object's mean direction, so far that all its rays see them in one direction."""
     count = len(bundle.number)
     reach = torch.zeros_like(bundle.number, dtype=bundle.origin.dtype)
     reach = reach.scatter_reduce(0, bundle.index, bundle.origin.norm(dim=1), "amax").clamp(min=1.0)
@@ -146,22 +134,21 @@ def _far_ahead(bundle: Bundle) -> Tensor:
 
 
 def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The consensus about a point (N, 3) of each object: inlier (R,), and log NFA (N,), below 0 where it is no chance."""
+    """Return the consensus about one point (N, 3) per object: inlier (R,), and log NFA (N,), below 0 if not by chance."""
     inlier = torch.zeros(len(bundle.origin), dtype=torch.bool, device=points.device)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
     for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
         chance = _chance(bundle, rays, real, points[objects, None])
         log_nfa[objects, None], limit = _least_chance(chance, bundle.number[objects])
-        chosen = (chance[:, 0] <= limit) & (chance[:, 0] < 1) & real
-        inlier[rays[real]] = chosen[real]
+        inlier[rays[real]] = ((chance[:, 0] <= limit) & (chance[:, 0] < 1))[real]
     return inlier, log_nfa
 
 
-def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor]:
-    """The point of two rays of an object with which the others agree most: points (B, 3), log NFA (B,), inf if none.
+def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
+    """Return the points (B, 3) of ray pairs with which the other rays agree most, NaN without a pair.
 
-    objects: (B,) indices. hypotheses: the pairs tried for each object: all, or as many spread evenly over them, with jitter
-    (hypotheses,) in [0, 1) for the place of each in its part. An object's answer depends on its own rays alone.
+    objects: (B,) indices. hypotheses: the most pairs tried per object, spread evenly over all its pairs. jitter:
+    (hypotheses,) in [0, 1), the place of each pair in its part. An object's result depends on its own rays alone.
     """
     points = bundle.origin.new_full((len(bundle.number), 3), torch.nan)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
@@ -171,7 +158,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
             which = torch.arange(begin, min(begin + step, hypotheses), device=rays.device)
             first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
             candidates, valid = _midpoints(bundle, rays.gather(1, first), rays.gather(1, second))
-            chance = _chance(bundle, rays, real, candidates).float()  # enough to rank them, and faster
+            chance = _chance(bundle, rays, real, candidates).float()  # Single precision is enough for ranking, and faster.
             nfa = _least_chance(chance, bundle.number[chunk])[0].double()
             nfa = torch.where(valid & exists, nfa, torch.inf)
             best = nfa.argmin(dim=1, keepdim=True)
@@ -180,28 +167,28 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
             winner = candidates.gather(1, best[:, :, None].expand(-1, 1, 3))[:, 0]
             points[chunk] = torch.where(better[:, None], winner, points[chunk])
             log_nfa[chunk] = torch.minimum(lowest, log_nfa[chunk])
-    return points[objects], log_nfa[objects]
+    return points[objects]
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs first < second (B, H) of each object's number (B,) of rays, and whether the pair exists."""
+    """Return pairs first < second (B, H) of each object's number (B,) of rays, and whether each pair exists."""
     n = number[:, None].to(jitter.dtype)
     pairs = n * (n - 1) / 2
     rank = torch.where(pairs <= hypotheses, which, torch.floor((which + jitter) * (pairs / hypotheses)))
     exists = rank < pairs
     rank = torch.where(exists, rank, 0.0)
     first = torch.floor(((2 * n - 1) - ((2 * n - 1) ** 2 - 8 * rank).clamp(min=0).sqrt()) / 2)
-    first = first - (first * (2 * n - first - 1) / 2 > rank).to(n.dtype)  # where the root was rounded up
-    first = first + ((first + 1) * (2 * n - first - 2) / 2 <= rank).to(n.dtype)  # or down
+    first = first - (first * (2 * n - first - 1) / 2 > rank).to(n.dtype)  # The root may be rounded up.
+    first = first + ((first + 1) * (2 * n - first - 2) / 2 <= rank).to(n.dtype)  # The root may be rounded down.
     second = rank - first * (2 * n - first - 1) / 2 + first + 1
     last = (number[:, None] - 1).clamp(min=0)
     return torch.minimum(first.long(), last), torch.minimum(second.long(), last), exists
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether there is one: parallel rays have none.
+    """Return midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist: not if parallel.
 
-    It may lie behind a ray, which then does not agree with it. `closest_approach` is the like in numpy, for rays in map.
+    A midpoint may lie behind a ray, which then does not agree with it. `closest_approach` does this in numpy.
     """
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
@@ -217,7 +204,7 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """The probability (B, H, n) that a wrong box is as close to the points (B, H, 3) as each ray; 1 where it points away."""
+    """Return the probability (B, H, n) that a wrong box is as close to points (B, H, 3) as each ray, 1 if it points away."""
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
     distance2 = points.square().sum(-1)[..., None] - 2 * points @ origin.mT + origin.square().sum(-1)[:, None]
@@ -231,10 +218,10 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """The lowest log NFA (B, H) over all shares of the rays with chances (B, H, n), and the chance at which it stands.
+    """Return the lowest log NFA (B, H) over all shares of rays with chances (B, H, n), and the largest chance in that share.
 
-    NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), with p_k the k-th lowest chance: k rays are 2 k numbers, 3 of them went
-    into the point, and each p stands for 2.
+    NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays are 2 k numbers, and 3 of
+    them determine the point. Each p counts for 2 numbers.
     """
     chance = chance.sort(dim=-1).values
     n = number.to(chance.dtype)[:, None]

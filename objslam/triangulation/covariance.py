@@ -1,9 +1,4 @@
-"""How well rays fix their objects, for many objects at once, in torch: covariance, parallax, and ranges that help them.
-
-`triangulate` imports this module only when something is triangulated.
-"""
-
-from __future__ import annotations
+"""Covariance and parallax of triangulated objects, and their fusion with ranges, for many objects at once, in torch."""
 
 import math
 
@@ -14,24 +9,22 @@ from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.ac_ransac import Bundle
 from objslam.triangulation.point_to_lines import Lines, object_sum
 
-_EVERY_PAIR = 256  # The most rays of an object of which every pair is looked at for the widest angle; larger costs time.
-_RANGE_ITERATIONS = (
-    30  # The iterations of the fit to ranges from their median on, the same number for all objects of a batch.
-)
+_EVERY_PAIR = 256  # The most rays of an object whose pairs are all compared for the widest angle; larger costs time.
+_RANGE_ITERATIONS = 30  # The iterations of the range fit from the median range, the same for all objects of a batch.
 
 
 def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Covariances (N, 3, 3) m^2 of Eq. 1's points (N, 3) from the rays in use (R,); NaN where those do not fix a point.
+    """Return covariances (N, 3, 3) m^2 of Eq. 1's solutions (N, 3) on the rays in use (R,), NaN if these fix no point.
 
-    Eq. 1 is an M-estimator: A^-1 B A^-1 with the expected Hessian A and gradient covariance B (Huber & Ronchetti, Robust
-    Statistics, ch. 6). Offsets are Gaussian of s_i along both axes across ray i: then the unit offset u has E[u u^T] =
-    P / 2, and E[1 / distance] = sqrt(pi / 2) / s_i is independent of it, so that a ray adds sqrt(pi / 2) / (2 s_i) P to
-    A and P / 2 to B. Residuals larger than s_i widen the result, smaller ones do not narrow it. Eq. 1 also has a bias, which
-    no number of rays takes away: angular noise tilts the unit offset forward, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i along
-    ray i of length r_i, because a nearer object is missed by less. The result contains the square of this bias.
+    Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
+    & Ronchetti, Robust Statistics, ch. 6). Offsets are Gaussian with s_i along both axes across ray i. The unit offset u
+    then has E[u u^T] = P / 2, and is independent of the distance with E[1 / distance] = sqrt(pi / 2) / s_i. So a ray adds
+    sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1
+    also has a bias that more rays do not reduce. Angular noise tilts the unit offset forward along ray i of length
+    r_i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, because rays miss a nearer object by less. The result includes its square.
     """
     rays = _used(bundle, use)
-    lines, index = _lines(rays, point), rays.index
+    lines, index = Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point)), rays.index
     distance = (point[index] - rays.origin).norm(dim=1)
     s = _offset_sigma(rays, distance)
     a = lines.spread(0.5 * RAYLEIGH_MEAN / s)
@@ -39,17 +32,17 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma.square() * distance / s)[:, None] * rays.direction)
     factor = _variance_factor(lines.foot.norm(dim=1) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a)
-    bias = factor * (inverse @ tilt[:, :, None])  # the tilt grows with the noise, the Hessian falls with it
+    bias = factor * (inverse @ tilt[:, :, None])  # The tilt grows with the noise, and the Hessian falls with it.
     result = factor * inverse @ b @ inverse + bias @ bias.mT
     return torch.where(regular[:, None, None], result, torch.nan)
 
 
 def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (N, 3) and covariances (N, 3, 3) from rays in use and the ranges measured along them (R,), NaN for none.
+    """Fuse rays in use with ranges (R,) m along them, NaN for none, to points (N, 3) and covariances (N, 3, 3).
 
-    For objects whose rays alone do not carry a position; NaN for objects without a range. The loss is squared across the
-    rays, whose outliers are gone, and Cauchy's along them, because a range may have hit what lies behind. That differs from
-    `association.refinement.refine`, whose loss is robust in both ways and which gives no covariance.
+    It is for objects whose rays alone are too uncertain, and gives NaN for objects without a range. The loss is squared
+    across the rays, whose outliers are already removed. It is Cauchy's along the rays, because a range may belong to the
+    background. `association.refinement.refine` is robust in both directions and gives no covariance.
     """
     rays, count = _used(bundle, use), len(bundle.number)
     ranges, range_sigma = ranges[use], range_sigma[use]
@@ -60,12 +53,11 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     has = typical.isfinite()
     measured = torch.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
     informed = has[rays.index]
-    zero = torch.zeros_like(rays.origin)
-    lines = Lines.through(torch.where(informed[:, None], rays.origin, zero), rays.direction, rays.index, count)
+    lines = Lines.through(torch.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count)
     weight = torch.where(informed, 1 / s.square(), 0.0)
     across_matrix = lines.spread(weight)
     across_vector = lines.sum(weight[:, None] * lines.foot)
-    # it starts at the median range along the mean direction, which is what the rays alone leave open
+    # The start is the median range along the mean direction, because the rays alone leave this direction free.
     heading = object_sum(rays.direction, rays.index, count)
     heading = heading / heading.norm(dim=1, keepdim=True).clamp(min=1e-12)
     depth = object_median((measured * heading[rays.index]).sum(1)[known], rays.index[known], count)
@@ -85,40 +77,39 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
         robust = torch.where(known, 1 / (1 + (residual / CAUCHY_K).square()) / range_sigma.square(), 0.0)
         target = across_vector + lines.sum((robust * ends)[:, None] * rays.direction)
         point = torch.linalg.solve(across_matrix + along(robust) + empty, target)
-    # ranges that scatter by more than their sigma count less
+    # Ranges that scatter by more than their sigma count less.
     scatter = object_median(residual.abs()[known], rays.index[known], count) / NORMAL_MEDIAN
     along_matrix = along(robust / scatter.square().clamp(min=1)[rays.index])
     factor = _variance_factor(lines.offset(point).norm(dim=1) / s, rays, 2)
     inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
     regular &= has
-    point = torch.where(regular[:, None], point, torch.nan)
-    return point, torch.where(regular[:, None, None], inverse, torch.nan)
+    return torch.where(regular[:, None], point, torch.nan), torch.where(regular[:, None, None], inverse, torch.nan)
 
 
 def largest_sigma(covariances: Tensor) -> Tensor:
-    """The largest standard deviation (N,) m in any direction of covariances (N, 3, 3); inf where NaN."""
+    """Return the largest standard deviation (N,) m in any direction of covariances (N, 3, 3), inf for NaN."""
     known = covariances.isfinite().all(dim=2).all(dim=1)
     variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
     return torch.where(known, variance.sqrt(), torch.inf)
 
 
 def reach(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """The median distance (N,), m, of points (N, 3) from where their rays in use (R,) begin; NaN without any."""
+    """Return the median distance (N,) m of points (N, 3) from the origins of their rays in use (R,), NaN without rays."""
     index = bundle.index[use]
     return object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
 
 
 def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Objects (N,) that lie ahead of more than half of their rays in use."""
+    """Return which objects (N,) lie ahead of more than half of their rays in use."""
     index = bundle.index[use]
     towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1).sign()
     return object_sum(towards, index, len(point)) > 0
 
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
-    """The widest angle (N,) rad between the lines of any two rays in use (R,); opposite directions are one line.
+    """Return the widest angle (N,) rad between any two of an object's rays in use (R,), as undirected lines.
 
-    For an object with many rays only the extremes in 64 directions are compared, which finds it to 1 %.
+    For objects with many rays it compares only the extreme rays in 64 directions, which is exact to 1 %.
     """
     rays = _used(bundle, use)
     widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
@@ -129,24 +120,21 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
         direction = rays.direction[members]
         if members.shape[1] > _EVERY_PAIR:
             towards = torch.where(real[:, :, None], direction @ axes.T, -torch.inf).argmax(dim=1)
-            direction, real = (
-                direction.gather(1, towards[:, :, None].expand(-1, -1, 3)),
-                torch.ones_like(towards, dtype=torch.bool),
-            )
+            direction = direction.gather(1, towards[:, :, None].expand(-1, -1, 3))
+            real = torch.ones_like(towards, dtype=torch.bool)
         cos = (direction @ direction.mT).abs()
-        both = real[:, :, None] & real[:, None, :]
-        cos = torch.where(both, cos, 1.0).flatten(1)
+        cos = torch.where(real[:, :, None] & real[:, None, :], cos, 1.0).flatten(1)
         pair = cos.argmin(dim=1)
         n = direction.shape[1]
         row = torch.arange(len(pair), device=pair.device)
         one, two = direction[row, pair // n], direction[row, pair % n]
-        # the arccos of nearly 1 would lose half the digits
+        # The arccos of a value near 1 would lose half of the digits.
         widest[objects] = torch.atan2(torch.linalg.cross(one, two, dim=1).norm(dim=1), (one * two).sum(1).abs())
     return widest
 
 
 def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """The median (N,) of each object's values (R,), NaN without any; `core.statistics` has the like in numpy."""
+    """Return the median (N,) of each object's values (R,), NaN without values. `core.statistics` does this in numpy."""
     if len(values) == 0:
         return values.new_full((count,), torch.nan)
     order = torch.argsort(values)
@@ -164,21 +152,17 @@ def _used(bundle: Bundle, use: Tensor) -> Bundle:
     return Bundle(bundle.origin[use], bundle.direction[use], bundle.sigma[use], position_sigma, bundle.index[use], number)
 
 
-def _lines(rays: Bundle, point: Tensor) -> Lines:
-    return Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point))
-
-
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
-    """Standard deviation (R,) m, along each axis across the ray, of how far a ray passes its object."""
+    """Return the standard deviation (R,) m of the offset of an object from each ray, per perpendicular axis."""
     return ((rays.sigma * distance).square() + rays.position_sigma**2).sqrt().clamp(min=1e-12)
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
-    """How many times larger than expected the variance (N,) is, at least 1, from the rays' residuals (R,), normalised.
+    """Return the factor (N,), at least 1, by which the variance exceeds its expectation, from normalised residuals (R,).
 
-    It comes from the mean residual, which is robust; `taken` of the 2 n degrees of freedom went into the fit. What exceeds
-    1 is stretched, because an estimate from the rest of them is uncertain: 1 + 3.2 / (rest - 2) is the 95 % quantile of
-    F(3, rest) over its limit, to 3 % from 4 rays on.
+    It uses the mean residual, which is robust. The fit takes `taken` of the 2 n degrees of freedom and leaves the rest. The
+    excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain. The factor 1 + 3.2 / (rest - 2)
+    is the 95 % quantile of F(3, rest) over its limit, to 3 % from 4 rays on.
     """
     number = rays.number.to(miss.dtype)
     mean = object_sum(miss, rays.index, len(number)) / number.clamp(min=1) / RAYLEIGH_MEAN
@@ -188,7 +172,7 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
 
 
 def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverses of symmetric matrices (N, 3, 3), and which of them are regular."""
+    """Return the inverses of symmetric matrices (N, 3, 3), and which matrices are regular."""
     eye = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
     finite = matrices.isfinite().all(dim=2).all(dim=1)
     eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], matrices, eye))
@@ -197,7 +181,7 @@ def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sphere(number: int, like: Tensor) -> Tensor:
-    """Directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
+    """Return directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
     k = torch.arange(number, dtype=like.dtype, device=like.device) + 0.5
     z = 1 - 2 * k / number
     azimuth = k * (math.pi * (3 - math.sqrt(5)))

@@ -1,30 +1,24 @@
-"""Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the smallest sum of distances to its lines.
-
-`triangulate` imports this module only when something is triangulated, because torch is slow to import.
-"""
+"""Solve Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the least sum of distances to lines."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
-_MAX_ITERATIONS = 80  # The most Newton steps; an object that is done leaves the batch earlier.
-_LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which `_exact_optimum` takes over after a few more steps.
-_LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances): rounding leaves no room for less.
-_ON_LINE = (
-    1e-7,
-    1e-5,
-)  # The distances (in mean distances) from the smoothed solution within which the exact one may be on a line.
-_TINY = 1e-300  # The least divisor, where 0 / 0 has to be 0.
+_MAX_ITERATIONS = 80  # The most Newton steps; a solved object leaves the batch earlier.
+_LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
+_LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances) above the rounding errors.
+_ON_LINE = (1e-7, 1e-5)  # The tried distances (in mean distances) within which the exact solution may lie on a line.
+_TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of many objects. foot: (R, 3) the point of each line nearest to its object's own origin. direction: (R, 3) unit.
-    index: (R,) the object of each line. count: N objects."""
+    """Lines of many objects. foot: (R, 3) the point of each line nearest to its object's origin. direction: (R, 3) unit.
+    index: (R,) the object of each line. count: the number N of objects."""
 
     foot: Tensor
     direction: Tensor
@@ -33,67 +27,63 @@ class Lines:
 
     @classmethod
     def through(cls, origin: Tensor, direction: Tensor, index: Tensor, count: int) -> Self:
-        """Lines through points (R, 3), given in the coordinates of their object, along unit directions (R, 3)."""
-        # projected twice, because the first time leaves rounding of the size of the origin along the line
+        """Make lines through points (R, 3), in coordinates of their object, along unit directions (R, 3)."""
+        # The first projection leaves a rounding error along the line of the size of the origin. The second removes it.
         return cls(perpendicular(perpendicular(origin, direction), direction), direction, index, count)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sums (N, ...) over each object's lines of values (R, ...)."""
+        """Sum values (R, ...) over each object's lines, to (N, ...)."""
         return object_sum(values, self.index, self.count)
 
     def offset(self, points: Tensor) -> Tensor:
-        """Offsets (R, 3) of each object's point (N, 3) from its lines, perpendicular to them: Eq. 1 sums their norms."""
+        """Return the perpendicular offsets (R, 3) of each object's point (N, 3) from its lines. Eq. 1 sums their norms."""
         return perpendicular(points[self.index], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Sums (N, 3, 3) over each object's lines of weight (R,) times I - n n^T."""
+        """Sum weight (R,) times I - n n^T over each object's lines, to (N, 3, 3)."""
         eye = torch.eye(3, dtype=weight.dtype, device=weight.device)
         return self.sum(weight)[:, None, None] * eye - self.outer(self.direction * weight[:, None], self.direction)
 
     def outer(self, a: Tensor, b: Tensor) -> Tensor:
-        """Sums (N, 3, 3) over each object's lines of (a b^T + b a^T) / 2 of vectors (R, 3)."""
+        """Sum (a b^T + b a^T) / 2 of vectors (R, 3) over each object's lines, to (N, 3, 3)."""
         (a0, a1, a2), (b0, b1, b2) = a.T, b.T
         off = (0.5 * (a0 * b1 + a1 * b0), 0.5 * (a0 * b2 + a2 * b0), 0.5 * (a1 * b2 + a2 * b1))
         six = self.sum(torch.stack([a0 * b0, a1 * b1, a2 * b2, *off], dim=1))
         return six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
 
-    def scaled(self, factor: Tensor) -> Lines:
-        """The lines with each object's coordinates multiplied by its factor (N,)."""
-        return Lines(self.foot * factor[self.index, None], self.direction, self.index, self.count)
-
     def select(self, objects: Tensor) -> tuple[Lines, Tensor]:
-        """The lines of some objects (N,) bool, renumbered, and which lines (R,) bool they are."""
+        """Return the lines of some objects (N,) bool, renumbered, and the mask (R,) of these lines."""
         rays = objects[self.index]
         number = torch.cumsum(objects, 0) - 1
         return Lines(self.foot[rays], self.direction[rays], number[self.index[rays]], int(objects.sum())), rays
 
 
 def object_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Sums (N, ...) over each object's rays of values (R, ...)."""
+    """Sum values (R, ...) over each object's rays, to (N, ...)."""
     return values.new_zeros((count, *values.shape[1:])).index_add_(0, index, values)
 
 
 def perpendicular(vectors: Tensor, direction: Tensor) -> Tensor:
-    """The parts (R, 3) of vectors perpendicular to unit directions (R, 3)."""
+    """Return the parts (R, 3) of vectors perpendicular to unit directions (R, 3)."""
     return vectors - direction * dot(vectors, direction)[:, None]
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot products (R,) of vectors (R, 3)."""
-    return (a * b) @ a.new_ones(3)  # (a * b).sum(1) over this short a dimension takes ten times as long
+    """Return the dot products (R,) of vectors (R, 3)."""
+    return (a * b) @ a.new_ones(3)  # This takes a tenth of the time of (a * b).sum(1).
 
 
 def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The points (N, 3) with the smallest sum of squared distances to their lines, and whether the lines fix them (N,).
+    """Return the points (N, 3) with the least sum of squared distances to their lines, and whether lines fix them (N,).
 
-    Parallel lines, or a single one, do not: then the point is 1 m ahead of the mean origin, on the mean line. It is NaN
-    without lines.
+    Parallel lines and a single line fix no point. The result is then 1 m ahead of the mean origin on the mean line. It is
+    NaN without lines.
     """
     number = object_sum(torch.ones_like(origin[:, 0]), index, count)
-    base = object_sum(origin, index, count) / number[:, None]  # map coordinates may be large
+    base = object_sum(origin, index, count) / number[:, None]  # Map coordinates may be large.
     lines = Lines.through(origin - base[index], direction, index, count)
     eigenvalues, vectors = torch.linalg.eigh(lines.spread(torch.ones_like(origin[:, 0])))
-    # an eigenvalue is the sum of squared sines between the lines and its axis
+    # An eigenvalue is the sum of squared sines between the lines and its axis.
     usable = eigenvalues > 1e-10 * number[:, None]
     pull = (vectors.mT @ lines.sum(lines.foot)[:, :, None])[:, :, 0]
     point = (vectors @ torch.where(usable, pull / torch.where(usable, eigenvalues, 1.0), 0.0)[:, :, None])[:, :, 0]
@@ -104,20 +94,19 @@ def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) 
     return base + point + torch.where(determined[:, None], 0.0, ahead), determined
 
 
-def minimise_distances(
-    origin: Tensor, direction: Tensor, index: Tensor, count: int, start: Tensor
-) -> tuple[Tensor, int, Tensor]:
-    """Eq. 1 for N objects from a start (N, 3): the points (N, 3), the iterations, the norm of the gradient (N,).
+def minimise_distances(origin: Tensor, direction: Tensor, index: Tensor, start: Tensor) -> tuple[Tensor, int, Tensor]:
+    """Solve Eq. 1 for N objects from a start (N, 3), and return points (N, 3), iterations and norms (N,) of the gradient.
 
-    Where lines pass through the solution, the gradient is the smallest subgradient found; 0 still proves the optimum.
-    Objects must have lines that fix a point; those without any stay where they start.
+    If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
+    The lines of each object must fix a point. Objects without lines keep their start.
     """
-    lines = Lines.through(origin - start[index], direction, index, count)
+    lines = Lines.through(origin - start[index], direction, index, len(start))
     number = lines.sum(torch.ones_like(origin[:, 0])).clamp(min=1)
     unit = lines.sum(lines.foot.norm(dim=1)) / number
     reach = lines.sum((origin - start[index]).norm(dim=1)) / number
-    meeting = unit <= 1e-14 * reach  # all lines meet at the start, up to rounding
-    lines, _ = lines.scaled(1 / torch.where(meeting, 1.0, unit)).select(~meeting)
+    meeting = unit <= 1e-14 * reach  # All lines meet at the start, up to rounding.
+    scale = 1 / torch.where(meeting, 1.0, unit)
+    lines, _ = replace(lines, foot=lines.foot * scale[index, None]).select(~meeting)
     point, dual, iterations = _smoothed_optimum(lines)
     smoothed, (point, gradient) = point, _exact_optimum(lines, point, dual, 0.0)
     for on_line in _ON_LINE:
@@ -134,15 +123,15 @@ def minimise_distances(
 
 
 def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
-    """Primal-dual Newton on the sum of sqrt(distance^2 + epsilon^2) while epsilon goes to zero, all objects together.
+    """Minimise the sum of sqrt(distance^2 + epsilon^2) for all objects by primal-dual Newton, while epsilon goes to zero.
 
-    Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000); the linearisation is Chan, Golub & Mulet's.
-    The dual (R, 3) of a line, within the unit ball across it, is the unit offset, or takes its place where the solution lies
-    on the line. Lengths are in units of an object's mean distance, coordinates from its own origin.
+    The method is Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000), with Chan, Golub & Mulet's
+    linearisation. The dual (R, 3) of a line is the unit offset. If the solution lies on the line, it is another vector in
+    the unit ball across the line. Lengths are in mean distances of the object, and coordinates from its own origin.
     """
     zeros = lines.foot.new_zeros(lines.count)
     point, dual = zeros[:, None].repeat(1, 3), torch.zeros_like(lines.foot)
-    live = torch.arange(lines.count, device=zeros.device)  # objects still worked on, and their lines
+    live = torch.arange(lines.count, device=zeros.device)  # The unsolved objects.
     live_rays = torch.arange(len(lines.foot), device=zeros.device)
     number = lines.sum(torch.ones_like(lines.foot[:, 0])).clamp(min=1)
     o, epsilon, late = point.clone(), torch.ones_like(zeros), torch.zeros_like(zeros)
@@ -151,7 +140,7 @@ def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
     for iteration in range(_MAX_ITERATIONS):
         distance = q.norm(dim=1).clamp(min=_TINY)
         gradient = lines.sum(q / distance[:, None]).norm(dim=1)
-        # rounding leaves this much of the gradient: an offset is known to 1e-16, its direction to that over its length
+        # Rounding limits the gradient: an offset is exact to 1e-16, and its direction to 1e-16 over its length.
         finished = gradient <= 4e-16 * lines.sum(1 + 1 / distance).clamp(max=1e6)
         finished |= late >= 4
         if finished.any():
@@ -174,7 +163,7 @@ def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
 
 
 def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """One damped primal-dual step from points o (N, 3) with offsets q and duals y (R, 3): the new o, q, y."""
+    """Take one damped primal-dual step from points o (N, 3) with offsets q and duals y (R, 3), to the new o, q, y."""
     r = _radius(q, epsilon[lines.index])
     hessian = lines.spread(1 / r) - lines.outer(y / r.square()[:, None], q)
     trace = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
@@ -182,7 +171,7 @@ def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor)
     gradient = lines.sum(q / r[:, None])
     step = -torch.linalg.solve(hessian, gradient)
     slope, value, length = dot(gradient, step), lines.sum(r), torch.ones_like(epsilon)
-    for _ in range(40):  # halve each object's step until its cost falls (Armijo), up to rounding
+    for _ in range(40):  # Halve each object's step until its cost falls (Armijo), up to rounding.
         new = o + length[:, None] * step
         new_q = lines.offset(new)
         too_long = lines.sum(_radius(new_q, epsilon[lines.index])) > value + 1e-4 * length * slope + 1e-14 * value
@@ -191,17 +180,18 @@ def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor)
         length = torch.where(too_long, 0.5 * length, length)
     change = new_q - q
     dual_step = (new_q - y * (dot(q, change) / r)[:, None]) / r[:, None] - y
-    # the dual moves as far as the unit ball allows
+    # The dual moves as far as the unit ball allows.
     a, b, c = dot(dual_step, dual_step), dot(y, dual_step), (dot(y, y) - 1).clamp(max=0)
     share = (0.999 * ((b.square() - a * c).clamp(min=0).sqrt() - b) / a.clamp(min=_TINY)).clamp(max=1)
     return new, new_q, y + share[:, None] * dual_step
 
 
 def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) -> tuple[Tensor, Tensor]:
-    """The exact optimum next to the smoothed one, (N, 3), and the norm of its smallest subgradient (N,).
+    """Return the exact optimum (N, 3) next to the smoothed one, and the norm (N,) of its smallest subgradient.
 
-    Lines within on_line of the smoothed solution are taken to pass through the exact one. The point is moved onto them, and
-    Newton steps use the freedom that they leave. The subgradient tells whether that was right; inf where they do not meet.
+    Lines within on_line of the smoothed solution are assumed to pass through the exact one. The point moves onto these
+    lines, and Newton steps use the remaining freedom. The subgradient shows whether the assumption holds. It is inf if the
+    lines do not meet.
     """
     on = lines.offset(point).norm(dim=1) <= on_line
     weight = on.to(point.dtype)[:, None]
@@ -209,7 +199,6 @@ def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) ->
     fixed = eigenvalues > 1e-9 * eigenvalues[:, -1:].clamp(min=_TINY)
     inverse = _assemble(vectors, torch.where(fixed, 1 / torch.where(fixed, eigenvalues, 1.0), 0.0))
     free = _assemble(vectors, (~fixed).to(point.dtype))
-    pull = torch.zeros_like(point)
     for newton in (True, True, True, False):
         point = point - _apply(inverse, lines.sum(lines.offset(point) * weight))
         q = lines.offset(point)
@@ -220,7 +209,7 @@ def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) ->
             inverse_d = (1 - weight) / d
             curvature = lines.spread(inverse_d[:, 0]) - lines.outer(u * inverse_d, u)
             point = point - _short_newton(free @ curvature @ free, _apply(free, pull))
-    # the smallest subgradient: each line on the point may answer the pull of the others with at most 1
+    # For the smallest subgradient, each line on the point may oppose the pull of the others with at most 1.
     answer = perpendicular(dual, lines.direction) * weight
     for _ in range(30 if bool(on.any()) else 0):
         rest = pull + lines.sum(answer)
@@ -231,7 +220,7 @@ def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) ->
 
 
 def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
-    """Newton steps (N, 3) where there is curvature, at most 1e-3 long: no solution next to here is further."""
+    """Return Newton steps (N, 3) along curved directions, at most 1e-3 long, because the solution is near."""
     scale = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
     eigenvalues, vectors = torch.linalg.eigh(hessian / scale[:, None, None])
     inverse = torch.where(eigenvalues > 1e-10, 1 / eigenvalues.clamp(min=_TINY), 0.0)

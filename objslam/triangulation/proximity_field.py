@@ -1,6 +1,4 @@
-"""The proximity field: Eq. 1's cost around one object, the heat map of Staszak & Belter's Fig. 2."""
-
-from __future__ import annotations
+"""The proximity field: the cost of Eq. 1 around one object, as in the heat map of Staszak & Belter's Fig. 2."""
 
 from dataclasses import dataclass
 
@@ -9,14 +7,14 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats
 from objslam.triangulation.triangulate import solve_eq1
 
-_AT_ONCE = 2_000_000  # The distances computed together; larger needs more memory.
+_AT_ONCE = 2_000_000  # The most distances computed together; larger needs more memory.
 _REACH = 8.0  # Half the edge of a slice, as a multiple of the rays' median distance from the minimum.
-_LEAST_REACH, _MOST_REACH = 0.15, 3.0  # The least and the greatest half edge of a slice, m.
+_LEAST_REACH, _MOST_REACH = 0.15, 3.0  # The least and the largest half edge (m) of a slice.
 
 
 @dataclass(frozen=True)
 class FieldSlice:
-    """A plane of the field. points: (n, n, 3) m in map; cost: (n, n) m, the rays' mean distance to each point."""
+    """A plane of the field. points: (n, n, 3) m in map. cost: (n, n) m, the mean distance of the rays to each point."""
 
     points: Floats
     cost: Floats
@@ -26,8 +24,8 @@ class FieldSlice:
 class ProximityField:
     """The field of one object.
 
-    minimum: (3,) m, Eq. 1's solution, and cost: m, the rays' mean distance there. horizontal: the slice through it parallel
-    to the floor. vertical: the slice along the rays' mean direction, in which the object is least certain.
+    minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays there. horizontal: the slice through it
+    parallel to the floor. vertical: the slice along the mean direction of the rays, where the object is the least certain.
     """
 
     minimum: Floats
@@ -37,29 +35,28 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """The mean distance, m, of points (..., 3) from rays (R, 3), (R, 3) unit, R > 0: Eq. 1's cost over R."""
+    """Return the mean distance, m, of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit: Eq. 1's cost over R."""
     flat = points.reshape(-1, 3)
-    centre = flat.mean(axis=0)  # squares of large map coordinates would leave no digits for small distances
+    centre = flat.mean(axis=0)  # Squares of large map coordinates would hide small distances.
     p, m = flat - centre, origins - centre
     foot = m - np.einsum("ri,ri->r", m, directions)[:, None] * directions
     cost = np.empty(len(flat))
     step = max(1, _AT_ONCE // len(origins))
     for begin in range(0, len(flat), step):
         some = p[begin : begin + step]
-        # |p - foot|^2 without the part along the ray
+        # This is |p - foot|^2 without the part along the ray.
         squared = (some**2).sum(axis=1)[:, None] - 2 * some @ foot.T + (foot**2).sum(axis=1) - (some @ directions.T) ** 2
         cost[begin : begin + step] = np.sqrt(np.maximum(squared, 0.0)).mean(axis=1)
     return cost.reshape(points.shape[:-1])
 
 
 def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach: float | None = None) -> ProximityField:
-    """The field of the object to which rays (R, 3), (R, 3) unit, R >= 2, point, in slices of size x size points.
+    """Return the field of the object of R >= 2 rays (R, 3), (R, 3) unit, in slices of size x size points.
 
-    reach: half the edge of a slice, m; None takes it from how far the rays pass the object. Parallel rays have no minimum:
-    then the slices lie 1 m ahead, as in `solve_eq1`.
+    reach: half the edge of a slice, m. None derives it from the distances of the rays. Parallel rays have no minimum, and
+    their slices lie 1 m ahead, as in `solve_eq1`.
     """
-    count = np.zeros(len(origins), dtype=np.int64)
-    minimum = solve_eq1(origins, directions, count, 1)[0][0]
+    minimum = solve_eq1(origins, directions, np.zeros(len(origins), dtype=np.int64), 1)[0][0]
     off = np.linalg.norm(np.cross(minimum - origins, directions), axis=1)
     if reach is None:
         reach = float(np.clip(_REACH * np.median(off), _LEAST_REACH, _MOST_REACH))
@@ -77,15 +74,13 @@ def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach:
 
 
 def main_heading(directions: Floats) -> Floats:
-    """The horizontal unit direction (3,) along which rays with directions (R, 3), as lines, mostly lie; else east."""
+    """Return the mean horizontal unit direction (3,) of rays with directions (R, 3) as lines, or east if they have none."""
     flat = directions[:, :2]
     values, axes = np.linalg.eigh(flat.T @ flat)
-    if values[1] < 1e-12:
-        return np.array([1.0, 0.0, 0.0])
-    return np.array([*axes[:, 1], 0.0])
+    return np.array([1.0, 0.0, 0.0] if values[1] < 1e-12 else [*axes[:, 1], 0.0])
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Which rays (R,) of an object (R,) bool pull on it: those that no robust loss rejected, or all if it rejected all."""
+    """Return which rays (R,) of an object (R,) bool have a weight above 0, or all its rays if none has."""
     kept = object_ & (weight > 0)
     return kept if kept.any() else object_

@@ -1,6 +1,6 @@
-"""Objects from rays with known poses: Eq. 1 of Staszak & Belter on the rays that agree, for all objects of a log at once.
+"""Triangulate objects from rays with known poses: Eq. 1 of Staszak & Belter on the rays that agree, for a whole log at once.
 
-Arrays go in and come out as numpy float64; torch does the work and is imported with the first call.
+Inputs and outputs are numpy float64 arrays. The first call imports torch and the modules with it, which takes long.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 
 _CUDA_PAYS = 200_000
 """The number of rays from which the device "auto" is CUDA. One CPU core solves Eq. 1 for 50,000 rays in 0.12 s and
-triangulates them in 0.6 s: well below this, CUDA's start alone takes longer. The crossing point depends on the card."""
+triangulates them in 0.6 s. For much fewer rays the start of CUDA alone takes longer. The exact limit depends on the card."""
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Objects of one batch of rays, N objects and R rays, all in the frame of the rays (map).
+    """N objects from one batch of R rays, all in the frame of the rays (map).
 
-    positions: (N, 3) m; where its rays do not fix an object, a point on their mean (1 m ahead where no range was measured);
-    NaN without rays. covariance: (N, 3, 3) m^2, NaN where not determined. ok: (N,) whether the position is
-    one to rely on. parallax: (N,) rad, the widest angle between inlier rays, as lines. rms: (N,) rad, angle off the inlier
-    rays. distance: (R,) m, Eq. 1's distance of a ray to its object, NaN without object. weight: (R,) 1 inlier, 0 rejected
-    or without object. counts: (N,) inlier rays. iterations: of the solver. gradient: (N,) norm of Eq. 1's gradient at the
-    solution (the smallest subgradient where rays pass through it), NaN where Eq. 1 did not give the position.
+    positions: (N, 3) m, NaN without rays. If the rays do not fix an object, it is a point on their mean ray, 1 m ahead if no
+    range was measured. covariance: (N, 3, 3) m^2, NaN if not determined. ok: (N,) whether the position is reliable.
+    parallax: (N,) rad, the widest angle between inlier rays as lines. rms: (N,) rad, angular residual of the inlier rays.
+    distance: (R,) m, Eq. 1's distance of a ray to its object, NaN without object. weight: (R,) 1 for an inlier, else 0.
+    counts: (N,) number of inlier rays. iterations: of the solver. gradient: (N,) norm of Eq. 1's gradient at the solution,
+    or of the smallest subgradient if rays pass through it, NaN for a position that is not from Eq. 1.
     """
 
     positions: Floats
@@ -64,22 +64,22 @@ def triangulate(
     range_sigma: ArrayLike | None = None,
     position_sigma: float = 0.0,
 ) -> Triangulation:
-    """Triangulate all objects of a batch: consensus, Eq. 1 on the rays that agree, and how far to rely on the result.
+    """Triangulate all objects of a batch by consensus and Eq. 1 on the rays that agree, with covariance and status.
 
     An object is ok if at least 2 rays agree, more closely than by chance, with the parallax and the relative precision of
-    the settings, and if it lies ahead of most of them. Ranges are fused with the rays where the rays alone miss that, or
-    where a single range says more than all of them. Else Eq. 1's position stands, because a range ends on an object's
-    surface and its rays meet inside. An object's answer depends neither on other objects nor on the order of the rays.
+    the settings, and if it lies ahead of most of these rays. Ranges are fused only for an object whose rays fail these
+    limits, or for which one range is more precise than all rays. Other objects keep the position of Eq. 1, because a range
+    ends on the surface of an object and its rays meet inside. The result does not depend on other objects or on ray order.
 
     Args:
-        origins, directions: (R, 3) m, and (R, 3) of any length but 0.
-        object_index: (R,) the object of each ray, -1 none, of `count` objects.
-        sigma: (R,) or one, rad, of a ray's angle along each axis across it.
-        ranges: (R,) m along the rays, NaN where unknown, with range_sigma (R,) or one, m.
+        origins, directions: (R, 3) m, and (R, 3) of any length above 0.
+        object_index: (R,) the object of each ray, -1 for none, of `count` objects.
+        sigma: (R,) or one number, rad, of a ray's angle along each perpendicular axis.
+        ranges, range_sigma: (R,) m along the rays, NaN if unknown, and (R,) or one number, m.
         position_sigma: m, of the origins.
     Raises:
-        ValueError: when arrays do not fit or are not finite.
-        ConfigError: when the device is not there.
+        ValueError: the arrays do not fit together or are not finite.
+        ConfigError: the device does not exist.
     """
     import torch
 
@@ -90,7 +90,8 @@ def triangulate(
     noise = _positive(sigma, len(m), "sigma")
     where, base, bundle = _bundle(m, n, index, count, noise, position_sigma, settings.device)
     if settings.consensus:
-        result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, _jitter(seed, bundle, settings))
+        jitter = torch.from_numpy(np.random.default_rng(seed).random(settings.hypotheses)).to(base.device)
+        result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter)
         by_chance = log_nfa >= 0
     else:
         use = torch.ones(len(where), dtype=torch.bool, device=base.device)
@@ -124,15 +125,17 @@ def triangulate(
     weight[where] = use.double().cpu().numpy()
     positions = (base + point).cpu().numpy()
     distance, off = _miss(m, n, index, positions)
+    total = np.bincount(index[weight > 0], off[weight > 0] ** 2, minlength=count)
+    number = counts.cpu().numpy()
     return Triangulation(
         positions=positions,
         covariance=covariance.cpu().numpy(),
         ok=(carried & ~by_chance).cpu().numpy(),
         parallax=angle.cpu().numpy(),
-        rms=_rms(off, weight, index, count),
+        rms=np.sqrt(np.divide(total, number, out=np.full(count, np.nan), where=number > 0)),
         distance=distance,
         weight=weight,
-        counts=counts.cpu().numpy(),
+        counts=number,
         iterations=result.iterations,
         gradient=gradient.cpu().numpy(),
     )
@@ -141,10 +144,10 @@ def triangulate(
 def closed_form(
     origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int, *, device: config.Device = "auto"
 ) -> tuple[Floats, Bools]:
-    """The points (N, 3) m with the smallest sum of squared distances to their rays' lines, and which are determined (N,).
+    """Return the points (N, 3) m with the least sum of squared distances to their rays' lines, and which are unique (N,).
 
-    Arguments are as in `triangulate`. Parallel rays, or a single one, fix no point: then it is 1 m ahead of the mean origin
-    on the mean ray. It is NaN without rays.
+    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then 1 m ahead of the mean
+    origin on the mean ray. It is NaN without rays.
     """
     from objslam.triangulation import point_to_lines
 
@@ -155,23 +158,16 @@ def closed_form(
 
 
 def solve_eq1(
-    origins: ArrayLike,
-    directions: ArrayLike,
-    object_index: ArrayLike,
-    count: int,
-    start: ArrayLike | None = None,
-    *,
-    device: config.Device = "auto",
+    origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int, *, device: config.Device = "auto"
 ) -> tuple[Floats, int, Floats]:
-    """Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
+    """Solve Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
 
-    Arguments are as in `triangulate`; start: (N, 3) m, used where it is better than the `closed_form`. Objects that their
-    rays do not fix get the closed form's point. The optimum of two rays is their whole common perpendicular: its midpoint is
-    returned.
+    Arguments are as in `triangulate`. Objects that their rays do not fix get the point of `closed_form`. Two rays have their
+    whole common perpendicular as optimum, and the result is its midpoint.
 
     Returns:
-        The points (N, 3) m, the solver's iterations, and the norm (N,) of the gradient, NaN where rays do not fix a point.
-        Where rays pass through the solution it is that of the smallest subgradient, so that 0 always proves the optimum.
+        The points (N, 3) m, the iterations, and the norm (N,) of the gradient, NaN if the rays do not fix a point. If rays
+        pass through the solution, it is the norm of the smallest subgradient. So a value of 0 always proves the optimum.
     """
     import torch
 
@@ -179,45 +175,13 @@ def solve_eq1(
 
     m, n, index = _rays(origins, directions, object_index, count)
     where, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, device)
-    first = None
-    if start is not None:
-        given = np.ascontiguousarray(start, dtype=np.float64)
-        if given.shape != (count, 3):
-            raise ValueError(f"start must be ({count}, 3), not {given.shape}")
-        first = torch.from_numpy(given).to(base.device) - base
-    result = ac_ransac.solve_points(bundle, torch.ones(len(where), dtype=torch.bool, device=base.device), first)
+    result = ac_ransac.solve_points(bundle, torch.ones(len(where), dtype=torch.bool, device=base.device))
     return (base + result.point).cpu().numpy(), result.iterations, result.gradient.cpu().numpy()
 
 
-def consensus(
-    origins: ArrayLike,
-    directions: ArrayLike,
-    object_index: ArrayLike,
-    count: int,
-    sigma: ArrayLike,
-    settings: config.Triangulation,
-    *,
-    seed: int = 0,
-    position_sigma: float = 0.0,
-) -> tuple[Bools, Floats]:
-    """Which rays agree on their object: inlier (R,), and for each object (N,) the log of the number of such agreements that
-    chance would make (NFA), below 0 where it would not. Arguments are as in `triangulate`; `ac_ransac` says how.
-    """
-    from objslam.triangulation import ac_ransac
-
-    m, n, index = _rays(origins, directions, object_index, count)
-    noise = _positive(sigma, len(m), "sigma")
-    where, _, bundle = _bundle(m, n, index, count, noise, position_sigma, settings.device)
-    _, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, _jitter(seed, bundle, settings))
-    inlier = np.zeros(len(m), dtype=bool)
-    inlier[where] = use.cpu().numpy()
-    return inlier, log_nfa.cpu().numpy()
-
-
 def _rays(origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int) -> tuple[Floats, Floats, Ints]:
-    """Origins, unit directions and object indices, checked."""
-    m = np.asarray(origins, dtype=np.float64)
-    n = np.asarray(directions, dtype=np.float64)
+    """Check origins, unit directions and object indices, and return them as arrays."""
+    m, n = np.asarray(origins, dtype=np.float64), np.asarray(directions, dtype=np.float64)
     index = np.asarray(object_index)
     if index.size == 0:
         index = index.astype(np.int64)
@@ -239,7 +203,7 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """One value a ray, finite and above 0 wherever `needed` (by default everywhere) is a number."""
+    """Return one value per ray, which must be finite and above 0 for rays with a `needed` number (default: all rays)."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
@@ -250,7 +214,7 @@ def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None =
 def _bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, device: config.Device
 ) -> tuple[Ints, torch.Tensor, Bundle]:
-    """The rays that have an object, in the bundle's order; each object's mean origin (N, 3); the rays relative to it."""
+    """Return the indices of rays with an object in bundle order, the mean origin (N, 3) of each object, and the bundle."""
     import torch
 
     from objslam.triangulation import point_to_lines
@@ -263,7 +227,7 @@ def _bundle(
     objects = torch.from_numpy(index[where]).to(place)
     base = point_to_lines.object_sum(origin, objects, count) / number[:, None]
     origin = origin - base[objects]
-    # sorted by how far they pass the closed form: then neither the rays' order nor the frame changes which pairs are tried
+    # The rays are sorted by their distance from the closed form. So their order and frame do not affect the tried pairs.
     points, _ = point_to_lines.least_squares(origin, direction, objects, count)
     order = torch.argsort(point_to_lines.Lines.through(origin - points[objects], direction, objects, count).foot.norm(dim=1))
     order = order[torch.argsort(objects[order], stable=True)]
@@ -271,23 +235,10 @@ def _bundle(
     return where[order.cpu().numpy()], base, bundle
 
 
-def _jitter(seed: int, bundle: Bundle, settings: config.Triangulation) -> torch.Tensor:
-    import torch
-
-    return torch.from_numpy(np.random.default_rng(seed).random(settings.hypotheses)).to(bundle.origin.device)
-
-
 def _miss(m: Floats, n: Floats, index: Ints, positions: Floats) -> tuple[Floats, Floats]:
-    """How far rays pass their object: distance (R,) m from the line, angle (R,) rad from the half line; NaN without one."""
+    """Return the distance (R,) m and the angle (R,) rad between each ray and its object, NaN without object."""
     to_object = np.full_like(m, np.nan)
     has = index >= 0
     to_object[has] = positions[index[has]] - m[has]
     distance = np.linalg.norm(np.cross(to_object, n), axis=1)
     return distance, np.arctan2(distance, (to_object * n).sum(axis=1))
-
-
-def _rms(off: Floats, weight: Floats, index: Ints, count: int) -> Floats:
-    inlier = weight > 0
-    total = np.bincount(index[inlier], off[inlier] ** 2, minlength=count)
-    number = np.bincount(index[inlier], minlength=count)
-    return np.sqrt(np.divide(total, number, out=np.full(count, np.nan), where=number > 0))

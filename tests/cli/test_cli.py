@@ -185,7 +185,7 @@ def test_info_of_a_log_folder(objslam, log_folder, variant):
     for words in ("small: log", "odometry", "detections", "640x480", "nothing is missing for a run"):
         assert words in info.out
     (variant / "detections.jsonl").unlink()
-    assert "no detections; and no images either" in objslam("info", variant).out
+    assert "neither detections nor images" in objslam("info", variant).out
 
 
 def test_config_dump_is_what_config_reads(objslam, tmp_path):
@@ -217,7 +217,7 @@ def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
     shutil.copytree(log_folder, tmp_path / "log")
     demo = objslam("demo", "-o", tmp_path, "--boxes")
     assert demo.code == 1
-    demo.says("no demo made", "-o")
+    demo.says("not from a demo", "-o")
     assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
 
 
@@ -621,7 +621,7 @@ def test_what_went_with_the_older_result_is_told(objslam, variant, tmp_path):
     assert objslam("export", out, "--to", "csv").code == 0
     assert objslam("eval", out).code == 0
     told = objslam("run", variant, "-o", out, *LEAN).out
-    assert f"removed from {out}, for it was of the older result: evaluation.json, objects.csv" in told
+    assert f"removed the older result from {out}: evaluation.json, objects.csv" in told
 
 
 def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
@@ -686,7 +686,8 @@ def test_an_unforeseen_error_asks_for_a_report(objslam, log_folder, tmp_path, mo
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
     assert failed.code == 1
     assert failed.err == (
-        "objslam: internal error, ZeroDivisionError: a fault of ours (please report it; objslam --debug shows where)\n"
+        "objslam: internal error, ZeroDivisionError: a fault of ours "
+        "(please report it with the traceback from objslam --debug)\n"
     )
     monkeypatch.setattr("objslam.mapping.pipeline.run", lambda *_: exhausted())
     failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)

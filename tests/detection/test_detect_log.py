@@ -279,7 +279,7 @@ def test_other_cameras_and_detections_that_were_there(log, detector):
     both = detect_log(replace(log, cameras=(mapped, blind)), detector, Settings(), ledger)
     same(both.cameras[0].detections, mapped.detections)
     assert both.cameras[1] is blind
-    assert ledger.warnings == ["camera front: the detector's boxes replace those that the log brought"]
+    assert ledger.warnings == ["camera front: the boxes of the detector replace the boxes of the log"]
 
 
 def test_a_detector_that_finds_nothing_is_told(log, tmp_path):

@@ -233,8 +233,8 @@ class TestNames:
             ("a.txt", b"red\ngr\x07een\nblue", "class 1 is empty or not printable"),
             ("a.yaml", b"names: [red", "not YAML"),
             ("a.yaml", b"nothing: here", "no list of names"),
-            ("a.txt", b"red\ngreen\n", "there are 2 class names, the model has 3 classes"),
-            ("a.txt", b"red\ngreen\nblue\nblack\n", "there are 4 class names, the model has 3 classes"),
+            ("a.txt", b"red\ngreen\n", "there are 2 class names, but the model has 3 classes"),
+            ("a.txt", b"red\ngreen\nblue\nblack\n", "there are 4 class names, but the model has 3 classes"),
         ],
     )
     def test_files_that_do_not_fit(self, tmp_path, name, content, message):

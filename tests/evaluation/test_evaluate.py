@@ -353,7 +353,7 @@ def test_where_no_truth_was_found_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"looked for groundtruth/objects\.json or groundtruth/trajectory\.txt") as caught:
         evaluate_folder(tmp_path / "out", tmp_path / "log")
     assert caught.value.where == str(tmp_path / "log")
-    with pytest.raises(LogError, match="brought no ground truth") as caught:
+    with pytest.raises(LogError, match="has no ground truth") as caught:
         evaluate_folder(tmp_path / "out")
     assert caught.value.where == str(tmp_path / "out")
     (tmp_path / "empty.json").write_text(dump_truth_objects(()))

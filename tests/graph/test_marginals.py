@@ -85,7 +85,7 @@ def test_a_camera_that_one_ray_holds_leaves_no_covariance_at_all():
     covariance = marginal_covariances(graph, values, np.arange(3), ledger)
     assert covariance.shape == (3, 3, 3)
     assert np.isnan(covariance).all()
-    assert any("no object has one" in warning for warning in ledger.warnings)
+    assert any("no object has a covariance" in warning for warning in ledger.warnings)
 
 
 def test_no_landmarks():

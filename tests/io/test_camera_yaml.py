@@ -141,7 +141,7 @@ def test_a_missing_key_is_named(tmp_path, key):
         (1, "image_width: wide", "image_width must be a finite number, got 'wide'"),
         (1, "image_width: .nan", "image_width must be a finite number"),
         (1, "image_width: [640]", "image_width must be one value"),
-        (2, "image_width: 480", "there twice"),
+        (2, "image_width: 480", "occurs twice"),
         (2, "? [a, b] : 480", "not a word"),
         (3, "camera_name: [front]", "camera_name must be one value"),
         (5, "  rows: 2", "camera_matrix says 2 x 3 but has 9"),

@@ -181,7 +181,7 @@ def test_a_type_that_nobody_knows_is_left_out_with_a_warning():
     adapter._publications[1] = _Publication("/tags", "my_apriltag/msg/TagArray", (True, False), None)
     assert adapter._open(0.0) == []
     assert adapter.ledger.warnings == [
-        "/tags: its type my_apriltag/msg/TagArray is not known, and DDS does not bring definitions: left out"
+        "/tags: left out, because its type my_apriltag/msg/TagArray is unknown and DDS sends no definitions"
     ]
 
 

@@ -84,7 +84,7 @@ def test_the_newest_image_counts_and_the_overtaken_are_counted(robot):
     assert messages.image("front", 1.1)[22, 11, 2] == 255  # what a view asks for
     assert messages.image("front", 0.7) is None
     assert messages.image("rear", 1.1) is None
-    assert messages.ledger.dropped == {"image that a newer one overtook before the detector had time for it": 9}
+    assert messages.ledger.dropped == {"image replaced by a newer one before the detector was free": 9}
 
 
 def test_a_detector_that_breaks_on_one_image_goes_on_with_the_next(robot):
@@ -206,9 +206,9 @@ def test_an_error_at_every_image_of_a_topic_is_said_once(heard):
 def test_a_detector_that_ends_its_thread_does_not_do_so_silently(heard):
     assert heard.look(1) == ("image that the detector failed on", "/front/image at 0.100 s: SystemExit: 3")
     heard.worker._thread.join(LIMIT)
-    assert heard.look(2) == ("image that came after the detector had ended", "/front/image at 0.200 s")
-    assert heard.look(3) == ("image that came after the detector had ended", "/front/image at 0.300 s")
-    assert heard.warnings == ["the detector has ended, no image is looked at any more: SystemExit: 3"]
+    assert heard.look(2) == ("image that arrived after the detector had ended", "/front/image at 0.200 s")
+    assert heard.look(3) == ("image that arrived after the detector had ended", "/front/image at 0.300 s")
+    assert heard.warnings == ["the detector has ended, later images are dropped: SystemExit: 3"]
 
 
 def test_a_session_says_what_the_detector_fails_on():

@@ -156,11 +156,11 @@ def test_lists_are_as_good_as_arrays():
         ({"width": None}, "without a size"),
         ({"height": np.nan}, "without a size"),
         ({"height": 480.5}, "without a size"),
-        ({"distortion_model": ["plumb_bob"]}, "with a lens model that is not known"),
-        ({"distortion": 5}, "with a lens model that is not known"),
-        ({"base_T_camera": [1, 2]}, "whose mount is no pose"),
+        ({"distortion_model": ["plumb_bob"]}, "with an unknown lens model"),
+        ({"distortion": 5}, "with an unknown lens model"),
+        ({"base_T_camera": [1, 2]}, "whose mount is not a rigid pose"),
         ({"depth_scale": "1000"}, "whose depth scale is not above zero"),
-        ({"sees_size": 2}, "that does not say whether it sees sizes"),
+        ({"sees_size": 2}, "whose sees_size is neither true nor false"),
     ],
 )
 def test_what_is_wrong_with_a_camera_is_told(change, reason):

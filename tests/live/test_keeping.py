@@ -29,7 +29,10 @@ def test_what_the_queue_refuses_is_not_journalled(tmp_path, monkeypatch):
     assert said == [True, True, True, False, False]
     session.abort()
     assert not session.push_odometry(9.0, np.eye(4))
-    assert session.counters.dropped() == {"poses that found no place in the queue": 2, "messages after the end": 1}
+    assert session.counters.dropped() == {
+        "poses refused because the queue was full": 2,
+        "messages after the end of the session": 1,
+    }
     assert [m.stamp for m in journalled(tmp_path / "journal.objslam")] == [0.0, 1.0, 2.0]
     again = Session(SETTINGS, tmp_path / "journal.objslam", resume=True).start()
     assert again.newest == 2.0

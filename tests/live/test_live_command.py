@@ -129,7 +129,7 @@ def test_a_live_recording_is_not_where_the_result_puts_its_own(log, tmp_path):
         command(log, out, "--view", str(out / "recording.rrd")), capture_output=True, text=True, timeout=LIMIT
     )
     assert failed.returncode == 1
-    assert "the recording of the result goes there" in failed.stderr
+    assert "this file is the recording of the result" in failed.stderr
     assert len(failed.stderr.strip().splitlines()) == 1
     assert not out.exists()
 
@@ -146,7 +146,7 @@ def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
     kept = journal_in(out)
     done = subprocess.run(command("stdin", out), input="", capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 1
-    assert "no camera came; no odometry or localisation came; no detections came" in done.stderr
+    assert "no camera arrived; no odometry or localisation arrived; no detections arrived" in done.stderr
     assert "Traceback" not in done.stderr
     assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
 

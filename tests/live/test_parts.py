@@ -14,7 +14,7 @@ from objslam.core.types import Trajectory
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.live.mapper.course import Course
 from objslam.live.mapper.keyframe_selection import KeyframeSelector
-from objslam.live.mapper.pose_uncertainty import carried
+from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.tables import GrowingTable, KeyframeTable, column
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 from objslam.live.session.clock import Clock
@@ -207,7 +207,9 @@ def test_what_the_cameras_uncertainty_makes_of_a_landmark_by_sampling():
     local = pose[:3, :3].T @ to[0]
     moved = pose @ exp_se3(rng.multivariate_normal(np.zeros(6), covariance, 40_000))
     seen = moved[:, :3, :3] @ local + moved[:, :3, 3] - point
-    np.testing.assert_allclose(carried(to, covariance, pose)[0], np.cov(seen.T), atol=3e-4)
+    drift = np.eye(6)  # so large that the covariance of the pose counts
+    found = PoseUncertainty(drift, np.eye(6), covariance).of_landmarks(to, np.zeros((1, 6, 6)), pose)
+    np.testing.assert_allclose(found[0], np.cov(seen.T), atol=3e-4)
 
 
 def test_asking_whether_a_frame_is_redundant_changes_nothing():

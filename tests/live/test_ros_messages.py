@@ -145,7 +145,7 @@ def test_tf_gives_the_odometry_at_once_where_a_user_says_so(maker):
     robot.tf(1.1, ("odom", "base_link", pose_at(1.1)))
     robot.tf(1.2, ("odom", "base_link", pose_at(1.1)))  # standing still is news as well
     assert [stamp for stamp, *_ in robot.sink.odometry] == pytest.approx([1.1, 1.2])
-    assert robot.dropped == {"odometry from another topic than the one taken": 1}
+    assert robot.dropped == {"odometry from a second topic": 1}
 
 
 def test_a_pose_in_map_is_localisation(maker):
@@ -210,7 +210,7 @@ def test_boxes_whose_camera_never_comes_are_dropped_and_say_why(maker):
     assert not robot.dropped
     robot.now = 1.1
     robot.messages.tick()
-    assert robot.dropped == {"detection frame whose camera is not calibrated or not placed": 1}
+    assert robot.dropped == {"detection frame of a camera without calibration or transform": 1}
     (line,) = robot.messages.ledger.lines()
     assert "no CameraInfo has the frame 'front_optical_frame'" in line
 
@@ -278,7 +278,7 @@ def test_two_detectors_on_one_camera_do_not_count_twice(maker):
     robot.detections(1.1)
     robot.detections(1.1, topic="/front/tracked")
     assert len(robot.sink.detections) == 1
-    assert robot.dropped == {"detection frame of a camera from another topic than the one taken": 1}
+    assert robot.dropped == {"detection frame from a second topic of its camera": 1}
 
 
 def test_depth_images_give_boxes_their_depth(maker):
@@ -350,7 +350,7 @@ def test_poses_that_are_none_are_counted(maker):
     broken = maker.odometry(ns(1.2), np.eye(4))
     broken.pose.pose.orientation.w = 0.0
     robot.send(ODOMETRY, "/odom", broken)
-    assert robot.dropped == {"odometry message that is no pose (not finite, or a zero quaternion)": 2}
+    assert robot.dropped == {"odometry message without a valid pose (not finite or a zero quaternion)": 2}
 
 
 def test_a_stamp_that_nobody_set_is_the_time_of_arrival(maker):

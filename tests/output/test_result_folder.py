@@ -128,7 +128,7 @@ GOOD = {
     ("change", "message"),
     [
         ({"id": True}, "objects[1]: id must be an integer, got True"),
-        ({"id": 0}, "objects[1]: id 0 is there twice"),
+        ({"id": 0}, "objects[1]: id 0 occurs twice"),
         ({"id": 2**63}, "id must be an integer"),
         ({"label": ""}, "label must be text"),
         ({"label": "\ud800"}, "label must be text"),
@@ -160,7 +160,7 @@ def test_malformed_objects_are_named(tmp_path: Path, change: dict[str, object], 
     [
         (b"", "not JSON"),
         (b'{"objects": [\n{"id": 1,}]}', "line 2"),
-        (b"\xff\xfe", "not text in UTF-8"),
+        (b"\xff\xfe", "not UTF-8 text"),
         (b"[]", "not an objects file"),
         (b'{"objects": {}}', "not an objects file"),
         (b'{"format": "objslam.objects/1", "objects": [3]}', "objects[0]: not a mapping"),

@@ -78,7 +78,7 @@ def test_what_is_inside(folder, log):
         "/fla/ovc_node/right/tags": "fla_right_cam.detections",
         "/fla/vio/odom": "odometry",
     }
-    assert all("no CameraInfo belongs to it" in line for line in info.missing)
+    assert all("no CameraInfo belongs to this camera" in line for line in info.missing)
     assert [c.camera.name for c in log.cameras] == ["left", "right"]
     assert [len(c.detections) for c in log.cameras] == [1876, 1759]
     assert len(log.odometry) == 4500

@@ -97,7 +97,7 @@ def test_a_clock_set_back_begins_anew():
     [
         ("", "base", planar(0, 0, 0), False, "without a frame"),
         ("base", "base", planar(0, 0, 0), False, "to itself"),
-        ("odom", "base", planar(np.nan, 0, 0), False, "no pose"),
+        ("odom", "base", planar(np.nan, 0, 0), False, "pose is invalid"),
         ("odom", "base", planar(9, 0, 0), False, "older"),
         ("world", "base", planar(9, 0, 0), False, "another parent"),
         ("odom", "base", planar(9, 0, 0), True, "also has a moving one"),

@@ -290,7 +290,7 @@ def test_the_same_seed_gives_the_same_drive_on_any_number_of_threads_and_another
 
 
 def test_what_is_there_is_not_written_over(drive):
-    with pytest.raises(OutputError, match="there is something already"):
+    with pytest.raises(OutputError, match="there is a log already"):
         render_drive(SMALL, 3, drive)
 
 

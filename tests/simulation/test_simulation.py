@@ -438,7 +438,7 @@ def test_settings_that_make_no_drive_are_refused():
         ({"odometry": None, "localization": None}, "odometry or localization"),
         ({"path": (2, 4)}, "common divisor"),
         ({"margin": 3.0}, "no room"),
-        ({"cameras": (make_camera("a"), make_camera("a"))}, "name of their own"),
+        ({"cameras": (make_camera("a"), make_camera("a"))}, "name of its own"),
         ({"moving": 1, "objects": 0}, "moving objects"),
         ({"missed": 1.5}, "less than or equal to 1"),
     ):

@@ -184,8 +184,8 @@ def test_what_cannot_be_written(log, tmp_path):
     (camera_log,) = log.cameras
     lost = replace(camera_log, rgb=Images(np.array([1.0]), (tmp_path / "lost.png",)))
     for bad, message in (
-        (replace(log, cameras=()), "without a camera"),
-        (replace(log, odometry=None, localization=None), "without a path"),
+        (replace(log, cameras=()), "without cameras"),
+        (replace(log, odometry=None, localization=None), "without odometry or localization"),
         (replace(log, cameras=(camera_log, camera_log)), "names must differ"),
         (replace(log, cameras=(camera_log, _camera_log("../x", camera_log.rgb.paths))), "file names"),
         (replace(log, cameras=(lost,)), "lost.png"),

@@ -105,9 +105,9 @@ def test_a_robot_is_read(dataset):
         "measurement line with a stamp that goes back": 1,
         "measurement of an unknown barcode": 1,
         "measurement of another robot": 2,
-        "measurement with a bearing out of the virtual camera's view": 1,
+        "measurement with a bearing outside the virtual camera's view": 1,
         "range that is not above zero (taken as unknown)": 1,
-        "landmark line whose subject is no landmark": 1,
+        "landmark line with a subject that is no landmark": 1,
     }
     assert ledger.examples["measurement of another robot"] == [f"{measurement}:4", f"{measurement}:5"]
     assert ledger.examples["measurement line that is not 4 numbers"] == [f"{measurement}:10"]

@@ -48,7 +48,7 @@ def test_what_is_missing(log):
     blind = replace(camera, detections=None)
     images = replace(blind, rgb=Images(log.odometry.stamps[:2], (Path("a.png"), Path("b.png"))))
     name = camera.camera.name
-    assert contents(replace(log, cameras=(blind,))).missing == (f"camera {name}: no detections; and no images either",)
+    assert contents(replace(log, cameras=(blind,))).missing == (f"camera {name}: neither detections nor images",)
     (line,) = contents(replace(log, cameras=(images,))).missing
     assert line == f"camera {name}: no detections; run a detector on its images (--detector)"
     late = Trajectory(log.localization.stamps + 1e6, log.localization.poses)

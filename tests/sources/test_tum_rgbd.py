@@ -88,14 +88,14 @@ def test_odd_files_are_dropped_and_named(numbered, tmp_path):
     assert [detections.label_names[i] for i in detections.label] == ["cabinet", "cabinet", "person"]
     assert np.isnan(detections.depths).all()
     assert ledger.dropped == {
-        "numbered file whose number another has": 1,
+        "numbered file with the number of another file": 1,
         "numbered file that leaves the folder": 1,
         "numbered file that no pose belongs to": 2,
         'box line that is not "[class] x y w h score"': 2,
-        "box line with a class that COCO does not have": 2,
+        "box line with a class number that is not in COCO": 2,
         "box without area (x2 <= x1 or y2 <= y1)": 1,
     }
-    assert ledger.examples["box line with a class that COCO does not have"] == [
+    assert ledger.examples["box line with a class number that is not in COCO"] == [
         f"{boxes / '0003_yolo2_0.15.txt'}:{n}" for n in (3, 4)
     ]
 
@@ -196,7 +196,7 @@ def test_an_archive_is_read_where_it_is(stamped):
     assert log.localization.stamps.tolist() == [10.5, 11.5, 12.5, 13.5]
     assert log.cameras[0].camera.matrix[0].tolist() == [535.4, 0, 320.1]
     assert ledger.dropped == {
-        "box file whose name is no stamp": 1,
+        "box file not named after a stamp": 1,
         "box file that is not a regular file": 3,
         "box file that is too large": 1,
         "detection frame with a stamp that repeats or goes back": 1,
@@ -232,7 +232,7 @@ def test_a_folder_of_boxes(stamped, tmp_path):
     detections = read_stamped(stamped, ledger, TumOptions(label="thing")).cameras[0].detections
     assert detections.frame_stamps.tolist() == [11.5]
     assert [detections.label_names[i] for i in detections.label] == ["cup", "thing"]
-    assert ledger.dropped == {"box file that is not a regular file": 2, "box file whose name is no stamp": 1}
+    assert ledger.dropped == {"box file that is not a regular file": 2, "box file not named after a stamp": 1}
     _archive(stamped, [("11.5.txt", b"41 1 2 3 4 0.5")])
     with pytest.raises(LogError, match=r"several sets of boxes: yolo_txts, yolo\.tar\.gz"):
         read_stamped(stamped, Ledger())

@@ -185,14 +185,6 @@ def test_an_object_without_rays_has_no_point():
     assert iterations == 0
 
 
-def test_a_start_far_away_changes_nothing():
-    rng = np.random.default_rng(6)
-    m, n, index, places = rays_around(rng, 10, 8)
-    points, _, _ = solve_eq1(m, n, index, 10)
-    for start in (places, places + 1e9):
-        np.testing.assert_allclose(solve_eq1(m, n, index, 10, start)[0], points, atol=1e-12)
-
-
 @pytest.mark.parametrize("offset", [1e3, 1e5])
 def test_map_coordinates_far_from_the_origin_cost_no_precision(offset):
     rng = np.random.default_rng(7)

@@ -1,4 +1,4 @@
-"""One file for each kind of factor: it knows its measurement and makes GTSAM's factors of it, the same offline and live.
+"""Turn measurements into GTSAM factors, with one file for each kind of factor, for offline and live use.
 
-Which measurements go into a graph is not said here: offline `graph/assembly.py` does, live the callers of `graph/isam2.py`.
+Which measurements enter a graph is decided in `graph/assembly.py` offline, and by the callers of `graph/isam2.py` live.
 """

@@ -1,36 +1,28 @@
-"""Where a box lies in its image: the angle between the ray and the object, or Eq. 1's distance of the object from the ray.
-
-The geometry is vectorised first, so that only the construction itself is left to Python.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
+"""Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray (Eq. 1)."""
 
 import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import make_pose
+from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""How far behind its ray a virtual camera stands (m): far enough that perspective is gone (the relative error is the range
-divided by it), near enough that rounding (it times 1e-16) is a nanometre."""
+"""The distance (m) of a virtual camera behind its ray. A larger value leaves less perspective and rounds more coarsely. The
+relative error is the range divided by the distance. The distance was chosen for a rounding (1e-16 of it) of a nanometre."""
 L1_RADIANS = 1e-4
-"""The angle (rad) below which the loss `l1` on bearings is quadratic, so that it has a derivative at 0. Chosen far below the
-noise of a box (a twentieth of a pixel); larger is smoother, and less like a norm."""
+"""The angle (rad) below which the loss `l1` on bearings is quadratic, which gives it a derivative at 0. A larger angle is
+smoother and less like a norm. It was chosen far below the noise of a box (a twentieth of a pixel)."""
 EQ1_SIGMA = 0.05
-"""The standard deviation (m) of the point-to-line distance where poses are solved too. Eq. 1 knows no noise: this one weighs
-its metres against the odometry's; larger trusts the odometry more."""
+"""The standard deviation (m) of the point-to-line distance in the joint solve. A larger value trusts the odometry more.
+Eq. 1 has no noise model, so this value weighs its distances against the odometry."""
 _ORTHOGRAPHIC = gtsam.Cal3DS2(STANDOFF, STANDOFF, 0, 0, 0, 0, 0, 0, 0)
 _CENTRE = np.zeros(2)
 
 
-def bearings(
-    keyframe: Ints, directions: Floats, landmark: Ints, noise: Sequence[gtsam.noiseModel.Base]
-) -> list[gtsam.NonlinearFactor]:
-    """The angle off the ray (rad) between X(keyframe) and L(landmark): directions (R, 3) in the camera frame."""
+def bearings(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
+    """Return factors on the angle (rad) at X(keyframe) between L(landmark) and a direction (R, 3) in the camera frame."""
     make, unit = gtsam.BearingFactor3D, gtsam.Unit3
     return [
         make(X0 + k, L0 + j, unit(direction), model)
@@ -38,10 +30,11 @@ def bearings(
     ]
 
 
-def point_to_line(
-    keyframe: Ints, directions: Floats, landmark: Ints, noise: Sequence[gtsam.noiseModel.Base]
-) -> list[gtsam.NonlinearFactor]:
-    """Eq. 1 with the pose as a variable: directions (R, 3) in the camera frame, residual in metres."""
+def point_to_line(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
+    """Return factors on the distance (m, Eq. 1) of L(landmark) from a ray of X(keyframe).
+
+    The directions (R, 3) are in the camera frame. The pose is a variable.
+    """
     make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(np.zeros_like(directions), directions)
     return [
         make(_CENTRE, model, X0 + k, L0 + j, _ORTHOGRAPHIC, False, False, body)
@@ -49,10 +42,11 @@ def point_to_line(
     ]
 
 
-def point_to_line_fixed(
-    origins: Floats, directions: Floats, landmark: Ints, noise: Sequence[gtsam.noiseModel.Base]
-) -> list[gtsam.NonlinearFactor]:
-    """Eq. 1 with known poses: the residual's norm is the distance (m) of L(landmark) to the ray (R, 3), (R, 3) in map."""
+def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
+    """Return factors on the distance (m, Eq. 1) of L(landmark) from a fixed ray.
+
+    Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
+    """
     make, camera = gtsam.TriangulationFactorCal3DS2, gtsam.PinholeCameraCal3DS2
     return [
         make(camera(pose, _ORTHOGRAPHIC), _CENTRE, model, L0 + j)
@@ -61,7 +55,10 @@ def point_to_line_fixed(
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """For each ray (R, 3), (R, 3) a far camera that looks along it: its image is the offset across the ray, in metres."""
+    """Return for each ray, origin (R, 3) and direction (R, 3), a distant camera that looks along the ray.
+
+    Its image of a point is the offset (m) of the point across the ray.
+    """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(helper, n)

@@ -1,6 +1,4 @@
-"""What a localisation says: the absolute pose of a keyframe."""
-
-from __future__ import annotations
+"""Factors for a localisation, which measures the absolute pose of a keyframe."""
 
 import gtsam
 import numpy as np
@@ -16,9 +14,10 @@ from objslam.graph.variables import X0
 def localizations(
     keyframes: Keyframes, settings: Settings, first: int = 0, on_plane: bool | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Absolute pose priors on every keyframe, X(first) and on, with Huber's loss, for a localisation may jump.
+    """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
-    Keyframes that share a measurement share its information. on_plane: whether the path is planar, None to see.
+    The priors have Huber's loss, because a localisation may jump. Keyframes that share a measurement share its information.
+    on_plane: whether the path is planar. If it is None, the poses decide.
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [

@@ -1,6 +1,4 @@
-"""What the odometry says: the motion between two keyframes, and how little is known where it says nothing."""
-
-from __future__ import annotations
+"""Compute motions between keyframes by odometry, their covariances, and their factors."""
 
 import gtsam
 import numpy as np
@@ -12,20 +10,21 @@ from objslam.core.types import Keyframes
 from objslam.graph.variables import X0
 
 UNKNOWN_TURN, UNKNOWN_WAY = 0.5, 2.0
-"""The standard deviations (rad, m) of a motion that nothing measured. Chosen for a robot that is carried a few steps; larger
-ties the two keyframes less."""
+"""The standard deviations (rad, m) of a motion without a measurement. Larger values tie the two keyframes less. They were
+chosen for a robot that somebody carries a few steps."""
 
 
 def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:
-    """Camera motion (K-1, 4, 4) between consecutive keyframes by odometry, and its covariance (K-1, 6, 6), rotation first.
+    """Return the camera motions (K-1, 4, 4) between consecutive keyframes, and their covariances (K-1, 6, 6).
 
-    The measured motion is E_prev^-1 * odo * E_next and its covariance Ad(E_next^-1) S Ad(E_next^-1)^T, where S, in base, is
-    what the odometry gathered between the two, and a floor for each step. on_plane: whether the path is planar, None to see.
-    What is not `Keyframes.measured` has no meaning.
+    A motion is E_prev^-1 * odo * E_next. Its covariance is Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation
+    first. S is the covariance in base that the odometry accumulated between the two keyframes. Rows that are not
+    `Keyframes.measured` have no meaning.
+    on_plane: whether the path is planar. If it is None, the poses decide. ValueError if the keyframes have no odometry.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
-        raise ValueError("motions need odometry")
+        raise ValueError("the keyframes have no odometry, which motions need")
     on_plane = _on_plane(keyframes, odom_T_base) if on_plane is None else on_plane
     odom_T_camera = odom_T_base @ keyframes.base_T_camera
     floor = motion_floor(keyframes.base_T_camera[1:], settings, on_plane)
@@ -34,7 +33,7 @@ def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = No
 
 
 def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
-    """Whether the odometry is planar; each stretch by itself, where the localisation says how they lie to each other."""
+    """Return whether the odometry is planar. With a localisation, each stretch may have a plane of its own."""
     stretch = keyframes.stretch
     if stretch is None or not keyframes.localized_every:
         return is_planar(odom_T_base)
@@ -43,17 +42,17 @@ def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
 
 
 def motion_floor(base_T_camera: Floats, settings: Settings, on_plane: bool) -> Floats:
-    """The least covariance (..., 6, 6) of a motion to a camera that sits there (..., 4, 4), in its frame."""
+    """Return the least covariance (..., 6, 6) of a motion, in the frame of the camera at base_T_camera (..., 4, 4)."""
     return _in_camera(base_T_camera, settings.odometry.floor_yaw, settings.odometry.floor_xy, settings, on_plane)
 
 
 def unknown_motion(base_T_camera: Floats, settings: Settings, on_plane: bool) -> Floats:
-    """The covariance (..., 6, 6) of a motion that nothing measured, in the frame of a camera at (..., 4, 4)."""
+    """Return the covariance (..., 6, 6) of a motion without a measurement, in the frame of the camera."""
     return _in_camera(base_T_camera, UNKNOWN_TURN, UNKNOWN_WAY, settings, on_plane)
 
 
 def _in_camera(base_T_camera: Floats, turn: float, way: float, settings: Settings, on_plane: bool) -> Floats:
-    """The covariance (..., 6, 6), in the camera, of a motion of base that is known to `turn` (rad) and `way` (m)."""
+    """Return the covariance, in the camera frame, of a base motion with standard deviations `turn` (rad) and `way` (m)."""
     tilt, z = (settings.planar.tilt, settings.planar.z) if on_plane else (turn, way)
     variance = np.array([tilt, tilt, turn, way, way, z]) ** 2
     to_camera = adjoint(inverse(base_T_camera))
@@ -61,24 +60,25 @@ def _in_camera(base_T_camera: Floats, turn: float, way: float, settings: Setting
 
 
 def motion_covariance(gathered: Floats, camera_from_drift: Floats, floor: Floats) -> Floats:
-    """Covariances (..., 6, 6) of motions in the frames that they lead to, by what drift (..., 6, 6) was gathered on the way.
+    """Return the covariances (..., 6, 6) of motions, each in the frame of its last camera.
 
-    camera_from_drift: (..., 6, 6) takes that to these frames.
+    gathered: (..., 6, 6) the drift between the two poses. camera_from_drift: (..., 6, 6) the adjoint that moves the drift
+    into the frame of the last camera. floor: (..., 6, 6) the covariance to add.
     """
     covariance = camera_from_drift @ gathered @ np.swapaxes(camera_from_drift, -1, -2) + floor
     return np.asarray((covariance + np.swapaxes(covariance, -1, -2)) / 2)
 
 
 def betweens(motion: Floats, covariance: Floats, first: int, measured: Bools | None = None) -> list[gtsam.NonlinearFactor]:
-    """Between-factors for camera motions (M, 4, 4) from X(first), X(first + 1), ... each to the next.
+    """Return between-factors for the camera motions (M, 4, 4) from X(first) to X(first + 1) and so on.
 
-    measured: (M,) which of them there are; None for all.
+    measured: (M,) whether a motion gets a factor. None means all motions.
     """
     steps = np.arange(len(motion)) if measured is None else np.flatnonzero(measured)
     return [between(first + i, first + i + 1, motion[i], covariance[i]) for i in steps.tolist()]
 
 
 def between(before: int, after: int, motion: Floats, covariance: Floats) -> gtsam.NonlinearFactor:
-    """The between-factor of the camera motion (4, 4) with covariance (6, 6) from X(before) to X(after)."""
+    """Return the factor of a camera motion (4, 4) with covariance (6, 6) from X(before) to X(after)."""
     noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
     return gtsam.BetweenFactorPose3(X0 + before, X0 + after, gtsam.Pose3(motion), noise)

@@ -1,21 +1,15 @@
-"""The distance that came with a box: from a pose that is solved, or along a ray whose pose is known."""
-
-from __future__ import annotations
-
-from collections.abc import Sequence
+"""Factors for the measured range of a box, with the pose as a variable or fixed."""
 
 import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.graph.factors.noise import huber
+from objslam.graph.factors.noise import Noise, huber
 from objslam.graph.variables import L0, X0
 
 
-def ranges(
-    keyframe: Ints, measured: Floats, landmark: Ints, noise: Sequence[gtsam.noiseModel.Base]
-) -> list[gtsam.NonlinearFactor]:
-    """The distance (R,) m of L(landmark) from X(keyframe)."""
+def ranges(keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
+    """Return factors on the distance (R,), m, between X(keyframe) and L(landmark)."""
     return [
         gtsam.RangeFactor3D(X0 + k, L0 + j, r, model)
         for k, j, r, model in zip(keyframe.tolist(), landmark.tolist(), measured.tolist(), noise, strict=True)
@@ -25,9 +19,9 @@ def ranges(
 def along_ray(
     origins: Floats, directions: Floats, measured: Floats, sigmas: Floats, landmark: Ints
 ) -> list[gtsam.NonlinearFactor]:
-    """The distance (R,) m along a ray (R, 3), (R, 3) in map with known poses, under Huber's loss.
+    """Return factors on the distance (R,), m, of L(landmark) along a fixed ray, with Huber's loss.
 
-    It says nothing across the ray, hence one row of information.
+    Origins (R, 3) and directions (R, 3) are in map. Each factor has information along its ray only.
     """
     points = origins + directions * measured[:, None]
     roots = np.zeros((len(points), 3, 3))

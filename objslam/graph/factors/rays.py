@@ -1,6 +1,4 @@
-"""The factors of rays, offline and live: each has a bearing, and a range where one came with it."""
-
-from __future__ import annotations
+"""Make the factors of rays, offline and live: a bearing for each ray, and a range for each ray with a measured range."""
 
 from dataclasses import dataclass
 
@@ -17,10 +15,10 @@ from objslam.graph.factors.range import ranges
 
 @dataclass(frozen=True)
 class Bearings:
-    """Rays of a live session, as its graph takes them.
+    """Rays of a live session, in the form that its graph takes.
 
-    number: (n,) their own. keyframe, landmark: (n,). direction: (n, 3) in the camera. sigma: (n,) rad. range: (n,) m along
-    the ray, NaN where unknown; range_sigma: (n,) m.
+    number: (n,) the ray's own number. keyframe, landmark: (n,) numbers of X and L. direction: (n, 3) in the camera frame.
+    sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m.
     """
 
     number: Ints
@@ -35,13 +33,14 @@ class Bearings:
 def ray_factors(
     rays: Rays | Bearings, landmark: Ints, loss: Loss, settings: Settings
 ) -> list[tuple[Ints, list[gtsam.NonlinearFactor]]]:
-    """The factors of rays by their kind: which rays (m,) have one, and the factors in their order.
+    """Return the factors of rays by kind: for each kind, the indices (m,) of its rays and one factor for each of these rays.
+
+    The first kind is the bearing of every ray. If joint.factor asks for it, the point-to-line distance takes its place. The
+    second kind is the measured ranges.
 
     Args:
         landmark: (n,) the landmark of each ray.
-        loss: that of the bearings; ranges have Cauchy's.
-    Returns:
-        First the bearings, which all rays have, or the point-to-line distances where joint.factor says so; then the ranges.
+        loss: the loss of the first kind. Ranges have Cauchy's loss.
     """
     if settings.joint.factor == "bearing":
         made = bearings(rays.keyframe, rays.direction, landmark, robust(loss, rays.sigma, 2, L1_RADIANS))

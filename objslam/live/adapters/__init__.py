@@ -1,8 +1,7 @@
-"""Adapters, a file each: what brings messages to a session. run(stop) returns when stop is set, or all has been read.
+"""Adapters bring messages to a session, one file per adapter. `ADAPTERS` lists them for `objslam live SOURCE`.
 
-`ADAPTERS` is the table of them for `objslam live SOURCE`: a new one is one more file, one more row here, and a function that
-makes it; if it has options, `LiveOptions` inherits them. What is not in the table is a recording, which is replayed. What is
-imported here may not be heavy: the command line reads the table before it answers `--help`.
+A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` inherits its options. A source
+outside the table is a recording. This module imports no heavy library, because `--help` imports it.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
@@ -28,33 +28,30 @@ if TYPE_CHECKING:
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice
 
-
 _INTERFACE = "DDS: auto, or a network interface's name or address. [default: as CYCLONEDDS_URI says, else loopback]"
 
 
 class Adapter(Protocol):
-    """What brings messages."""
+    """Brings messages to a `Sink`."""
 
     @property
     def ledger(self) -> Ledger:
-        """What was dropped before it could be pushed, and warnings."""
-        ...
+        """The counts of messages that were dropped before a push, and warnings."""
 
     def run(self, stop: threading.Event) -> None:
-        """Push messages until stop is set, or there are no more."""
-        ...
+        """Push messages until stop is set or no more come."""
 
 
 @dataclass(frozen=True)
 class LiveRosOptions(RosOptions):
-    """What a running robot's messages do not say themselves, and the model that finds the boxes in its images, if any."""
+    """Facts that the messages of a running robot lack, and the detector for its images, if any."""
 
     detector: Annotated[Path | None, DETECTOR] = None
 
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Where DDS is; see `live.dds.network`."""
+    """The DDS domain and network, as in `live.dds.network`."""
 
     domain: Annotated[int | None, Option("--domain", "DDS domain. [default: ROS_DOMAIN_ID, else 0]")] = None
     interface: Annotated[str | None, Option("--interface", _INTERFACE)] = None
@@ -62,19 +59,19 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class DdsOptions(NetworkOptions, LiveRosOptions):
-    """What is heard over DDS does not say itself, and where that is."""
+    """The options of messages over DDS and of the DDS network."""
 
 
 @dataclass(frozen=True)
 class LiveOptions(DdsOptions, SourceOptions):
-    """All options of all adapters, and of the recordings that may be replayed in their place."""
+    """The options of all adapters, and of the recordings that may be replayed instead."""
 
 
 @dataclass(frozen=True)
 class Feed:
-    """An adapter, what else wants to see the snapshots, and what to close in the end.
+    """An adapter, the functions that receive the snapshots, and the functions to call at the end.
 
-    image: the image of a camera, by its name, at a stamp, s, where the adapter sees any.
+    image: returns the image of a camera (name) at a stamp, s; None if the adapter has no images.
     """
 
     adapter: Adapter
@@ -85,12 +82,10 @@ class Feed:
 
 @dataclass(frozen=True)
 class LiveSource:
-    """What `objslam live` calls by a name.
+    """A named source of `objslam live`.
 
-    Attributes:
-        says: what it is, in a few words for `--help`.
-        opens: what makes its adapter.
-        options: the class of the options that it takes, which `LiveOptions` inherits; None: it takes none.
+    says: its description in `--help`. opens: the function that makes its adapter. options: the class of its options, which
+    `LiveOptions` inherits; None without options.
     """
 
     says: str
@@ -110,22 +105,19 @@ def _dds(sink: Sink, settings: Settings, options: DdsOptions) -> Feed:
     from objslam.live.adapters.dds import DdsAdapter
     from objslam.live.dds.network import open_network
 
-    network = open_network(options.domain, options.interface)
-    messages, choice, close = _ros(sink, settings, options)
-    return Feed(DdsAdapter(network, messages, choice), close=close, image=messages.image)
+    return _ros(sink, settings, options, partial(DdsAdapter, open_network(options.domain, options.interface)))
 
 
 def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions) -> Feed:
     from objslam.live.adapters.rclpy import RclpyAdapter
 
-    messages, choice, close = _ros(sink, settings, options)
-    return Feed(RclpyAdapter(messages, choice), close=close, image=messages.image)
+    return _ros(sink, settings, options, RclpyAdapter)
 
 
 def _ros(
-    sink: Sink, settings: Settings, options: LiveRosOptions
-) -> tuple[RosMessages, TopicChoice, tuple[Callable[[], None], ...]]:
-    """What turns ROS messages into pushes, which topics it wants, and what to close in the end."""
+    sink: Sink, settings: Settings, options: LiveRosOptions, make: Callable[[RosMessages, TopicChoice], Adapter]
+) -> Feed:
+    """Return the feed of an adapter of ROS messages, with a detector if the options name one."""
     from objslam.live.ros.detector_worker import DetectorWorker
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice
@@ -139,7 +131,8 @@ def _ros(
             ledger.warn(warning)
         worker = DetectorWorker(detector)
     messages = RosMessages(sink, options, worker, ledger=ledger)
-    return messages, TopicChoice(messages.chosen, worker is not None), (worker.close,) if worker is not None else ()
+    adapter = make(messages, TopicChoice(messages.chosen, worker is not None))
+    return Feed(adapter, close=(worker.close,) if worker is not None else (), image=messages.image)
 
 
 ADAPTERS = {
@@ -147,4 +140,4 @@ ADAPTERS = {
     "rclpy": LiveSource("the same, as a ROS node", _rclpy, LiveRosOptions),
     "stdin": LiveSource("JSON lines", _stdin),
 }
-"""What a name of `objslam live` stands for."""
+"""The sources of `objslam live` by name."""

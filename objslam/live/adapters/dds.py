@@ -1,13 +1,10 @@
-"""A running ROS 2 robot, heard over DDS without a ROS install."""
-
-from __future__ import annotations
+"""Receives the messages of a ROS 2 robot over DDS, without an installed ROS."""
 
 import threading
 import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from objslam.core.diagnostics import Ledger
 from objslam.live.dds.network import AUTO, LOOPBACK, Network, receive_buffer
 from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
@@ -16,13 +13,11 @@ from objslam.ros.bag.records import Connection, plain
 from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-_LONELY = 5.0  # Time without any publisher, or with one that does not match, before that is said, s.
-_TAKE = 200  # The messages that are taken of a reader at once; larger: other topics wait longer.
-_MAX_READERS = 256  # The most readers that are open; chosen to bound the memory.
-_MIN_BUFFER = 2 << 20  # The smallest socket buffer that a raw image fits into, bytes; below it a warning is given.
-
-_Kind = tuple[bool, bool]
-"""Whether a writer is reliable, and whether it keeps past messages (transient-local)."""
+_LONELY = 5.0  # The time without a publisher that matches, s, after which the user is warned. A larger value warns later.
+_TAKE = 200  # The most messages taken from a reader at once. A larger number lets other topics wait longer.
+_MAX_READERS = 256  # The most open readers. It bounds the memory.
+_MIN_BUFFER = 2 << 20  # The smallest socket buffer for a raw image, bytes. A larger value warns on more systems.
+_Kind = tuple[bool, bool]  # Whether a writer is reliable, and whether it is transient-local, which keeps past messages.
 
 
 @dataclass
@@ -35,24 +30,22 @@ class _Publication:
 
 @dataclass
 class _Reader:
-    """A DDS reader of a topic, for writers of one kind."""
+    """A DDS reader for all publishers with the topic and the kind of `of`."""
 
-    topic: str
-    type: str
-    kind: _Kind
+    of: _Publication
     entity: Any
     decode: Any
     since: float
     lost: int = 0
-    told: bool = False
+    warned: bool = False
 
 
 @dataclass
 class DdsAdapter:
-    """Hears topics by their types, as their publishers come and go, and hands the messages on.
+    """Reads topics by type while their publishers come and go.
 
-    For each topic there is a reader for each kind of publisher, best-effort or reliable, volatile or transient-local: a
-    reader that asks for more than is offered hears nothing, one that asks for less may lose what need not be lost.
+    A topic has one reader per kind of publisher: best-effort or reliable, volatile or transient-local. A reader with a
+    stricter QoS than its publisher receives nothing, and a reader with a weaker QoS may lose messages.
     """
 
     network: Network
@@ -63,13 +56,11 @@ class DdsAdapter:
     _topics: dict[str, Any] = field(default_factory=dict)
     _unread: dict[str, int] = field(default_factory=dict)
 
-    @property
-    def ledger(self) -> Ledger:
-        """What was dropped before it could be pushed, and warnings."""
-        return self.messages.ledger
+    def __post_init__(self) -> None:
+        self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
-        """Hand messages on until stop is set."""
+        """Push messages until stop is set."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
         from cyclonedds.util import duration
@@ -94,7 +85,6 @@ class DdsAdapter:
                 self._say_what_is_missing(now - begin)
 
     def _look_around(self, found: Any) -> None:
-        """Note which publishers there are."""
         from cyclonedds.core import InstanceState
 
         while samples := found.take(_TAKE):
@@ -109,7 +99,7 @@ class DdsAdapter:
                     self._publications[handle] = publication
 
     def _open(self, age: float) -> list[_Reader]:
-        """Make the readers that are missing for what is published and wanted."""
+        """Return new readers for the wanted topics that lack one."""
         offered = {publication.topic: publication.type for publication in self._publications.values()}
         wanted = self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)
         opened = []
@@ -121,8 +111,8 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # frames and cameras before what refers to them
-        self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].type, len(order))))
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # frames and cameras first
+        self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
     def _make_reader(self, publication: _Publication) -> _Reader | None:
@@ -131,11 +121,13 @@ class DdsAdapter:
         from cyclonedds.topic import Topic
 
         topic, type_, (reliable, latched) = publication.topic, publication.type, publication.kind
-        layouts = layouts_of(type_)
+        layouts: tuple[Any, ...] = layouts_of(type_)
         if not layouts:
-            self.ledger.warn(f"{topic}: its type {type_} is not known, and DDS does not bring definitions: left out")
+            self.ledger.warn(f"{topic}: left out, because its type {type_} is unknown and DDS sends no definitions")
             return None
-        layout = next((layout for layout in layouts if _is_of(publication, layout)), layouts[0])
+        declared = publication.type_id  # older publishers declare none
+        fitting = (layout for layout in layouts if declared is not None and layout.__idl__.get_type_id() == declared)
+        layout = next(fitting, layouts[0])
         images = type_ in IMAGES
         qos = Qos(
             Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
@@ -144,19 +136,18 @@ class DdsAdapter:
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )
         if images and (receive_buffer() or _MIN_BUFFER) < _MIN_BUFFER:
-            self.ledger.warn("the system's socket buffers are small for images: sysctl -w net.core.rmem_max=4194304")
+            self.ledger.warn("the system's socket buffers are too small for images: run sysctl -w net.core.rmem_max=4194304")
         try:
             if topic not in self._topics:
                 self._topics[topic] = Topic(self.network.participant, dds_topic(topic), layout)
             entity: Any = DataReader(self.network.participant, self._topics[topic], qos=qos)
         except DDSException as error:
-            self.ledger.warn(f"{topic}: cannot be heard ({error.msg})")
+            self.ledger.warn(f"{topic}: cannot be subscribed to ({error.msg})")
             return None
-        decode = make_decoder(Connection(topic, type_, "cdr"))
-        return _Reader(topic, type_, publication.kind, entity, decode, time.monotonic())
+        return _Reader(publication, entity, make_decoder(Connection(topic, type_, "cdr")), time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        """Hand on what a reader has; no more than it may hold, so that one that never runs dry does not keep off a stop."""
+        """Push a reader's messages, at most QUEUE of them, so that a busy reader does not delay a stop."""
         for _ in range(QUEUE // _TAKE):
             samples = reader.entity.take(_TAKE)
             for sample in samples:
@@ -166,26 +157,26 @@ class DdsAdapter:
                 try:
                     message = reader.decode(sample.data)
                 except DecodeError as error:
-                    self.messages.refuse("message that cannot be decoded", f"{reader.topic}: {error}")
+                    self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")
                     continue
-                self.messages.receive(reader.type, reader.topic, message, info.source_timestamp / 1e9)
+                self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
             if len(samples) < _TAKE:
                 return
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
-        """Whether a reader takes what a publisher sent: a best-effort one hears the reliable publishers too."""
+        """Return whether a reader is for a publisher. A best-effort reader also receives from the reliable publishers."""
         if handle not in self._publications:
             self._look_around(found)
         publication = self._publications.get(handle)
         if publication is not None:
-            return publication.kind == reader.kind
-        alone = sum(topic == reader.topic for topic, _ in self._readers) == 1
-        return alone or reader.kind == max(kind for topic, kind in self._readers if topic == reader.topic)
+            return publication.kind == reader.of.kind
+        alone = sum(topic == reader.of.topic for topic, _ in self._readers) == 1
+        return alone or reader.of.kind == max(kind for topic, kind in self._readers if topic == reader.of.topic)
 
     def _count_losses(self) -> None:
         for reader in self._readers.values():
             lost = reader.entity.get_sample_lost_status().total_count
-            self.messages.refuse("message lost on the way (DDS)", reader.topic, lost - reader.lost)
+            self.messages.refuse("message lost by DDS", reader.of.topic, lost - reader.lost)
             reader.lost = lost
         for topic, count in list(self.network.unread.items()):
             name = ros_topic(topic) or "a packet that is not DDS"
@@ -195,23 +186,17 @@ class DdsAdapter:
     def _say_what_is_missing(self, age: float) -> None:
         now = time.monotonic()
         if age > _LONELY and not self._readers:
-            hint = f"; --interface {AUTO} looks on the network" if self.network.where == LOOPBACK else ""
-            self.ledger.warn(
-                f"no publisher of odometry, tf or detections on {self.network.where}, domain {self.network.domain}{hint}"
-            )
+            hint = f"; --interface {AUTO} searches the network" if self.network.where == LOOPBACK else ""
+            where = f"{self.network.where}, domain {self.network.domain}{hint}"
+            self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
-            present = any((p.topic, p.kind) == (reader.topic, reader.kind) for p in self._publications.values())
-            if not reader.told and present and now - reader.since > _LONELY:
-                reader.told = True
+            present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in self._publications.values())
+            if not reader.warned and present and now - reader.since > _LONELY:
+                reader.warned = True
                 if not reader.entity.get_matched_publications():
                     self.ledger.warn(
-                        f"{reader.topic}: there is a publisher, but its QoS or layout of {reader.type} does not match"
+                        f"{reader.of.topic}: the publisher has another QoS or another layout of {reader.of.type}"
                     )
-
-
-def _is_of(publication: _Publication, layout: Any) -> bool:
-    """Whether a publisher says that its messages have this layout; older ones do not say."""
-    return publication.type_id is not None and layout.__idl__.get_type_id() == publication.type_id
 
 
 def _kind(qos: Any, type_: str) -> _Kind:

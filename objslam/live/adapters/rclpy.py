@@ -1,6 +1,4 @@
-"""A running ROS 2 robot, heard as a ROS node: where ROS 2 is installed and its setup is sourced."""
-
-from __future__ import annotations
+"""Receives the messages of a ROS 2 robot as a ROS node, which needs an installed and sourced ROS 2."""
 
 import threading
 import time
@@ -8,48 +6,37 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-
-@dataclass
-class _Subscription:
-    """A subscription and the QoS that it asks for: reliable, transient-local."""
-
-    entity: Any
-    kind: tuple[bool, bool]
+_Kind = tuple[bool, bool]  # Whether the QoS is reliable, and whether it is transient-local.
 
 
 @dataclass
 class RclpyAdapter:
-    """Subscribes to topics by their types, as their publishers come and go, and hands the messages on.
+    """Subscribes to topics by type while their publishers come and go. ObjslamError when rclpy cannot be imported.
 
-    ROS does not say which publisher a message is from, so a topic has one subscription: reliable where all its publishers
-    are, else best-effort, which hears both. ObjslamError where rclpy cannot be imported.
+    ROS does not name the publisher of a message, so each topic has one subscription. It is reliable if all publishers are
+    reliable; otherwise it is best-effort, which receives from all of them.
     """
 
     messages: RosMessages
     choice: TopicChoice
-    _open: dict[str, _Subscription] = field(default_factory=dict)
+    _open: dict[str, tuple[Any, _Kind]] = field(default_factory=dict)
     _unknown: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
         try:
             import rclpy  # noqa: F401
         except ImportError as error:
-            hint = "source the setup of ROS 2 in a Python that fits it; `objslam live dds` needs no ROS"
+            hint = "source the setup of ROS 2 with its own Python, or use `objslam live dds`, which needs no ROS"
             raise ObjslamError(f"rclpy cannot be imported ({error})", hint=hint) from error
-
-    @property
-    def ledger(self) -> Ledger:
-        """What was dropped before it could be pushed, and warnings."""
-        return self.messages.ledger
+        self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
-        """Hand messages on until stop is set."""
+        """Push messages until stop is set."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
@@ -74,7 +61,7 @@ class RclpyAdapter:
             rclpy.shutdown(context=context)
 
     def _look_around(self, node: Any, settled: bool) -> None:
-        """Subscribe to what is published and wanted, again where the publishers' QoS asks for it."""
+        """Subscribe to the wanted topics, again if the QoS of their publishers has changed."""
         offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
         for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
             type_ = offered[topic]
@@ -82,16 +69,14 @@ class RclpyAdapter:
             if not profiles or type_ in self._unknown:
                 continue
             kind = _kind(profiles, type_)
-            old = self._open.get(topic)
-            if old is not None and old.kind == kind:
-                continue
-            message = self._message(type_)
+            old, old_kind = self._open.get(topic, (None, None))
+            message = self._message(type_) if old_kind != kind else None
             if message is None:
                 continue
             if old is not None:
-                node.destroy_subscription(old.entity)
+                node.destroy_subscription(old)
             entity = node.create_subscription(message, topic, partial(self._take, type_, topic), _profile(kind, type_))
-            self._open[topic] = _Subscription(entity, kind)
+            self._open[topic] = entity, kind
 
     def _message(self, type_: str) -> Any:
         from rosidl_runtime_py.utilities import get_message
@@ -107,7 +92,7 @@ class RclpyAdapter:
         self.messages.receive(type_, topic, message, time.time())
 
 
-def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
+def _kind(profiles: list[Any], type_: str) -> _Kind:
     from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
     reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
@@ -115,7 +100,7 @@ def _kind(profiles: list[Any], type_: str) -> tuple[bool, bool]:
     return reliable, latched and type_ in LATCHED
 
 
-def _profile(kind: tuple[bool, bool], type_: str) -> Any:
+def _profile(kind: _Kind, type_: str) -> Any:
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     reliable, latched = kind

@@ -1,6 +1,4 @@
-"""A log, played again as it was driven: at its own speed, faster, or as fast as the session can take it."""
-
-from __future__ import annotations
+"""Replays a log at its own speed, at another speed, or as fast as the session accepts it."""
 
 import threading
 import time
@@ -15,15 +13,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, Log, Trajectory
 from objslam.live.interface import Sink
 
-_BEHIND = 1.0  # The most that a replay may fall behind before a user is told, s.
+_BEHIND = 1.0  # The delay of a replay, s, above which the user is warned. A larger value warns later.
 
 
 @dataclass
 class ReplayAdapter:
-    """Pushes what a log holds in the order of `events`.
+    """Pushes the content of a log in the order of `events`.
 
-    speed: 2 is twice as fast as it was driven; None as fast as possible, then `wait` is called after each frame and returns
-    once that is in the map. after: what has a smaller stamp is left out, when a session that took it before goes on.
+    speed: 2 is twice the speed of the drive, None is as fast as possible. wait: without a speed, it is called after each
+    frame, and returns once the map contains the frame. after: the stamp, s, before which a resumed session has everything.
     """
 
     sink: Sink
@@ -35,7 +33,7 @@ class ReplayAdapter:
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:
-        """Push all of it, or until stop is set."""
+        """Push the whole log, or until stop is set."""
         for camera_log in self.log.cameras:
             self.sink.push_camera(camera_log.camera)
         begin, first = time.perf_counter(), None
@@ -55,27 +53,26 @@ class ReplayAdapter:
             if self.speed is None and frame and self.wait is not None:
                 self.wait()
         if late > _BEHIND:
-            self.ledger.warn(f"the replay fell behind by up to {late:.1f} s")
+            self.ledger.warn(f"the replay was up to {late:.1f} s late: choose a smaller --speed")
 
 
 Push = Callable[[Sink], bool]
 
 
 def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
-    """The log as pushes in the order of their stamps: stamp, whether it is a frame, and the push.
+    """Yield the log's stamps, s, whether each is a frame, and its push, in the order of the stamps.
 
-    A frame comes right after the first pose that is not before it, at that pose's stamp: a recording can wait for its poses,
-    however rare they are, and no frame has to (`live.max_lag`).
+    A frame follows the first pose that is not older, at the pose's stamp, so that no frame waits for a pose (live.max_lag).
     """
     settings = settings or Settings()
-    kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []
+    kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []  # stamps, rank at the same stamp, push by index
     for path, which in ((log.localization, "push_localization"), (log.odometry, "push_odometry")):
         if path is not None:
             kinds.append((path.stamps, 0, _poses(path, which)))
     for camera_log in log.cameras:
         name, mount = camera_log.camera.name, camera_log.mount
         if mount is not None:
-            kinds.append((mount.stamps, 1, _mounts(mount, name)))
+            kinds.append((mount.stamps, 1, _poses(mount, "push_mount", name)))
         if camera_log.detections is not None:
             kinds.append((_covered(log, settings, camera_log.detections), 2, _frames(camera_log.detections, name)))
     stamps = np.concatenate([k[0] for k in kinds])
@@ -87,7 +84,7 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
 
 
 def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
-    """The stamps (F,) of the poses that the frames must wait for; their own where that is longer than a session bears."""
+    """Return the stamps (F,) of the poses that frames wait for, or their own stamps beyond live.max_late."""
     path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
     own = detections.frame_stamps
     if path is None:
@@ -96,18 +93,8 @@ def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
     return np.asarray(np.where(later - own <= settings.live.max_late, later, own))
 
 
-def _poses(path: Trajectory, which: str) -> Callable[[int], Push]:
-    def push(i: int) -> Push:
-        return lambda sink: getattr(sink, which)(float(path.stamps[i]), path.poses[i])
-
-    return push
-
-
-def _mounts(mount: Trajectory, camera: str) -> Callable[[int], Push]:
-    def push(i: int) -> Push:
-        return lambda sink: sink.push_mount(float(mount.stamps[i]), camera, mount.poses[i])
-
-    return push
+def _poses(path: Trajectory, which: str, *camera: str) -> Callable[[int], Push]:
+    return lambda i: lambda sink: getattr(sink, which)(float(path.stamps[i]), *camera, path.poses[i])
 
 
 def _frames(detections: Detections, camera: str) -> Callable[[int], Push]:
@@ -116,15 +103,8 @@ def _frames(detections: Detections, camera: str) -> Callable[[int], Push]:
     def push(i: int) -> Push:
         boxes = slice(bounds[i], bounds[i + 1])
         labels = tuple(detections.label_names[j] for j in detections.label[boxes].tolist())
-        return lambda sink: sink.push_detections(
-            float(detections.frame_stamps[i]),
-            camera,
-            detections.boxes[boxes],
-            labels,
-            detections.scores[boxes],
-            detections.depths[boxes],
-            detections.track_ids[boxes].tolist(),
-            detections.whole,
-        )
+        depths, tracks = detections.depths[boxes], detections.track_ids[boxes].tolist()
+        found = detections.boxes[boxes], labels, detections.scores[boxes], depths, tracks, detections.whole
+        return lambda sink: sink.push_detections(float(detections.frame_stamps[i]), camera, *found)
 
     return push

@@ -1,4 +1,4 @@
-"""Anything else: JSON lines on standard input, one message each.
+"""Reads JSON lines from standard input, one message per line.
 
 {"type": "camera", "name": "front", ...the keys of camera.yaml...}
 {"type": "odometry", "stamp": 12.5, "translation": [x, y, z], "rotation_xyzw": [x, y, z, w]}    odom_T_base
@@ -6,11 +6,9 @@
 {"type": "mount", "camera": "front", ...the same...}    base_T_camera from this stamp on
 {"type": "detections", "camera": "front", ...a line of detections.jsonl...}
 
-Poses may be planar, "x", "y", "yaw" in place of translation and rotation, and odometry and localization may have a
-"covariance" of 36 numbers. "camera" may be left out where there is one, which is then called "camera", as is its "name".
+A planar pose has "x", "y", "yaw" instead of translation and rotation. Odometry and localization may have a "covariance" of
+36 numbers. "camera" and "name" may be left out with a single camera, which is then called "camera".
 """
-
-from __future__ import annotations
 
 import json
 import os
@@ -31,15 +29,14 @@ from objslam.io.detections_jsonl import Malformed, add_frame, parse_object, read
 from objslam.live.interface import Sink
 
 _CAMERA = "camera"
-_TYPES = ("camera", "odometry", "localization", "mount", "detections")
-_LONGEST = 1 << 20  # bytes; a line beyond it is skipped
-_CHUNK = 1 << 16
-_WAIT = 0.1  # s: how soon a stop is seen
+_LONGEST = 1 << 20  # The longest line, bytes. Longer lines are skipped. A larger number costs memory.
+_CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
+_WAIT = 0.1  # The time until a stop is noticed, s. A larger value notices it later.
 
 
 @dataclass
 class StdinAdapter:
-    """Reads messages from a stream, line by line; lines that are no message are counted with their numbers."""
+    """Pushes the messages of a stream. Malformed lines are counted with their line numbers."""
 
     sink: Sink
     stream: BinaryIO
@@ -47,7 +44,7 @@ class StdinAdapter:
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:
-        """Hand messages on until the stream ends or stop is set."""
+        """Push messages until the stream ends or stop is set."""
         number, rest, skipping = 0, b"", False
         while not stop.is_set() and (chunk := self._read(stop)):
             *lines, rest = (rest + chunk).split(b"\n")
@@ -64,7 +61,7 @@ class StdinAdapter:
             self._take(rest, number + 1)
 
     def _read(self, stop: threading.Event) -> bytes:
-        """The next bytes, b"" at the end or when stop is set."""
+        """Return the next bytes; b"" at the end or when stop is set."""
         source = self.stream.fileno()
         while not stop.is_set():
             if select.select([source], [], [], _WAIT)[0]:
@@ -88,16 +85,15 @@ class StdinAdapter:
             keys = {key: value for key, value in message.items() if key not in ("type", "name")}
             text = json.dumps(keys).encode()
             self.sink.push_camera(parse_camera(text, place, self.ledger, _name(message, "name")))
-        elif kind == "odometry":
-            self.sink.push_odometry(read_stamp(message), _pose(message), _covariance(message))
-        elif kind == "localization":
-            self.sink.push_localization(read_stamp(message), _pose(message), _covariance(message))
+        elif kind in ("odometry", "localization"):
+            push = self.sink.push_odometry if kind == "odometry" else self.sink.push_localization
+            push(read_stamp(message), _pose(message), _covariance(message))
         elif kind == "mount":
             self.sink.push_mount(read_stamp(message), _name(message, _CAMERA), _pose(message))
         elif kind == "detections":
             self._push_detections(message, place)
         else:
-            raise Malformed(f"type is none of {', '.join(_TYPES)}")
+            raise Malformed("type is none of camera, odometry, localization, mount, detections")
 
     def _push_detections(self, message: dict[str, Any], place: str) -> None:
         collector = BoxCollector()
@@ -119,11 +115,11 @@ def _pose(message: dict[str, Any]) -> Floats:
     if "yaw" in message:
         return lift_se2(np.array(_finite([message.get(key) for key in ("x", "y", "yaw")], "x, y, yaw", 3)))
     if "translation" not in message:
-        raise Malformed("no pose: x, y and yaw, or translation and rotation_xyzw")
+        raise Malformed("no pose (x, y and yaw, or translation and rotation_xyzw)")
     place = _finite(message.get("translation"), "translation", 3)
     xyzw = _finite(message.get("rotation_xyzw"), "rotation_xyzw", 4)
     if not abs(float(np.linalg.norm(xyzw)) - 1) < 0.01:
-        raise Malformed("rotation_xyzw has not the length 1")
+        raise Malformed("rotation_xyzw is not of length 1")
     return pose_from_quaternion(np.array([place]), np.array([xyzw]))[0]
 
 

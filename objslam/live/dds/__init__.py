@@ -1,4 +1,1 @@
-"""DDS, the transport of ROS 2: the network, the types on it, and the map published there.
-
-The adapter that feeds a session from it is `live.adapters.dds`.
-"""
+"""DDS is the transport of ROS 2: network, message types, publication of the map. Its adapter is `live.adapters.dds`."""

@@ -1,6 +1,4 @@
-"""The way into a DDS domain: which network it may use, and what the library says of what it could not read."""
-
-from __future__ import annotations
+"""Joins DDS domains on a chosen network, and counts the payloads that the DDS library rejects."""
 
 import ipaddress
 import os
@@ -16,18 +14,18 @@ from objslam.errors import ConfigError, ObjslamError
 
 LOOPBACK, AUTO = "loopback", "auto"
 _URI, _DOMAIN_ID = "CYCLONEDDS_URI", "ROS_DOMAIN_ID"
-_MAX_DOMAIN = 232  # The largest domain that DDS has ports for.
-_BUFFER = "4MB"  # The socket buffer that is asked for; chosen for a raw image, which comes as a burst of fragments.
+_MAX_DOMAIN = 232  # The largest number of a DDS domain: larger domains have no ports.
+_BUFFER = "4MB"  # The requested socket buffer. It holds a raw image, which arrives as a burst of fragments.
 _FAILED = re.compile(r"deserialization (\S+) failed")
 _MALFORMED = re.compile(r"malformed packet")
-_DEVICE = b"lo\0"  # The loopback device.
 
 
 @dataclass
 class Network:
-    """One domain of this process: the participant, what network it is on, in words, and what could not be read.
+    """A domain that this process has joined.
 
-    unread: by DDS topic ("" for what is no DDS at all), how many payloads the library threw away.
+    where: its network, in words. entities: DDS entities that must live as long as the participant. unread: the number of
+    payloads that the library rejected, by DDS topic, "" for packets that are not DDS.
     """
 
     domain: int
@@ -41,11 +39,11 @@ _OPEN: dict[int, tuple[str | None, Network]] = {}
 
 
 def open_network(domain: int | None = None, interface: str | None = None) -> Network:
-    """Join a DDS domain; a process joins each once, and gets the same again.
+    """Join a DDS domain, or return the network of a domain that the process has already joined.
 
-    domain: None for that of ROS_DOMAIN_ID, else 0. interface: None for what CYCLONEDDS_URI says, else the loopback
-    interface alone; "auto", a name or an address opens the network. ObjslamError where cyclonedds is not installed or the
-    domain cannot be joined; ConfigError for a domain or an interface that cannot be.
+    domain: None for ROS_DOMAIN_ID, else 0. interface: a name, an address, "auto" for any network, None for CYCLONEDDS_URI,
+    else loopback. ObjslamError when cyclonedds is not installed or the domain cannot be joined. ConfigError when the domain
+    or the interface is invalid, or the domain is already open on another interface.
     """
     try:
         import cyclonedds  # noqa: F401
@@ -57,16 +55,15 @@ def open_network(domain: int | None = None, interface: str | None = None) -> Net
         if asked != interface:
             raise ConfigError(f"DDS domain {domain} is open on {network.where} already")
         return network
-    network = _join(domain, interface)
-    _OPEN[domain] = interface, network
-    return network
+    _OPEN[domain] = interface, _join(domain, interface)
+    return _OPEN[domain][1]
 
 
 def _domain(given: int | None) -> int:
     text = os.environ.get(_DOMAIN_ID, "0") if given is None else str(given)
     if not (text.isascii() and text.isdigit() and int(text) <= _MAX_DOMAIN):
         where = _DOMAIN_ID if given is None else "--domain"
-        raise ConfigError(f"{text[:20]!r} is no DDS domain", where=where, hint=f"0 to {_MAX_DOMAIN}")
+        raise ConfigError(f"{text[:20]!r} is no DDS domain", where=where, hint=f"give a number from 0 to {_MAX_DOMAIN}")
     return int(text)
 
 
@@ -87,7 +84,7 @@ def _join(domain: int, interface: str | None) -> Network:
         participant = DomainParticipant(domain)
     except DDSException as error:
         os.close(reading)
-        hint = f"{_URI} is set" if where == _URI else "--interface names the network interface, `ip address` lists them"
+        hint = f"check {_URI}" if where == _URI else "choose --interface from the list of `ip address`"
         raise ObjslamError(f"DDS domain {domain} cannot be joined on {where}", hint=hint) from error
     finally:
         os.close(writing)
@@ -97,11 +94,11 @@ def _join(domain: int, interface: str | None) -> Network:
 
 
 def _settings(interface: str | None) -> tuple[str, str]:
-    """Where the domain is, in words, and the library's settings for it."""
+    """Return the network in words, and the library's settings for it."""
     if interface is None and os.environ.get(_URI):
         return _URI, os.environ[_URI]
     if interface in (None, LOOPBACK):
-        # without multicast, which a loopback interface need not have, others are found at the ports of their index
+        # a loopback interface may lack multicast, so participants are found at the ports of their index
         peers = '<Peers><Peer address="127.0.0.1"/></Peers>'
         index = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
         chosen = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces><AllowMulticast>false</AllowMulticast>'
@@ -109,60 +106,55 @@ def _settings(interface: str | None) -> tuple[str, str]:
     assert interface is not None
     if interface == AUTO:
         return "the network", ""
-    return (
-        f"the interface {interface}",
-        f"<General><Interfaces><NetworkInterface {_named(interface)}/></Interfaces></General>",
-    )
-
-
-def _named(interface: str) -> str:
     try:
-        return f'address="{ipaddress.ip_address(interface)}"'
+        named = f'address="{ipaddress.ip_address(interface)}"'
     except ValueError:
         if not re.fullmatch(r"[A-Za-z0-9_.:@-]{1,32}", interface):
-            raise ConfigError(f"{interface[:40]!r} is no network interface", where="--interface") from None
-        return f'name="{interface}"'
+            hint = "choose from the list of `ip address`"
+            raise ConfigError(f"{interface[:40]!r} is no network interface", where="--interface", hint=hint) from None
+        named = f'name="{interface}"'
+    return f"the interface {interface}", f"<General><Interfaces><NetworkInterface {named}/></Interfaces></General>"
 
 
 def _sockets() -> set[int]:
-    """The file descriptors of this process that are sockets; none where the system does not list them."""
+    """Return this process's file descriptors that are sockets; none if the system does not list them."""
     found = set()
     folder = Path("/proc/self/fd")
     for entry in folder.iterdir() if folder.is_dir() else ():
         try:
             if str(entry.readlink()).startswith("socket:"):
                 found.add(int(entry.name))
-        except OSError:  # the one that listed the folder is closed by now
+        except OSError:  # the descriptor that listed the folder is already closed
             continue
     return found
 
 
 def _keep_inside(sockets: set[int]) -> None:
-    """Bind sockets to the loopback device: the library listens on every address whatever interface it is given."""
+    """Bind sockets to the loopback device, because the library listens on every address of any interface."""
     for number in sockets:
         with socket.socket(fileno=os.dup(number)) as own:
             if own.type == socket.SOCK_DGRAM:
                 try:
-                    own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _DEVICE)
-                except OSError as error:  # a kernel before 5.7, without the right to
+                    own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+                except OSError as error:  # kernels before 5.7 need a privilege
                     raise ObjslamError(
-                        f"the DDS sockets cannot be kept to the loopback interface ({error.strerror})",
-                        hint=f"--interface {AUTO} opens them to the network",
+                        f"the DDS sockets cannot be bound to the loopback interface ({error.strerror})",
+                        hint=f"open them to the network with --interface {AUTO}",
                     ) from error
 
 
 def _listen(reading: int, unread: Counter[str]) -> None:
-    """Count what the library throws away: it checks payloads against their type before anyone sees them."""
+    """Count the payloads that the library rejects, because it checks them against their type before delivery."""
     with os.fdopen(reading, errors="replace") as lines:
         for line in lines:
             if match := _FAILED.search(line):
-                unread[match[1].rpartition("/")[0]] += 1  # topic/type
+                unread[match[1].rpartition("/")[0]] += 1  # without the type behind the topic
             elif _MALFORMED.search(line):
                 unread[""] += 1
 
 
 def receive_buffer() -> int | None:
-    """The largest socket buffer that the system grants, bytes; None where it does not say."""
+    """Return the largest socket buffer that the system allows, bytes; None if unknown."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):

@@ -1,6 +1,4 @@
-"""A session's map out again over DDS, for RViz and Nav2: objects, markers and the corrected path."""
-
-from __future__ import annotations
+"""Publishes a session's map over DDS for RViz and Nav2: objects, markers and the corrected path."""
 
 import math
 from typing import Any
@@ -17,15 +15,14 @@ TOPICS = {
     "markers": "visualization_msgs/msg/MarkerArray",
     "path": "nav_msgs/msg/Path",
 }
-"""What is published below the prefix, and its type."""
-
-_MAX_PATH = 500  # The most poses of a path that is sent; chosen so that showing one of hours takes no time from mapping.
+"""The ROS types of the published messages, by their topic below the prefix."""
+_MAX_PATH = 500  # The most poses of a published path. It keeps a path of hours from delaying the mapping.
 
 
 class DdsPublisher:
-    """Publishes snapshots below a prefix; each keeps its last message for those who come later (transient-local).
+    """Publishes snapshots below a prefix, transient-local: a later subscriber receives the last message.
 
-    Objects without a position to rely on are left out. `publish` is to be called from one thread.
+    Unresolved objects are left out. Call `publish` from one thread.
     """
 
     def __init__(self, network: Network, prefix: str = "/objslam") -> None:
@@ -33,7 +30,7 @@ class DdsPublisher:
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
 
-        # a subscriber that stands still must not hold up the session: no waiting for it, and the last message alone counts
+        # a stuck subscriber must not delay the session, so a write never waits and only the last message is kept
         qos = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
         self.topics = {name: f"{prefix.rstrip('/')}/{name}" for name in TOPICS}
         self._writers: dict[str, Any] = {}
@@ -42,7 +39,7 @@ class DdsPublisher:
             self._writers[name] = DataWriter(network.participant, topic, qos=qos)
 
     def publish(self, snapshot: Snapshot) -> None:
-        """Send a snapshot's objects, markers and path."""
+        """Publish a snapshot's objects, markers and path."""
         maker = MapMessages(snapshot.map.frame)
         for name, message in messages_of(snapshot, maker).items():
             data = bytes(maker.store.serialize_cdr(message, TOPICS[name]))
@@ -50,7 +47,7 @@ class DdsPublisher:
 
 
 def messages_of(snapshot: Snapshot, maker: MapMessages) -> dict[str, Any]:
-    """The messages of a snapshot, by the names in TOPICS; the path thinned out to a bounded length, its newest pose kept."""
+    """Return the messages of a snapshot by the names in TOPICS. The path is thinned to _MAX_PATH poses."""
     stamp = snapshot.stamp if math.isfinite(snapshot.stamp) else 0.0
     stamps, poses = snapshot.path.stamps, snapshot.path.poses
     step = max(1, math.ceil(len(stamps) / _MAX_PATH))

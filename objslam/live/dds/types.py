@@ -1,4 +1,4 @@
-"""ROS 2 message types as DDS knows them. Payloads pass as bytes: rosbags' CDR reads and writes them, as for logs."""
+"""DDS types of ROS 2 messages. Their payloads stay bytes, which rosbags' CDR reads and writes."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ _PREFIX, _PARTS = "rt/", ("::msg::dds_::", "_")
 
 
 def dds_topic(topic: str) -> str:
-    """The name that a ROS topic has in DDS: /odom is rt/odom."""
+    """Return the DDS name of a ROS topic: /odom becomes rt/odom."""
     return _PREFIX + topic.lstrip("/")
 
 
 def ros_topic(name: str) -> str | None:
-    """The ROS topic of a DDS topic's name, None where it is none (services, say)."""
+    """Return the ROS topic of a DDS topic's name; None for anything else, such as a service."""
     return "/" + name.removeprefix(_PREFIX) if name.startswith(_PREFIX) else None
 
 
 def dds_type(type_: str) -> str:
-    """The name that a ROS type has in DDS: nav_msgs/msg/Odometry is nav_msgs::msg::dds_::Odometry_."""
+    """Return the DDS name of a ROS type: nav_msgs/msg/Odometry becomes nav_msgs::msg::dds_::Odometry_."""
     package, _, name = type_.partition("/msg/")
     return f"{package}{_PARTS[0]}{name}{_PARTS[1]}"
 
 
 def ros_type(name: str) -> str | None:
-    """The ROS type of a DDS type's name, None where it is none."""
+    """Return the ROS type of a DDS type's name; None for anything else."""
     package, middle, rest = name.partition(_PARTS[0])
     return type_name(f"{package}/msg/{rest.removesuffix(_PARTS[1])}") if middle and rest.endswith(_PARTS[1]) else None
 
 
 @lru_cache(maxsize=256)
 def layouts_of(type_: str) -> tuple[type, ...]:
-    """The DDS types of a ROS type, one for each layout that is known; () where none is.
+    """Return the DDS types of a ROS type, one per known layout.
 
-    Their instances hold a serialised message, `data`, and on the way in what DDS says of it, `sample_info`.
+    An instance holds a serialised message in `data`. A received instance also has the `sample_info` of DDS.
     """
     try:
         stores = typestores(type_, "cdr", "", "msg")
@@ -51,10 +51,9 @@ def layouts_of(type_: str) -> tuple[type, ...]:
 
 
 def _make_type(store: Typestore, type_: str) -> type:
-    made: dict[str, type] = {}
-    plain = _make_struct(store, type_, made)
+    """Make a DDS type that declares its fields but passes bytes: cyclonedds would process each field in Python."""
+    made = _make_struct(store, type_, {})
 
-    # cyclonedds would take messages apart field by field in Python; the type itself still says to other nodes what it is
     def serialize(self: Any, *args: Any, **kwargs: Any) -> bytes:
         return bytes(self.data)
 
@@ -66,11 +65,10 @@ def _make_type(store: Typestore, type_: str) -> type:
     def init(self: Any, data: bytes) -> None:
         self.data = data
 
-    methods: dict[str, Any] = {"serialize": serialize, "__init__": init}
-    methods |= {name: classmethod(deserialize) for name in ("deserialize", "deserialize_key")}
-    for name, method in methods.items():
-        setattr(plain, name, method)
-    return plain
+    incoming = dict.fromkeys(("deserialize", "deserialize_key"), classmethod(deserialize))
+    for name, method in {"serialize": serialize, "__init__": init, **incoming}.items():
+        setattr(made, name, method)
+    return made
 
 
 def _make_struct(store: Typestore, type_: str, made: dict[str, type]) -> type:
@@ -86,7 +84,7 @@ def _make_field(store: Typestore, description: Any, made: dict[str, type]) -> An
     from cyclonedds import idl
     from rosbags.interfaces import Nodetype
 
-    types: Any = idl.types  # its generics are made at run time
+    types: Any = idl.types  # untyped, because its generics are made at run time
     kind, detail = description
     if kind == Nodetype.NAME:
         return _make_struct(store, detail, made)

@@ -1,4 +1,4 @@
-"""The map of a session, frame by frame, in one thread: keyframes, association, landmarks, the incremental graph.
+"""The map of a live session: keyframes, association, landmarks and the incremental graph, in one thread.
 
-Threads, queues and clocks are in `live.session`; what a frame is matched with offline as well is in `association`.
+Threads, queues and clocks are in `live.session`, and the association that offline runs share is in `association`.
 """

@@ -1,6 +1,4 @@
-"""From frames to bearings: cameras and their mounts as they come, and the numbers of labels."""
-
-from __future__ import annotations
+"""The bearings of a frame, with the calibrations and mounts of the cameras and the numbers of labels."""
 
 from dataclasses import dataclass
 
@@ -14,13 +12,12 @@ from objslam.frontend.bearings import box_rays, surest
 from objslam.live.mapper.frame_association import FrameRays
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096
-"""Mounts of one camera that are kept; more let a frame be later on a camera that is moved often, and cost memory."""
+_MOUNTS = 4096  # The mounts kept per camera. More mounts allow later frames of a camera on an arm, and cost memory.
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame as the map takes it: the number of its camera, base_T_camera (4, 4), and the bearings of its usable boxes."""
+    """A frame with the number of its camera, base_T_camera (4, 4), and the bearings of its usable boxes."""
 
     camera: int
     base_T_camera: Floats
@@ -28,9 +25,9 @@ class FrameView:
 
 
 class BearingExtractor:
-    """Numbers cameras and labels in the order in which they come, and makes bearings of boxes.
+    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings.
 
-    cameras, labels: the map's own lists, which grow here.
+    cameras, labels: the lists of the map, to which new cameras and labels are appended.
     """
 
     def __init__(self, settings: Settings, ledger: Ledger, cameras: list[Camera], labels: list[str]) -> None:
@@ -41,22 +38,18 @@ class BearingExtractor:
         self._mounts: dict[str, HeldMounts] = {}
 
     def add_camera(self, camera: Camera) -> None:
-        """A camera, or another calibration of one."""
-        if camera.name in self._camera_number:
-            self._cameras[self._camera_number[camera.name]] = camera
-        else:
-            self._camera_number[camera.name] = len(self._cameras)
-            self._cameras.append(camera)
+        """Add a camera, or replace its calibration."""
+        number = self._camera_number.setdefault(camera.name, len(self._cameras))
+        self._cameras[number : number + 1] = [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Where a camera is from now on."""
+        """Add a pose of a camera on the robot."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage) -> FrameView:
-        """The bearings of a frame, from its camera as it was mounted by then; dropped boxes are counted."""
+        """Return the bearings of a frame, with the mount of its camera at its stamp. Dropped boxes are counted."""
         number, settings = self._camera_number[frame.camera], self._settings
-        camera = self._cameras[number]
-        held = self._mounts.get(frame.camera)
+        camera, held = self._cameras[number], self._mounts.get(frame.camera)
         base_T_camera = camera.base_T_camera if held is None else held.at(frame.stamp, camera)
         kept, direction, sigma = box_rays(frame.boxes, frame.scores, camera, settings, self._ledger, frame.whole)
         for name in sorted(set(frame.labels) - self._label_number.keys()):

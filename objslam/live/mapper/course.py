@@ -1,10 +1,7 @@
-"""The robot's course through a session: odometry places a frame where there is some, else localisation does.
+"""The course of the robot, joined from odometry and localisation in the frame of the first pose.
 
-Both are put into one frame, in which the drift is summed up: that of the first pose. Where the one takes over from the
-other, or the odometry comes back after a gap, the localisation tells how the new piece lies to the old one.
+Localisation replaces missing odometry. It also relates two pieces of the course at a change of source or after a gap.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -17,17 +14,15 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0
-"""s besides live.max_late that the paths are kept for, since a frame also waits its turn; longer costs memory."""
-_LOCALIZED = -1
-"""The stretch of what the localisation places: its poses are in one frame throughout."""
+_KEPT = 3.0  # s, kept of each path besides live.max_late, because frames wait in a queue. A longer time costs memory.
+_LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one frame.
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Where a frame was taken: map_T_base (4, 4) as its path gives it, start_T_base (4, 4) and drift (6, 6) on the course.
+    """The pose of a frame: map_T_base (4, 4) by its path, and start_T_base (4, 4) and drift (6, 6) on the course.
 
-    piece: the number of its piece of the course; between two frames of one piece the path tells the motion.
+    piece: the number of the piece of the course. The path measures the motion between two frames of one piece.
     """
 
     by_odometry: bool
@@ -39,7 +34,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """A stretch of a path on the course: how its frame lies there, and the drift (6, 6) to add to the path's own."""
+    """One stretch of a path on the course. drift: (6, 6), added to the drift of the path."""
 
     stretch: int
     start_T_path: Floats
@@ -47,7 +42,7 @@ class _Piece:
 
 
 class Course:
-    """Both paths as they come, and where they have the robot."""
+    """The paths of odometry and localisation, and the poses of frames on them."""
 
     def __init__(self, settings: Settings) -> None:
         seconds, self._max_gap = settings.live.max_late + _KEPT, settings.poses.max_gap
@@ -60,15 +55,15 @@ class Course:
         self._newest = -np.inf
 
     def add_odometry(self, stamp: float, pose: Floats) -> None:
-        """One more pose (4, 4) of the odometry."""
+        """Append a pose (4, 4) of the odometry."""
         self.odometry.append(stamp, pose)
         self._localized_by_then = self.localization.newest
 
     def ready(self, stamp: float) -> bool:
-        """Whether it is decided what places a frame, or that nothing does.
+        """Return whether later messages cannot change the result of `place` for a frame.
 
-        While the odometry is silent, which is once the localisation has gone on for poses.max_gap without it, the
-        localisation does. Where the odometry begins a piece, the localisation is waited for until it has come so far.
+        The odometry counts as silent after poses.max_gap of localisation without odometry. Then localisation gives the pose.
+        A frame on a new piece of the odometry waits until the localisation reaches the start of the piece.
         """
         odometry, localization = self.odometry, self.localization
         if odometry.newest < stamp:
@@ -81,9 +76,9 @@ class Course:
         return stretch is not None and (goes_on or localization.newest >= odometry.stretch_begin)
 
     def place(self, stamp: float, keyframes: KeyframeTable, before: int | None) -> Placed | None:
-        """Where a frame was taken; None off both paths, or where it is late and on no piece of the course so far.
+        """Return the pose of a frame. None off both paths, and for a late frame on no known piece of the course.
 
-        before: the row of the keyframe before it.
+        before: the row of the keyframe before the frame.
         """
         on, path = self.odometry.at(stamp), self.odometry
         if on is None:
@@ -95,7 +90,6 @@ class Course:
         near = [] if before is None else [int(keyframes.piece[before])]
         near += [] if self._last is None else [self._last.piece]
         number = next((n for n in near if self._pieces[n].stretch == stretch), len(self._pieces))
-        pose = path.from_start(on.pose)
         if number == len(self._pieces):
             if stamp < self._newest:
                 return None
@@ -103,32 +97,29 @@ class Course:
         piece = self._pieces[number]
         to_start = adjoint(piece.start_T_path)
         drift = piece.drift + to_start @ on.drift @ to_start.T
-        placed = Placed(by_odometry, number, on.pose, piece.start_T_path @ pose, drift)
+        placed = Placed(by_odometry, number, on.pose, piece.start_T_path @ path.from_start(on.pose), drift)
         if stamp >= self._newest:
             self._last, self._newest = placed, stamp
         return placed
 
     def _begin(self, stretch: int, path: PathBuffer, stamp: float, keyframes: KeyframeTable) -> _Piece:
-        """A new piece, whose first frame is at a stamp.
-
-        How it lies is read off at the newest stamp by then that the localisation covers as well.
-        """
+        """Make a new piece that starts at a stamp, placed by the newest pose of the localisation up to this stamp."""
         last = self._last
         if last is None:
             return _Piece(stretch, np.eye(4), np.zeros((6, 6)))
         old, goes_on = self._pieces[last.piece], path is self.odometry and last.by_odometry
         localized = np.flatnonzero(keyframes.localized & (keyframes.stamp <= stamp))
-        if goes_on and not len(localized):  # nothing else tells how the robot moved in a gap of the odometry
+        if goes_on and not len(localized):  # Without localisation the odometry counts across its gaps.
             return _Piece(stretch, old.start_T_path, old.drift)
         both = min(stamp, self.localization.newest)
         on, there = path.at(both), self.localization.at(both)
         if len(localized) and on is not None and there is not None and (path is self.localization or on.stretch == stretch):
             row = localized[keyframes.stamp[localized].argmax()]
             start_T_base = keyframes.start_T_base[row] @ inverse(keyframes.map_T_base[row]) @ there.pose
-            drift = 2 * last.drift - keyframes.drift[row]  # what was gathered since then tells nothing about the new piece
+            drift = 2 * last.drift - keyframes.drift[row]  # The new piece is independent of the drift since this keyframe.
             return self._lay(stretch, start_T_base, drift, path.from_start(on.pose), on.drift, self._noise)
         on = path.at(stamp)
-        assert on is not None  # for a frame was placed by it
+        assert on is not None
         pose = path.from_start(on.pose)
         start_T_base = old.start_T_path @ pose if goes_on else last.start_T_base
         return self._lay(stretch, start_T_base, last.drift, pose, on.drift, (UNKNOWN_TURN, UNKNOWN_WAY))
@@ -136,10 +127,7 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """The piece on which a pose (4, 4) of its path, with a drift (6, 6) of its own, is start_T_base on the course.
-
-        drift: (6, 6) by then on the course. noise: rad, m; how little it is known that the pose is there.
-        """
+        """Make the piece that takes a pose with drift `own` on its path to start_T_base with `drift` on the course."""
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)
         turn, way = noise

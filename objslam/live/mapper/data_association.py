@@ -1,6 +1,4 @@
-"""A new keyframe's rays to landmarks and tracks, and those that are of landmarks into the graph."""
-
-from __future__ import annotations
+"""The association of a new keyframe's rays with landmarks and tracks, and the ray factors in the graph."""
 
 import numpy as np
 
@@ -13,36 +11,27 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_NOVELTY_WEIGHT = 0.02
-"""Weight of a frame in the share of boxes that showed nothing known; larger follows a new room sooner, and varies more."""
+_NOVELTY_WEIGHT = 0.02  # The weight of a frame in MapState.novelty. A larger weight is noisier and adapts sooner.
 
 
 def associate(
-    m: MapState,
-    rays: FrameRays,
-    map_T_camera: Floats,
-    uncertainty: PoseUncertainty,
-    predicted: PredictedLandmarks | None,
+    m: MapState, rays: FrameRays, map_T_camera: Floats, uncertainty: PoseUncertainty, predicted: PredictedLandmarks | None
 ) -> LandmarkUpdate:
-    """Give every ray of the newest keyframe its landmark or track, and the graph what it can use of them.
+    """Assign every ray of the newest keyframe to a landmark or a track, and add the rays of landmarks to the graph.
 
-    Args:
-        m: the map, with the keyframe.
-        rays: (n,) of the keyframe.
-        map_T_camera: (4, 4) pose that is predicted for its camera, and how well by `uncertainty`.
-        predicted: `predict_landmarks` of the map as it is, None where that is still to be made.
+    map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of `predict_landmarks`, or None
+    to compute it here.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
     if m.by_label and settings.method == "auto" and len(set(rays.label.tolist())) < count:
-        m.tell_apart_within_labels()  # two boxes of one label
+        m.tell_apart_within_labels()
     numbers = m.next_id.ray + np.arange(count)
     m.next_id.ray += count
-    owner, used = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=bool)
-    waiting: dict[int, Track] = {}  # by label
-    tracks: dict[int, Track] = {}  # by ray
+    row, owner, used = np.full(count, -1), np.full(count, -1), np.zeros(count, dtype=bool)
+    waiting: dict[int, Track] = {}  # The tracks of the mode by_label, by label.
+    tracks: dict[int, Track] = {}  # The tracks of the frame, by the index of the ray.
     if m.by_label:
         best = best_of_label(rays)
-        row = np.full(count, -1, dtype=np.int64)
         row[best], missed = match_by_label(rays.take(best), map_T_camera, landmarks, uncertainty, settings.gate)
         lost = missed >= 0
         landmarks.rejected[missed[lost]] += 1

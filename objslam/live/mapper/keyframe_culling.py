@@ -1,6 +1,4 @@
-"""Bounded growth: of many keyframes, the older ones are left out where they are densest, and the odometry is summed up."""
-
-from __future__ import annotations
+"""The culling of old keyframes, which bounds the size of the map."""
 
 import numpy as np
 
@@ -8,36 +6,28 @@ from objslam.core.arrays import Bools, Ints
 from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
-_NEWEST = 1 / 3
-"""Share of live.max_keyframes, the newest, that stay in any case; larger leaves more of the older ones out."""
-_OLDEST = 1 / 30
-"""The same of the oldest, whose rays alone tell how the map lies to where the robot began."""
-_SHARE = 0.25
-"""Share of live.max_keyframes that is left out at a time; larger is done less often, and takes longer."""
-_AGAIN = 0.1
-"""Share of live.max_keyframes that must come until the next time, however many there are; smaller delays other duties."""
-_ENOUGH = 10
-"""Rays that a landmark keeps; larger keeps more keyframes, and landmarks more certain."""
-_LEAST = 3
-"""Rays that a landmark keeps where too many keyframes would stay with more; three are what a place takes."""
-_CROWDED = 1.2
-"""Times live.max_keyframes that may stay until landmarks keep the least; larger uses more memory."""
+_NEWEST = 1 / 3  # The share of live.max_keyframes that is newest and stays. A larger share removes more old keyframes.
+_OLDEST = 1 / 30  # The share of live.max_keyframes that is oldest and stays, since it relates the map to the start.
+_SHARE = 0.25  # The share of live.max_keyframes that one culling removes. A larger share is rarer and takes longer.
+_AGAIN = 0.1  # The share of live.max_keyframes that must be new before the next culling. A larger share makes it rarer.
+_ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
+_LEAST = 3  # The rays that every landmark keeps if _ENOUGH keeps too many keyframes. Three rays fix a position.
+_CROWDED = 1.2  # The factor on live.max_keyframes above which landmarks keep _LEAST rays. A larger factor costs memory.
 
 
 def cull_keyframes(m: MapState) -> None:
-    """Remove older keyframes, where they are densest, when there are more than live.max_keyframes.
+    """Remove old keyframes from their densest places, if the map has more than live.max_keyframes.
 
-    One call never removes two neighbours. After a removal, some new keyframes must come before the next one. The odometry
-    between the keyframes that stay is summed up.
+    One call never removes two neighbours. Some new keyframes must come before the next removal. The odometry is summed up.
     """
     k, most = m.keyframes, m.settings.live.max_keyframes
     if len(k) <= most or m.next_id.keyframe < m.schedule.culled + _AGAIN * most:
         return
     m.schedule.culled = m.next_id.keyframe
-    order = np.argsort(k.stamp, kind="stable")
-    out = _dispensable(m, order, len(k) - int((1 - _SHARE) * most), _ENOUGH)
-    if len(k) - out.sum() > _CROWDED * most:  # very many landmarks of few rays each
-        out = _dispensable(m, order, len(k) - int((1 - _SHARE) * most), _LEAST)
+    order, wanted = m.time_order(), len(k) - int((1 - _SHARE) * most)
+    out = _dispensable(m, order, wanted, _ENOUGH)
+    if len(k) - out.sum() > _CROWDED * most:
+        out = _dispensable(m, order, wanted, _LEAST)
     leaving = k.id[order[out]]
     lost: Bools = np.isin(m.rays.keyframe, leaving)
     m.graph.drop_rays(m.rays.number[lost])
@@ -51,15 +41,13 @@ def cull_keyframes(m: MapState) -> None:
     m.tracks = [track for track in m.tracks if track.rays]
     chain_keyframes(m)
     m.counters.accept("keyframes left out", len(leaving))
-    m.graph.rebuild_in_slices(m.in_order())
-    m.read_positions()
+    m.rebuild_in_slices()
 
 
 def _dispensable(m: MapState, order: Ints, wanted: int, fewest: int) -> Bools:
-    """Which keyframes, in order (K,), can go: at most `wanted`, and no landmark is left with fewer rays than `fewest`."""
+    """Return which keyframes in time order (K,) to remove: at most `wanted`, and every landmark keeps `fewest` rays."""
     k, rays, most = m.keyframes, m.rays, m.settings.live.max_keyframes
-    place = k.start_T_base[order][:, :3, 3]
-    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    step = np.linalg.norm(np.diff(k.start_T_base[order][:, :3, 3], axis=0), axis=1)
     span = np.full(len(order), np.inf)
     span[1:-1] = step[:-1] + step[1:]
     span[: int(_OLDEST * most)] = span[len(span) - int(_NEWEST * most) :] = np.inf

@@ -1,6 +1,4 @@
-"""Which frames become keyframes."""
-
-from __future__ import annotations
+"""The selection of keyframes by motion and by new labels."""
 
 import math
 
@@ -9,12 +7,11 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10
-"""Keyframes from one place; more average the detector's noise, and cost time while the robot stands."""
+_STANDING = 10  # The keyframes from one place. More keyframes average the detector's noise, but cost time.
 
 
 class KeyframeSelector:
-    """A keyframe wherever a camera has moved or turned by as much as is set, and a few from where it stands."""
+    """Selects a keyframe after each set distance or angle of a camera, and a few keyframes from one place."""
 
     def __init__(self, settings: Live) -> None:
         self._settings = settings
@@ -23,19 +20,19 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Whether keyframes from the same place show as much as a frame with these labels, taken at (4, 4) on the course."""
+        """Return whether enough keyframes from the place (4, 4) of a frame have its labels."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
     def accept(self, camera: int, start_T_camera: Floats, shown: set[int]) -> None:
-        """A frame became a keyframe."""
+        """Register a frame that became a keyframe."""
         self.pass_over(camera, start_T_camera)
         self._last[camera] = start_T_camera
         self._shown |= shown
         self._standing += 1
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """A frame is not redundant, but no keyframe either: another place begins where its camera has moved."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, a new place begins."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

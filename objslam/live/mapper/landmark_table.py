@@ -1,6 +1,4 @@
-"""The landmarks of a session: where they are, how well that is known, and how often they were seen where they should be."""
-
-from __future__ import annotations
+"""The table of landmarks, with their covariances, their noise, and the landmarks that a camera should see."""
 
 import math
 from collections.abc import Sequence
@@ -15,26 +13,20 @@ from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_PROMISE
 from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
-_FLOOR = 0.01
-"""Standard deviation, m, added to what the rays of a landmark tell; larger keeps old landmarks from being too sure."""
-_HELD = 1e-4
-"""Information, m^-2, that holds a landmark along rays that all run one way; larger is more than rays themselves tell."""
-_INNER = 0.05
-"""Share of the image along its edge where a box may be cut off; larger asks fewer landmarks to be seen."""
-_NEAREST = 0.3
-"""m; what is nearer to the camera does not fit into the image and need not be seen."""
-_FURTHER = 1.1
-"""Times the greatest distance from which a landmark was seen, it should be seen from; larger makes more misses count."""
-_NO_ID = -2
-"""The id of a track among the predicted landmarks: it is no landmark's, nor that of none, which is -1."""
+_FLOOR = 0.01  # The standard deviation (m) added to each landmark. A larger value keeps old landmarks less certain.
+_HELD = 1e-4  # The information (m^-2) added to each landmark, for parallel rays. A larger value makes landmarks too certain.
+_INNER = 0.05  # The share of the image along its edge where a box may be cut off. A larger share expects fewer landmarks.
+_NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
+_FURTHER = 1.1  # The factor on the largest observed distance up to which a landmark is expected. More counts more misses.
+_NO_ID = -2  # The id of a track among the predicted landmarks. It differs from all ids, and from -1 for no landmark.
 
 
 class LandmarkTable(GrowingTable):
-    """The landmarks, in the order of their ids.
+    """The landmarks in the order of their ids.
 
-    position: m, in map. information: m^-2, of its rays. drift: the odometry's, gathered when it was last seen. first, last:
-    stamps at which it was seen. seen, expected: frames that showed it, and that should have. far: m, the greatest distance
-    from which it was seen. squared: the sum of squared deviations of its rays. rejected: rays that did not fit.
+    position: m, in map. information: m^-2, from the rays. drift: at the last observation. first, last: stamps of the first
+    and the last observation. seen, expected: numbers of frames that showed the landmark and that should have. far: m, the
+    largest observed distance. squared: sum of the squared deviations of its rays. rejected: number of rays outside the gate.
     """
 
     id: Ints = column(np.int64)
@@ -52,26 +44,23 @@ class LandmarkTable(GrowingTable):
 
 
 def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """By what factor (n,) the rays of landmarks are noisier than promised."""
+    """Return the factor (n,) on the nominal noise of the rays of each landmark."""
     seen = landmarks.seen[rows] + POOLED_WITH_PROMISE
-    least, most = NOISE_FACTORS
-    return np.asarray(
-        np.minimum(np.maximum(np.sqrt((landmarks.squared[rows] / 2 + POOLED_WITH_PROMISE) / seen), least), most)
-    )
+    return np.sqrt((landmarks.squared[rows] / 2 + POOLED_WITH_PROMISE) / seen).clip(*NOISE_FACTORS)
 
 
 def covariances(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Covariances (n, 3, 3), m^2, of landmarks from their rays, as if the poses were known."""
+    """Return the covariances (n, 3, 3), m^2, of landmarks from their rays at known poses."""
     return np.linalg.inv(landmarks.information[rows] + _HELD * np.eye(3)) + _FLOOR**2 * np.eye(3)
 
 
 def in_view(
     landmarks: LandmarkTable, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: float = 0.0
 ) -> Bools:
-    """Which landmarks (N,) should be seen: well inside the image, and from no further than they were seen.
+    """Return which landmarks (N,) a camera should see, by their pixels and by the distances from which they were seen.
 
-    margin: the share of the image along its edge that does not count; negative, one around it that does. reach: m,
-    from how far all of them should be seen, even if they were not.
+    margin: the share of the image along its edge that is excluded. A negative margin extends the image. reach: m, the
+    distance up to which every landmark should be seen.
     """
     local = (landmarks.position - map_T_camera[:3, 3]) @ map_T_camera[:3, :3]
     distance = np.sqrt(np.einsum("ni,ni->n", local, local))
@@ -86,7 +75,7 @@ def in_view(
 
 
 def predict_landmarks(landmarks: LandmarkTable, tracks: Sequence[Track]) -> PredictedLandmarks:
-    """What the boxes of the next frame may be of: landmarks and tracks as they are now."""
+    """Return the candidates for the boxes of the next frame: all landmarks, then all tracks."""
     count, more = len(landmarks.id), len(tracks)
     every = np.arange(count)
     label = [-1 if t.by_label else t.label for t in tracks]

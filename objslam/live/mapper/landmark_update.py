@@ -1,8 +1,7 @@
-"""What landmarks learn from a frame that is in the map; landmarks that turn out to be one, and landmarks that go."""
-
-from __future__ import annotations
+"""The update of landmarks by a new keyframe, and the merging and removal of landmarks."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -14,19 +13,16 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)
-"""rad; rays of a frame in the map that miss their landmarks by more are a loop that closes. Larger gives the graph less
-time to settle after one."""
-_TRACKS = 4096
-"""Tracks of the detector whose landmark is remembered; more serve a detector that takes numbers up again late."""
+_JUMP = np.radians(2.0)  # The residual (rad) above which a loop is closing. A larger angle leaves less time to settle.
+_TRACKS = 4096  # The detector tracks whose landmark is stored. More serve a detector that reuses numbers after a long time.
 
 
 @dataclass(frozen=True)
 class LandmarkUpdate:
-    """What the newest keyframe, which is in the graph, has for landmarks and tracks.
+    """The observations of the newest keyframe, which is in the graph.
 
-    rays: of the frame. matched: (m,) those of them that are of a landmark, and rows: (m,) of these landmarks in their table.
-    tracks: that have a ray of the frame, new ones too.
+    rays: of the frame. matched: (m,) the rays with a landmark. rows: (m,) the rows of these landmarks in their table.
+    tracks: all tracks with a ray of the frame.
     """
 
     rays: FrameRays
@@ -36,7 +32,7 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count which landmarks the newest keyframe showed or should have, and add what its rays tell of them."""
+    """Count the landmarks that the newest keyframe showed or should have shown, and add the information of its rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)
@@ -62,22 +58,20 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
             if len(m.landmark_of_track) > _TRACKS:
                 del m.landmark_of_track[next(iter(m.landmark_of_track))]
     if not m.by_label:
-        together, shown = m.pairs.together, sorted(zip(ids.tolist(), landmarks.label[rows].tolist(), strict=True))
-        for a, (first, label) in enumerate(shown):
-            for second, other in shown[a + 1 :]:
-                if label == other:
-                    together[first, second] = together.get((first, second), 0) + 1
+        shown = sorted(zip(ids.tolist(), landmarks.label[rows].tolist(), strict=True))
+        for (first, label), (second, other) in combinations(shown, 2):
+            if label == other:
+                m.pairs.together[first, second] += 1
 
 
 def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
-    """The rays and counts of one landmark, by its row, become another's; `remove_landmarks` must follow."""
+    """Move the rays and counts of one landmark to another landmark, by rows. The caller must `remove_landmarks` then."""
     landmarks, rays = m.landmarks, m.rays
     mine = np.flatnonzero(rays.owner == landmarks.id[drop])
     m.graph.drop_rays(rays.number[mine])
     rays.owner[mine] = landmarks.id[keep]
-    landmarks.information[keep] += landmarks.information[drop]
-    for counts in (landmarks.squared, landmarks.seen, landmarks.expected, landmarks.rejected):
-        counts[keep] += counts[drop]
+    for sums in (landmarks.information, landmarks.squared, landmarks.seen, landmarks.expected, landmarks.rejected):
+        sums[keep] += sums[drop]
     landmarks.first[keep] = min(landmarks.first[keep], landmarks.first[drop])
     if landmarks.last[drop] > landmarks.last[keep]:
         landmarks.last[keep], landmarks.drift[keep] = landmarks.last[drop], landmarks.drift[drop]
@@ -86,7 +80,7 @@ def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
 
 
 def remove_landmarks(m: MapState, rows: Ints, rebuild: bool = True) -> None:
-    """Landmarks that no ray is of go, by their rows; without `rebuild` the graph still waits for it."""
+    """Remove landmarks without rays, by rows. Without `rebuild` the caller must rebuild the graph."""
     ids = m.landmarks.id[rows]
     m.pairs.forget(set(ids.tolist()))
     m.graph.drop_landmarks(ids)
@@ -94,5 +88,4 @@ def remove_landmarks(m: MapState, rows: Ints, rebuild: bool = True) -> None:
     kept[rows] = False
     m.landmarks.keep(kept)
     if rebuild:
-        m.graph.rebuild_in_slices(m.in_order())
-        m.read_positions()
+        m.rebuild_in_slices()

@@ -1,6 +1,4 @@
-"""What holds keyframes besides their boxes: absolute poses by localisation, and motions from one to the next."""
-
-from __future__ import annotations
+"""Factors on keyframe poses: absolute poses by localisation, and motions between consecutive keyframes."""
 
 import numpy as np
 
@@ -12,9 +10,9 @@ from objslam.live.mapper.state import MapState
 
 
 def localize(m: MapState) -> bool:
-    """Absolute poses for the keyframes that the localisation covers by now; whether that moved the map.
+    """Add the absolute poses of the keyframes that the localisation covers now, and return whether the map moved.
 
-    The first one does: it says where the map is, which so far lay where the odometry began.
+    The first absolute pose moves a map that was relative to the start of the odometry.
     """
     if not m.localization.received or not m.localization.pending:
         return False
@@ -26,9 +24,7 @@ def localize(m: MapState) -> bool:
         stamp = float(m.keyframes.stamp[row])
         if stamp > path.newest:
             left.append(k)
-            continue
-        found = path.at(stamp)
-        if found is None:
+        if (found := path.at(stamp)) is None:
             continue
         planar = m.localization.planar and is_planar(np.stack([np.eye(4), path.from_start(found.pose)]))
         m.localization.planar = planar
@@ -41,7 +37,7 @@ def localize(m: MapState) -> bool:
         m.graph.add_absolute(k, localizations(one, m.settings, k, planar)[0])
         if first:
             moved = True
-            if len(np.unique(m.keyframes.piece)) > 1:  # from now on, what the odometry says across its gaps does not count
+            if len(np.unique(m.keyframes.piece)) > 1:  # With localisation, motions across gaps of the odometry do not count.
                 chain_keyframes(m)
             m.graph.rebuild()
     m.localization.pending = left
@@ -49,13 +45,8 @@ def localize(m: MapState) -> bool:
 
 
 def chain_keyframes(m: MapState) -> None:
-    """Tie each keyframe to the one before where it is not tied as it should be; the graph's `rebuild` must follow.
-
-    Motions are those of the odometry. Where it measured nothing, a weak tie holds the keyframes that the localisation does
-    not.
-    """
-    k = m.keyframes
-    order = np.argsort(k.stamp, kind="stable")
+    """Connect consecutive keyframes by odometry, or by weak motion factors. The caller must rebuild the graph."""
+    k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)
     if every.odom_T_base is None:
         return
@@ -74,7 +65,7 @@ def chain_keyframes(m: MapState) -> None:
 
 
 def _move_onto(m: MapState, row: int, map_T_base: Floats) -> None:
-    """Move the whole map so that the keyframe in a row has that pose (4, 4)."""
+    """Move the whole map such that the keyframe in a row gets the pose (4, 4)."""
     m.graph.update()
     there = map_T_base @ m.keyframes.base_T_camera[row] @ inverse(m.graph.pose(int(m.keyframes.id[row])))
     m.graph.drop_absolute()

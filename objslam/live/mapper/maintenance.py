@@ -1,8 +1,4 @@
-"""What a map needs now and then: duplicates merged, ghosts dropped, a second look at every ray, bounded growth."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
+"""The periodic maintenance of a map: solves, outlier rejection, merging of duplicates, loop closure, and bounded growth."""
 
 import numpy as np
 
@@ -19,59 +15,52 @@ from objslam.live.mapper.keyframe_culling import cull_keyframes
 from objslam.live.mapper.landmark_table import covariances, in_view, noise
 from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmarks
 from objslam.live.mapper.loop_closure import close_loop
-from objslam.live.mapper.pose_uncertainty import carried, gathered
+from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.alternation import MANY, SECOND
 
-_EVERY = 10
-"""Keyframes after which each duty is due again; larger leaves duplicates and false landmarks in the map for longer."""
-_GROWING = 3
-"""Place of the duties that bound growth among those keyframes; not that of the others, so that no frame pays for two."""
-_CLOSING = 6
-"""Place of the duties that merge and drop landmarks."""
-_BREATH = 2
-"""Keyframes after which variables that moved are looked for, when a loop has closed; larger lets the map settle later."""
-_FIRST = 20
-"""Keyframes after which the graph is solved as a whole for the first time; fewer tell too little of any landmark."""
-_GROWTH = 1.5
-"""Times more keyframes until it is solved as a whole again; larger leaves what the first guesses got wrong for longer."""
-_ITERATIONS = 8
-"""Iterations of such a solve at the most; more take longer, for which a frame has to wait."""
-_LARGE = 400
-"""Keyframes above which the graph is not solved but linearised again, step by step, for no frame may wait for a solve."""
-_ODDS = 2.5
-"""Log odds that two landmarks are one, against another one that happens to stand there; larger leaves more duplicates."""
-_HALF = 0.5
-"""Share of a landmark's rays; where fewer fit, its place is looked for among all of them. Larger does so more often."""
+_EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
+_GROWING = 3  # The keyframe of each period that bounds growth. It differs from _CLOSING to spread the delay.
+_CLOSING = 6  # The keyframe of each period that merges and removes landmarks.
+_BREATH = 2  # The period of relinearisation after a loop closure, in keyframes. In a larger period the map settles later.
+_FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
+_GROWTH = 1.5  # The growth in keyframes between two full solves. More growth keeps errors of the first estimates for longer.
+_ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
+_LARGE = 400  # The keyframes above which relinearisation in slices replaces the full solve, because frames cannot wait.
+_ODDS = 2.5  # The least log odds that two landmarks are one, against a neighbour. Larger odds leave more duplicates.
+_HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
-"""Changes between rays that fit a label's object and rays that do not, at the least, where there are two objects; a drifted
-path, or a bad place, disagrees at one stretch."""
-_DISTANT = 60.0
-"""s; how long a track of enough rays, which something seen from afar has, is waited for. Larger keeps more tracks."""
-_AROUND = 0.15
-"""Share of the image around it; what stands there may soon be in it. Larger prepares the graph for more landmarks."""
-_USUAL = 0.75
-"""Quantile of the distances from which landmarks were seen; what is no further away may soon be seen."""
+"""The least number of changes between inliers and outliers that shows two objects of a label. A drifted path gives one run
+of outliers. A larger number keeps one object for longer."""
+_DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
+_AROUND = 0.15  # The border around the image, as a share of it. A wider border prepares the graph for more landmarks.
+_USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. More prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:
-    """After each keyframe, whatever is due."""
+    """Run the tasks that are due after a keyframe."""
     m.graph.continue_rebuild()
     number, schedule = m.next_id.keyframe, m.schedule
     due = number % _EVERY == 0 or (schedule.relinearisations > 0 and number % _BREATH == 0)
-    relinearise = due and not m.graph.is_rebuilding  # A rebuilt graph is linearised at the estimate of now.
+    relinearise = due and not m.graph.is_rebuilding  # A rebuild linearises at the current estimate anyway.
     if relinearise:
         schedule.relinearisations = max(0, schedule.relinearisations - 1)
     m.graph.prepare(_coming(m), relinearise)
     if number % _EVERY == _GROWING:
-        _do(m, (_forget_tracks, cull_keyframes, _polish_if_grown))
+        tasks = _forget_tracks, cull_keyframes, _polish_if_grown
     elif number % _EVERY == _CLOSING and not m.by_label:
-        _do(m, (close_loop, _merge_duplicates, _drop_ghosts))
+        tasks = close_loop, _merge_duplicates, _drop_ghosts
+    else:
+        return
+    m.read_positions()
+    for task in tasks:
+        if not m.graph.is_rebuilding:
+            task(m)
 
 
 def _coming(m: MapState) -> Ints:
-    """The landmarks (n,) that the camera of the newest keyframe shows, or soon may."""
+    """Return the landmarks (n,) that the camera of the newest keyframe sees, or may see soon."""
     landmarks, keyframes = m.landmarks, m.keyframes
     if not len(landmarks.id):
         return landmarks.id
@@ -80,25 +69,11 @@ def _coming(m: MapState) -> Ints:
     return np.asarray(landmarks.id[in_view(landmarks, camera, pose, -_AROUND, reach)])
 
 
-def _do(m: MapState, duties: tuple[Callable[[MapState], None], ...]) -> None:
-    """One duty after the other, until one has the graph built again in turns."""
-    m.read_positions()
-    for duty in duties:
-        if not m.graph.is_rebuilding:
-            duty(m)
-
-
 def _polish_if_grown(m: MapState) -> None:
-    if m.next_id.keyframe >= max(_FIRST, _GROWTH * m.schedule.solved) and len(m.landmarks):
-        m.schedule.solved = m.next_id.keyframe
-        polish(m)
-
-
-def polish(m: MapState) -> None:
-    """The whole graph solved by Levenberg-Marquardt, then every ray asked again whether it fits its landmark.
-
-    A large graph is linearised again instead, in turns.
-    """
+    """Solve the whole graph and test all rays again. A large graph is linearised again in slices instead."""
+    if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
+        return
+    m.schedule.solved = m.next_id.keyframe
     large = len(m.keyframes) > _LARGE
     try:
         if not large:
@@ -106,12 +81,13 @@ def polish(m: MapState) -> None:
     except SolveError:
         m.counters.accept("solves given up")
     if _reconsider(m) or large:
-        m.graph.rebuild_in_slices(m.in_order())
-    m.read_positions()
+        m.rebuild_in_slices()
+    else:
+        m.read_positions()
 
 
 def _reconsider(m: MapState) -> bool:
-    """Reject rays that miss their landmark by far more than its others, take back those that do not; whether any changed."""
+    """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed."""
     rays, landmarks = m.rays, m.landmarks
     m.graph.refresh()
     m.read_positions()
@@ -144,35 +120,26 @@ def _reconsider(m: MapState) -> bool:
 
 
 def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
-    """Whether the rays (R,), in the order of time, show that some label has two objects.
-
-    Many disagree with the one that it has, in turns with those that do not, and would make another one by themselves.
-    """
+    """Return whether alternating inliers and outliers among the rays (R,), in time order, show two objects of a label."""
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))
     for j in np.flatnonzero((against >= MANY) & (against > SECOND * number)).tolist():
         mine = np.flatnonzero(row == j)
-        if (np.diff(support[mine].astype(np.int64)) != 0).sum() < _VISITS:
-            continue
         other = obs.take(mine[~support[mine]])
-        if fit_if_observable(other, MANY, AGREE, m.settings, m.rng) is not None:
+        visits = (np.diff(support[mine].astype(np.int64)) != 0).sum()
+        if visits >= _VISITS and fit_if_observable(other, MANY, AGREE, m.settings, m.rng) is not None:
             return True
     return False
 
 
 def _forget_tracks(m: MapState) -> None:
-    """Give up tracks out of sight for too long."""
     now, live = float(m.keyframes.stamp.max()), m.settings.live
     waits = (live.forget, _DISTANT)
     m.tracks = [t for t in m.tracks if t.by_label or now - t.last < waits[len(t.rays) >= live.min_rays]]
 
 
 def _merge_duplicates(m: MapState) -> None:
-    """Landmarks of one label that are no further apart than the graph allows, and were not seen in one frame, are one.
-
-    As `alternation.merge_unseen_together` does for a log, but by bounds on the covariances, which take no time. Bounds that
-    are wide would take neighbours for one, so the odds against a neighbour count too.
-    """
+    """Merge near landmarks of one label like `alternation.merge_unseen_together`, with fast upper bounds on covariances."""
     landmarks = m.landmarks
     if len(landmarks) < 2:
         return
@@ -182,14 +149,12 @@ def _merge_duplicates(m: MapState) -> None:
     for i, j, way in zip(a.tolist(), b.tolist(), apart, strict=True):
         ids = int(landmarks.id[i]), int(landmarks.id[j])
         fewer = min(int(landmarks.seen[i]), int(landmarks.seen[j]))
-        if gone & {i, j} or seen_as_two(m.pairs.together.get(ids, 0), fewer):
-            continue
-        if m.pairs.apart.get(ids) == fewer // 5:  # nothing new since they were found to be two
+        tested = m.pairs.apart.get(ids) == fewer // 5
+        if tested or gone & {i, j} or seen_as_two(m.pairs.together.get(ids, 0), fewer):
             continue
         rows = np.array([i, j])
-        spread = (covariances(landmarks, rows) * (noise(landmarks, rows) ** 2)[:, None, None]).sum(axis=0) + _drifted(
-            m, rows
-        )
+        spread = (covariances(landmarks, rows) * (noise(landmarks, rows) ** 2)[:, None, None]).sum(axis=0)
+        spread = spread + _drifted(m, rows)
         if not np.isfinite(spread).all() or not _one(way, spread, density[i]):
             m.pairs.apart[ids] = fewer // 5
             continue
@@ -202,34 +167,25 @@ def _merge_duplicates(m: MapState) -> None:
 
 
 def _one(way: Floats, spread: Floats, density: float) -> bool:
-    """Whether two landmarks `way` (3,) m apart are one: by the covariance (3, 3) of that, and by how many of their label
-    there are per m^2, one of which may stand there as well."""
+    """Return whether two landmarks `way` m apart are one. density: possible neighbours of the label per m^2."""
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
     return squared <= SAME_POINT and -np.log(area * density) - squared / 2 >= _ODDS
 
 
 def _drifted(m: MapState, rows: Ints) -> Floats:
-    """Covariance (3, 3) of two landmarks' places to each other by how the path drifted between their last sightings.
-
-    Or by how little the newest pose is known, if that is less: both bound what the graph knows, which takes too long to ask.
-    """
+    """Return an upper bound (3, 3) on the covariance between two landmarks by the drift between their last observations."""
     k, landmarks = m.keyframes, m.landmarks
     newest = int(np.argmax(k.stamp))
     pose = m.graph.pose(int(k.id[newest]))
     first, second = rows[np.argsort(landmarks.last[rows], kind="stable")]
     to = (landmarks.position[rows].mean(axis=0) - pose[:3, 3])[None]
-    camera_from_drift = adjoint(k.camera_T_start[newest])
-    gained = camera_from_drift @ gathered(landmarks.drift[second], landmarks.drift[first][None]) @ camera_from_drift.T
-    since = carried(to, gained, pose)[0]
-    if not np.isfinite(m.pose_covariance).all():
-        return since
-    placed = carried(to, m.pose_covariance, pose)[0]
-    return placed if np.trace(placed) < np.trace(since) else since
+    uncertainty = PoseUncertainty(landmarks.drift[second], adjoint(k.camera_T_start[newest]), m.pose_covariance)
+    return uncertainty.of_landmarks(to, landmarks.drift[first][None], pose)[0]
 
 
 def _drop_ghosts(m: MapState) -> None:
-    """Landmarks that are hardly ever seen where they should be."""
+    """Remove the landmarks that are rarely seen in frames that should show them."""
     landmarks, live = m.landmarks, m.settings.live
     rarely_seen = landmarks.seen < live.ghost_share * landmarks.expected
     ghost = np.flatnonzero((landmarks.expected >= live.ghost_frames) & rarely_seen)

@@ -1,10 +1,7 @@
-"""The map of a session, message by message, in one thread: the order in which the modules beside do their work.
+"""The mapper of a live session, which takes one message at a time. It defines the order of all changes of the map.
 
-It depends on the messages and their order alone, never on the time of day, so that a journal played again gives the same
-map.
+The map depends on the messages and their order only, never on the clock, so a replayed journal gives the same map.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -13,9 +10,10 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
 from objslam.live.mapper.bearing_extraction import BearingExtractor, FrameView
-from objslam.live.mapper.course import Placed
+from objslam.live.mapper.course import Course, Placed
 from objslam.live.mapper.data_association import associate
 from objslam.live.mapper.keyframe_selection import KeyframeSelector
 from objslam.live.mapper.landmark_table import in_view, predict_landmarks
@@ -30,17 +28,18 @@ from objslam.sources.journal.records import CameraMessage, FrameMessage, Message
 
 
 class Mapper:
-    """Takes messages in session time and keeps the map; not to be used from two threads at a time."""
+    """Builds the map from messages in session time, in one thread."""
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
-        self.state = MapState.new(settings, counters)
+        by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
+        self.state = MapState(settings, counters, IncrementalGraph(settings), Course(settings), by_label, rng)
         self._extractor = BearingExtractor(settings, counters.ledger, self.state.cameras, self.state.labels)
         self._selector = KeyframeSelector(settings.live)
         self._predictor = PosePredictor(self.state)
-        self._predicted: PredictedLandmarks | None = None  # of the map as it is, made ahead; None where it changed since
+        self._predicted: PredictedLandmarks | None = None  # Made ahead of the next frame. None after a change of the map.
 
     def feed(self, message: Message) -> None:
-        """Take a message that is no frame."""
+        """Process a pose, a calibration or a mount."""
         m = self.state
         if isinstance(message, PoseMessage):
             if message.path == "odometry":
@@ -56,52 +55,41 @@ class Mapper:
             self._extractor.add_mount(message)
 
     def is_ready(self, stamp: float) -> bool:
-        """Whether the place on the course of a frame from then is decided."""
+        """Return whether later messages cannot change the pose of a frame on the course."""
         return self.state.course.ready(stamp)
 
     def take(self, frame: FrameMessage) -> LandmarkUpdate | None:
-        """Work a frame into the map: what `look_after` is to be given then; None where it became no keyframe."""
+        """Add a frame to the map, and return the argument for `look_after`. None if the frame became no keyframe."""
         m = self.state
-        # the pose on the course
         before = m.newest_before(frame.stamp)
         placed = m.course.place(frame.stamp, m.keyframes, before)
         if placed is None:
             m.counters.drop_frame(frame, "frames off the path, or in a gap of it")
             return None
-        # bearings of the boxes
         view = self._extractor.extract(frame)
-        m.frames[view.camera] = m.frames.get(view.camera, 0) + 1
-        # keyframe selection
+        m.frames[view.camera] += 1
         start_T_camera, shown = placed.start_T_base @ view.base_T_camera, set(view.rays.label.tolist())
         if not self._is_wanted(frame, view.camera, start_T_camera, shown, before):
             return None
-        # prediction of the pose, with its covariance
         prediction = self._predictor.predict(before, frame.stamp, placed, view.base_T_camera, start_T_camera)
-        if not shown:  # what was not seen is evidence, but no keyframe
-            camera = m.cameras[view.camera]
-            m.landmarks.expected[in_view(m.landmarks, camera, prediction.map_T_camera)] += 1
+        pose = prediction.map_T_camera
+        if not shown:  # A frame without boxes counts against the landmarks in view, but is no keyframe.
+            m.landmarks.expected[in_view(m.landmarks, m.cameras[view.camera], pose)] += 1
             return None
         self._selector.accept(view.camera, start_T_camera, shown)
-        # into the graph
         k = self._add_keyframe(frame.stamp, view, placed, prediction)
-        # localisation
-        pose = prediction.map_T_camera
         if localize(m):
             pose, self._predicted = m.graph.pose(k), None
-        # association with landmarks and tracks
         predicted, self._predicted = self._predicted, None
         return associate(m, view.rays, pose, prediction.uncertainty, predicted)
 
     def look_after(self, update: LandmarkUpdate) -> None:
-        """After a frame became a keyframe: what landmarks learn of it, and what else need not keep the next one waiting."""
+        """Update landmarks and tracks after a new keyframe, run maintenance, and prepare the next association."""
         m = self.state
-        # landmarks and tracks that the frame showed
         update_landmarks(m, update)
         rest = promote_tracks(m, update.tracks)
         update_positions([track for track in rest if not track.by_label])
-        # what is due now and then
         maintain(m)
-        # prediction of what the next frame may show, and from where
         if not m.by_label:
             prune_tracks(m)
             self._predicted = predict_landmarks(m.landmarks, m.tracks)
@@ -111,7 +99,7 @@ class Mapper:
     def _is_wanted(
         self, frame: FrameMessage, camera: int, start_T_camera: Floats, shown: set[int], before: int | None
     ) -> bool:
-        """Whether a frame tells something new: it is neither redundant nor late, and there are boxes or landmarks."""
+        """Return whether a frame is neither redundant nor late, and has boxes or can show missing landmarks."""
         m = self.state
         if self._selector.is_redundant(camera, start_T_camera, shown):
             m.counters.accept("frames between keyframes")
@@ -125,7 +113,7 @@ class Mapper:
         return shows_something and not is_late
 
     def _add_keyframe(self, stamp: float, view: FrameView, placed: Placed, prediction: PosePrediction) -> int:
-        """The id of the new keyframe."""
+        """Add a keyframe to the table and the graph, and return its id."""
         m = self.state
         k = m.next_id.keyframe
         m.next_id.keyframe += 1

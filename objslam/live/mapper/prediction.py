@@ -1,6 +1,4 @@
-"""Where a frame's camera is before its boxes are looked at, and how well that is known."""
-
-from __future__ import annotations
+"""The prediction of the camera pose of a frame, with its uncertainty, before association."""
 
 from dataclasses import dataclass
 
@@ -14,18 +12,16 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""Keyframes after which the graph is asked how well it knows its newest pose, which takes time; between, the odometry adds
-to that. Larger takes less time, and takes the pose for less certain than it is."""
+"""The keyframes between two slow covariance queries, while odometry adds to it. More make the pose less certain."""
 
 
 @dataclass(frozen=True)
 class PosePrediction:
-    """The pose of a frame's camera in map (4, 4), and how well it is known.
+    """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
-    camera_T_start: (4, 4) the beginning of the course in the camera's frame.
-    motion: id of the keyframe before, the motion (4, 4) from its camera, and the covariance (6, 6) of that in the new
-    camera's frame; None where there is no keyframe before, or the localisation holds the frame and the odometry did not
-    measure it.
+    camera_T_start: (4, 4) start of the course in the camera frame. motion: id of the previous keyframe, motion (4, 4) from
+    its camera, and covariance (6, 6) of the motion in the new camera frame. None without a previous keyframe, or if
+    only localisation gives the pose.
     """
 
     map_T_camera: Floats
@@ -35,7 +31,7 @@ class PosePrediction:
 
 
 class PosePredictor:
-    """Predicts poses from the map and the course, and remembers what of the graph takes long to ask."""
+    """Predicts camera poses from map and course, and caches covariances that are slow to compute."""
 
     def __init__(self, state: MapState) -> None:
         self._state = state
@@ -45,13 +41,9 @@ class PosePredictor:
     def predict(
         self, before: int | None, stamp: float, placed: Placed, base_T_camera: Floats, start_T_camera: Floats
     ) -> PosePrediction:
-        """The pose of a frame's camera.
+        """Predict the camera pose of a frame at a stamp, s. before: row of the previous keyframe.
 
-        Args:
-            before: row of the keyframe before it.
-            stamp: of the frame, s.
-            placed: where the course has the robot.
-            base_T_camera, start_T_camera: (4, 4) of the camera, on the robot and on the course.
+        base_T_camera, start_T_camera: (4, 4) camera pose on the robot, and on the course.
         """
         m, k = self._state, self._state.keyframes
         camera_T_start = inverse(start_T_camera)
@@ -80,7 +72,7 @@ class PosePredictor:
         return PosePrediction(m.graph.pose(number) @ motion, camera_T_start, reckoned, (number, motion, covariance))
 
     def accept(self, prediction: PosePrediction) -> None:
-        """Keep the pose covariance of a prediction whose frame became the newest keyframe."""
+        """Store the covariance of a prediction whose frame became the newest keyframe."""
         m, number = self._state, int(self._state.keyframes.id[-1])
         if prediction.motion is None:
             m.pose_covariance = np.full((6, 6), np.nan)
@@ -90,13 +82,13 @@ class PosePredictor:
             self._covariances[number] = m.pose_covariance
 
     def covariance_of(self, keyframe: int) -> Floats:
-        """Covariance (6, 6) of a keyframe's camera, in its frame: as remembered, else as the graph has it."""
+        """Return the covariance (6, 6) of a keyframe's camera in its own frame, from the cache or the graph."""
         if keyframe not in self._covariances:
             self._covariances = {keyframe: self._state.graph.pose_covariance(keyframe)}
         return self._covariances[keyframe]
 
     def _motion_floor(self, base_T_camera: Floats) -> Floats:
-        """`odometry.motion_floor`, which stays the same as long as the mount and the plane do."""
+        """Return `odometry.motion_floor` from a cache that holds for one mount."""
         mount, planar, floor = self._floor
         on_plane = self._state.course.odometry.planar
         if mount is not base_T_camera or planar != on_plane:

@@ -1,10 +1,6 @@
-"""A live map as data: what is known at a moment of keyframes, bearings, landmarks and tracks.
+"""The state of a live map: graph, course, keyframes, rays, landmarks and tracks."""
 
-The modules beside change it; `mapper` says in which order.
-"""
-
-from __future__ import annotations
-
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,13 +18,12 @@ from objslam.live.mapper.landmark_table import LandmarkTable
 from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
 
-_RELINEARISATIONS = 3
-"""Updates that look for variables that moved, after a loop has closed; more settle the map further, and take time."""
+_RELINEARISATIONS = 3  # The relinearisations after a loop closure. More let the map settle further, and take time.
 
 
 @dataclass
 class NextIds:
-    """The number that the next one of each kind gets; no number is given twice."""
+    """The next free number of each kind. No number is used twice."""
 
     keyframe: int = 0
     ray: int = 0
@@ -38,11 +33,7 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """What the localisation has said of the map.
-
-    received: poses that came. pending: ids of the keyframes that it may still get to. planar: whether all poses that
-    keyframes got of it keep one height, roll and pitch.
-    """
+    """The localisation so far: the number of poses, the ids of keyframes without a pose, and whether poses are planar."""
 
     received: int = 0
     pending: list[int] = field(default_factory=list)
@@ -51,28 +42,28 @@ class LocalizationState:
 
 @dataclass
 class PairEvidence:
-    """What tells whether two landmarks of one label are one; by their ids, the smaller first.
+    """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: frames that showed both. apart: a fifth of the frames that showed the one seen less, when the two were last
-    found to be apart.
+    together: number of frames with both landmarks. apart: a fifth of the frames with the less seen landmark, when the pair
+    was last tested and not merged.
     """
 
-    together: dict[tuple[int, int], int] = field(default_factory=dict)
+    together: Counter[tuple[int, int]] = field(default_factory=Counter)
     apart: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def forget(self, ids: set[int]) -> None:
-        """Landmarks that are gone."""
-        self.together = {pair: n for pair, n in self.together.items() if not ids & set(pair)}
+        """Remove the pairs of removed landmarks."""
+        self.together = Counter({pair: n for pair, n in self.together.items() if not ids & set(pair)})
         self.apart = {pair: n for pair, n in self.apart.items() if not ids & set(pair)}
 
 
 @dataclass
 class MaintenanceSchedule:
-    """When the seldom duties were last done.
+    """When the maintenance tasks last ran.
 
-    solved, culled: keyframes that there had been when the whole graph was last solved, and keyframes were last left out.
-    relinearisations: that are still to come sooner than usual, since a loop moved the estimate far. compared: ids of the
-    landmarks seen lately, and how many were long unseen, when a loop was last looked for; None before.
+    solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: the number of
+    early relinearisations still to do. compared: ids of the recently seen landmarks and number of the long unseen ones at
+    the last search for loops, None before the first search.
     """
 
     solved: int = 0
@@ -81,29 +72,20 @@ class MaintenanceSchedule:
     compared: tuple[tuple[int, ...], int] | None = None
 
     def relinearise_soon(self) -> None:
-        """The estimate has moved far: the next few turns look for variables that moved."""
+        """Schedule early relinearisations after a large change of the estimate."""
         self.relinearisations = _RELINEARISATIONS
 
 
 @dataclass
 class MapState:
-    """The map of a session, with all that the next message needs to go on from it.
+    """The whole state of a session's map.
 
-    Attributes:
-        graph: the factors, and the estimate of keyframes and landmarks.
-        course: the paths that place frames.
-        cameras, labels: by their numbers.
-        keyframes, rays, landmarks: tables; rays.owner tells who is whose.
-        tracks: things seen that are no landmarks yet, in the order in which they were first seen.
-        by_label: whether every label is one object so far.
-        pairs: evidence for and against two landmarks being one.
-        landmark_of_track: id of the landmark that each track of the detector was given last.
-        novelty: share of boxes that showed nothing known, averaged over about the last 50 frames with weights that fade.
-        pose_covariance: (6, 6) of the newest keyframe's pose as it was predicted, in its camera's frame, rad and m, rotation
-            first; NaN where the odometry does not tell.
-        frames: frames of each camera that the course placed.
-        localization, schedule, next_id: as their types say.
-        rng: for what is drawn at random, seeded by the settings.
+    graph: the factors and the estimate. cameras, labels: by their numbers. rays: `owner` gives the landmark of each ray.
+    tracks: in the order of their first observation. by_label: whether every label is one object so far.
+    landmark_of_track: id of the last landmark of each detector track. novelty: share of boxes that match no landmark, as an
+    exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
+    frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
+    the course. rng: seeded by the settings.
     """
 
     settings: Settings
@@ -122,31 +104,25 @@ class MapState:
     landmark_of_track: dict[int, int] = field(default_factory=dict)
     novelty: float = 1.0
     pose_covariance: Floats = field(default_factory=lambda: np.full((6, 6), np.nan))
-    frames: dict[int, int] = field(default_factory=dict)
+    frames: Counter[int] = field(default_factory=Counter)
     localization: LocalizationState = field(default_factory=LocalizationState)
     schedule: MaintenanceSchedule = field(default_factory=MaintenanceSchedule)
     next_id: NextIds = field(default_factory=NextIds)
 
-    @classmethod
-    def new(cls, settings: Settings, counters: Counters) -> MapState:
-        """An empty map."""
-        by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
-        return cls(settings, counters, IncrementalGraph(settings), Course(settings), by_label, rng)
-
     def newest_before(self, stamp: float) -> int | None:
-        """The row of the newest keyframe that is not newer than a stamp."""
+        """Return the row of the newest keyframe at or before a stamp."""
         stamps = self.keyframes.stamp
         if len(stamps) and stamps[-1] <= stamp:
             return len(stamps) - 1
         older = np.flatnonzero(stamps <= stamp)
         return int(older[stamps[older].argmax()]) if len(older) else None
 
-    def in_order(self) -> Ints:
-        """The ids of the keyframes (K,) by their stamps."""
-        return np.asarray(self.keyframes.id[np.argsort(self.keyframes.stamp, kind="stable")])
+    def time_order(self) -> Ints:
+        """Return the rows of the keyframes (K,) in the order of their stamps."""
+        return np.argsort(self.keyframes.stamp, kind="stable")
 
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
-        """The keyframes at these rows (n,), in the type that the offline estimation uses."""
+        """Return the keyframes at these rows (n,) in the type of the offline estimation."""
         k = self.keyframes
         localized, reckoned = bool(k.localized.any()), bool(k.by_odometry[rows].any())
         return Keyframes(
@@ -162,28 +138,20 @@ class MapState:
         )
 
     def rows_of(self, ids: Ints) -> Ints:
-        """The rows of landmarks by their ids, which must be there."""
+        """Return the rows of landmarks by their ids, which must be in the table."""
         return np.searchsorted(self.landmarks.id, ids)
 
     def bearings(self, at: Ints) -> Bearings:
-        """Rows (n,) of the rays for the graph; ranges of one object share a bias, which no number of them takes away."""
+        """Return the rays at rows (n,) for the graph. The range bias of an object does not average out over its rays."""
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
-            row = np.searchsorted(self.landmarks.id, rays.owner[at])
-            sigma = np.sqrt(sigma**2 + (self.landmarks.seen[row] + 1) * self.settings.depth.bias**2)
-        return Bearings(
-            number=rays.number[at],
-            keyframe=rays.keyframe[at],
-            landmark=rays.owner[at],
-            direction=rays.direction[at],
-            sigma=rays.sigma[at],
-            range=rays.range[at],
-            range_sigma=sigma,
-        )
+            sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * self.settings.depth.bias**2)
+        columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "direction", "sigma", "range")}
+        return Bearings(**columns, landmark=rays.owner[at], range_sigma=sigma)
 
     def sight(self, at: Ints) -> Observations:
-        """Rows (n,) of the rays as lines in map, as of the graph's last refresh."""
+        """Return the rays at rows (n,) in map, at the poses of the graph's last refresh."""
         rays = self.rays
         ids, index = np.unique(rays.keyframe[at], return_inverse=True)
         poses = self.graph.poses(ids)[index]
@@ -191,16 +159,21 @@ class MapState:
         return Observations.of_lines(poses[:, :3, 3], ahead, rays.sigma[at], rays.range[at], rays.range_sigma[at])
 
     def read_positions(self) -> None:
-        """The places of all landmarks, as the graph has them now."""
+        """Copy the current positions of all landmarks from the graph."""
         self.landmarks.position[:] = self.graph.points(self.landmarks.id)
 
+    def rebuild_in_slices(self) -> None:
+        """Start a rebuild of the graph in slices, and copy the positions of all landmarks."""
+        self.graph.rebuild_in_slices(self.keyframes.id[self.time_order()])
+        self.read_positions()
+
     def move_tracks(self, new_T_old: Floats, since: float) -> None:
-        """Tracks seen from a stamp on moved by a pose (4, 4), as the path was."""
+        """Move the tracks seen at or after a stamp by a pose (4, 4)."""
         for track in self.tracks:
             if track.last >= since:
                 track.move(new_T_old)
 
     def tell_apart_within_labels(self) -> None:
-        """From now on a label may have several objects: what shares nothing but the label is no track any more."""
+        """Allow several objects of one label, and drop the tracks whose rays have only the label in common."""
         self.by_label = False
         self.tracks = [track for track in self.tracks if not track.by_label]

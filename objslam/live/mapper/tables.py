@@ -1,50 +1,38 @@
-"""Tables that grow by rows, with room to spare so that a new row copies nothing; and those of keyframes and rays."""
+"""Tables of arrays that grow by rows, and the tables of keyframes and rays."""
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple, Self
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
 
-_FIRST = 64
-"""Rows that a new table has room for. More costs memory, fewer costs copies while a session is young."""
+_FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
-class Column(NamedTuple):
-    """What a column holds: the type of a number, and the shape of one row."""
-
-    kind: type
-    shape: tuple[int, ...]
-
-
-def column(kind: type, *shape: int) -> Any:
-    """Declares a column in the body of a `GrowingTable`; on a table, the name is the array of its rows (n, *shape)."""
-    return Column(kind, shape)
+def column(kind: DTypeLike, *shape: int) -> Any:
+    """Declare a column of a `GrowingTable` by the type of its numbers and the shape of a row."""
+    return np.dtype((kind, shape))
 
 
 class GrowingTable:
-    """Columns of one length. A column is an attribute: the array of the rows so far, to be changed in place.
+    """Columns of one length. A column is an attribute: the array of the rows (n, *shape), which may be changed in place.
 
-    A subclass declares its columns with `column`. `add` and `keep` make new arrays of the attributes.
+    Subclasses declare columns with `column`. `add` and `keep` replace all arrays.
     """
 
     def __init__(self) -> None:
         self._length = 0
-        self._room: dict[str, NDArray[Any]] = {
-            name: np.zeros((_FIRST, *of.shape), dtype=of.kind)
-            for name, of in vars(type(self)).items()
-            if isinstance(of, Column)
-        }
+        columns = {name: kind for name, kind in vars(type(self)).items() if isinstance(kind, np.dtype)}
+        self._room: dict[str, NDArray[Any]] = {name: np.zeros(_FIRST, dtype=kind) for name, kind in columns.items()}
         self._show()
 
     def __len__(self) -> int:
         return self._length
 
     def add(self, **rows: ArrayLike) -> None:
-        """Rows at the end: (n, ...) for each column."""
+        """Append rows (n, ...), given for every column."""
         arrays = {name: np.asarray(rows[name]) for name in self._room}
         end = self._length + len(next(iter(arrays.values())))
         for name, room in self._room.items():
@@ -57,7 +45,7 @@ class GrowingTable:
         self._show()
 
     def keep(self, which: NDArray[np.bool_]) -> None:
-        """Only some of the rows (n,), in their order."""
+        """Keep the rows of a mask (n,) in their order."""
         rows = np.flatnonzero(which)
         for room in self._room.values():
             room[: len(rows)] = room[rows]
@@ -65,9 +53,8 @@ class GrowingTable:
         self._show()
 
     def copy(self) -> Self:
-        """The same rows, in arrays of their own."""
-        other = type(self)()
-        other._length = self._length
+        """Return a table with copies of all arrays."""
+        other = copy(self)
         other._room = {name: room.copy() for name, room in self._room.items()}
         other._show()
         return other
@@ -78,10 +65,9 @@ class GrowingTable:
 
 
 class KeyframeTable(GrowingTable):
-    """The keyframes, in the order in which they came; columns as `types.Keyframes` has them, and `course.Placed`.
+    """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
-    camera_T_start: the beginning of the course in the camera's frame. localized: whether map_T_base is of the localisation,
-    as it is from the beginning without odometry.
+    camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
     """
 
     id: Ints = column(np.int64)
@@ -99,9 +85,9 @@ class KeyframeTable(GrowingTable):
 
 
 class RayTable(GrowingTable):
-    """The rays of the keyframes, one a box; columns as `types.Rays` has them.
+    """The rays of the keyframes, one for each box, with columns as in `types.Rays`.
 
-    number: of each ray, increasing. owner: the id of its landmark, -1 without. used: whether the graph has its factor.
+    number: increasing. owner: the id of the ray's landmark, or -1. used: whether the graph has a factor of the ray.
     """
 
     number: Ints = column(np.int64)

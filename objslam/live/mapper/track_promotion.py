@@ -1,9 +1,8 @@
-"""From tracks to landmarks, once their rays carry a place; and which tracks are given up."""
+"""The promotion of tracks to landmarks, and the removal of surplus tracks."""
 
-from __future__ import annotations
-
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
+from itertools import count
 
 import numpy as np
 
@@ -16,27 +15,19 @@ from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-AGREE = 0.7
-"""The share of the rays of one thing that must agree on its place; larger makes objects later, and fewer false ones."""
-SLACK = 0.02
-"""m; the poses of one stretch fit each other that well, and larger lets rays meet less closely."""
-_AGREE_BY_LABEL = 0.5
-"""The same share where rays merely share a label, and some may be of another object; larger makes those objects later."""
-_AGAIN = 1.2
-"""Times as many rays, or as wide a spread, as when a track was last tried, before it is tried again; smaller takes time."""
-_EARLY = 0.4
-"""Share of joint.min_parallax_deg that is enough where the place is very sure; larger makes objects later."""
-_SURE = 0.05
-"""Standard deviation of such a place as a share of its distance; larger makes objects sooner, and more of them false."""
-_MOST_TRACKS = 150
-"""Tracks at the most; each is predicted, and matched with every frame, so more take longer."""
+AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
+SLACK = 0.02  # The relative error (m) of poses on one stretch. A larger error accepts rays that pass a point less closely.
+_AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
+_AGAIN = 1.2  # The growth in rays or in spread before a track is tried again. Less growth costs time.
+_EARLY = 0.4  # The share of joint.min_parallax_deg that a certain position needs. A larger share makes landmarks later.
+_SURE = 0.05  # The sigma of a certain position as a share of its distance. A larger share makes more false landmarks.
+_MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
 def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
-    """Of tracks that have a ray more, those whose rays carry it become landmarks; the others are returned.
+    """Make landmarks of the tracks whose rays are sufficient, and return the other tracks.
 
-    To be called once the frame that brought the rays is worked in: whether rays meet takes as long to find out. The graph
-    works the landmarks in when it is next asked to.
+    The triangulation takes as long as an association. The graph adds the landmarks at its next update.
     """
     rest: list[Track] = []
     for track in tracks:
@@ -71,16 +62,15 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:
-    """Where a track's object is once its rays carry that: enough of them, enough parallax or ranges, few against it."""
-    live, count = settings.live, len(track.rays)
-    if count < live.min_rays:
-        return None
-    if count < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread:
+    """Return the position of a track's object if `fit_if_observable` finds one. A track is tried again only after growth."""
+    live, rays = settings.live, len(track.rays)
+    unchanged = rays < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread
+    if rays < live.min_rays or unchanged:
         return None
     ranged = any(np.isfinite(ray[4]) for ray in track.rays)
     if not ranged and track.spread < _EARLY * np.radians(settings.joint.min_parallax_deg):
         return None
-    track.tried, track.tried_spread = count, track.spread
+    track.tried, track.tried_spread = rays, track.spread
     share = _AGREE_BY_LABEL if track.by_label else AGREE
     return fit_if_observable(track.sight(graph), live.min_rays, share, settings, rng, early=True)
 
@@ -88,16 +78,9 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 def fit_if_observable(
     obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
 ) -> PointFit | None:
-    """Where rays meet, if they make an object of it.
+    """Triangulate rays in map. None with too few inliers, an uncertain position, or too little parallax and no range.
 
-    Args:
-        obs: rays in map.
-        least: rays that must agree.
-        share: share of the rays that must agree.
-        early: less parallax is enough for a place that is very sure.
-
-    Returns:
-        None with fewer rays that agree, too little parallax and no ranges, or a place that is too uncertain.
+    least, share: the least number of inliers, and their least share. early: accept less parallax for a certain position.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
@@ -112,18 +95,12 @@ def fit_if_observable(
 
 
 def prune_tracks(m: MapState) -> None:
-    """Give up tracks where there are too many: the short ones of the labels that have most, unseen for longest first.
-
-    So a crowd of one label leaves room for the others. What is given up is counted.
-    """
+    """Remove and count tracks above the limit: from the most common labels, short tracks first, then the longest unseen."""
     if len(m.tracks) <= _MOST_TRACKS:
         return
     best_first = sorted(m.tracks, key=lambda t: (len(t.rays) >= m.settings.live.min_rays, t.last))[::-1]
-    of_label: Counter[int] = Counter()
-    rank: dict[Track, int] = {}
-    for track in best_first:
-        rank[track] = of_label[track.label]
-        of_label[track.label] += 1
-    least = set(sorted(best_first, key=lambda track: rank[track])[_MOST_TRACKS:])
+    of_label: defaultdict[int, count[int]] = defaultdict(count)
+    rank = {track: next(of_label[track.label]) for track in best_first}
+    least = set(sorted(best_first, key=rank.__getitem__)[_MOST_TRACKS:])
     m.tracks = [track for track in m.tracks if track not in least]
     m.counters.accept("tracks given up", len(least))

@@ -1,6 +1,4 @@
-"""Boxes that are no landmark's yet: tracked from frame to frame until their parallax carries a place."""
-
-from __future__ import annotations
+"""Tracks: boxes of one object over several frames, before their parallax is enough for a landmark."""
 
 import math
 from collections.abc import Sequence
@@ -13,32 +11,25 @@ from objslam.association.refinement import refine_damped
 from objslam.core.arrays import Floats, Ints
 from objslam.graph.isam2 import IncrementalGraph
 
-_DEPTH = 2.5
-"""m; how far away a thing is taken to be that was seen from one place only, about the middle of a room."""
-_DEPTH_SIGMA = 2.0
-"""Standard deviation of that, m; larger leaves a track's place along its last ray to its rays alone."""
-_DAMPING = 1e-3
-"""Information, m^-2, that a track's place stays where it was in all directions; larger moves it more slowly."""
-_STEPS = 3
-"""Steps of Gauss-Newton to a track's place, which is near to where it was before; more take longer in every frame."""
-_RECENT = 30
-"""Rays that a track's place is made of; more average more noise, over a longer stretch of drift."""
-_LONGEST = 200
-"""Rays that a track keeps, the older ones of a longer one left out in turns; more cost memory and time."""
+_DEPTH = 2.5  # The assumed distance (m) of an object seen from one place only, about the middle of a room.
+_DEPTH_SIGMA = 2.0  # The standard deviation (m) of a track along its last ray. A larger value relies more on the rays.
+_DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More slows the position down.
+_STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
+_RECENT = 30  # The newest rays that define a track's position. More rays average more noise over a longer drift.
+_LONGEST = 200  # The most rays of a track. Above it, every second old ray is dropped. More rays cost memory and time.
+
+TrackRay = tuple[int, int, Floats, float, float, float]
+"""The number of a ray, its keyframe, its direction (3,) in the camera, sigma in rad, range in m and range_sigma in m."""
 
 
 @dataclass(eq=False)
 class Track:
-    """Rays of one thing that is no landmark yet.
+    """The rays of one object that is not a landmark yet.
 
-    Attributes:
-        by_label: whether its rays share nothing but the label; then it waits as long as it takes.
-        first, last: stamps, s, at which it was seen.
-        drift: (6, 6) covariance that the odometry had gathered when it was last seen.
-        position, covariance: (3,) m and (3, 3) m^2, a first guess in map from the rays as they lay when they came.
-        rays: of each its number, its keyframe, direction (3,) in the camera, sigma rad, range m, range_sigma m.
-        spread: rad, the widest angle between a ray and the first one.
-        tried, tried_spread: how many rays there were, and their spread, when it was last tried to make a landmark of them.
+    by_label: whether its rays have only the label in common. Such a track is never dropped. first, last: stamps, s, of its
+    first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)
+    m^2 in map, from the camera poses at the time of each ray. spread: rad, the widest angle between a ray and the first ray.
+    tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
     """
 
     id: int
@@ -49,7 +40,7 @@ class Track:
     drift: Floats
     position: Floats = field(default_factory=lambda: np.zeros(3))
     covariance: Floats = field(default_factory=lambda: np.eye(3))
-    rays: list[tuple[int, int, Floats, float, float, float]] = field(default_factory=list)
+    rays: list[TrackRay] = field(default_factory=list)
     tried: int = 0
     spread: float = 0.0
     tried_spread: float = 0.0
@@ -57,13 +48,11 @@ class Track:
     _lines: list[Floats] = field(default_factory=list)
 
     def numbers(self) -> Ints:
-        """The numbers of its rays."""
+        """Return the numbers of its rays."""
         return np.array([ray[0] for ray in self.rays], dtype=np.int64)
 
-    def extend(
-        self, ray: tuple[int, int, Floats, float, float, float], map_T_camera: Floats, stamp: float, drift: Floats
-    ) -> None:
-        """One more ray, from a camera at that pose; of very many rays, every second of the older half is left out."""
+    def extend(self, ray: TrackRay, map_T_camera: Floats, stamp: float, drift: Floats) -> None:
+        """Add a ray from a camera pose (4, 4). drift: (6, 6) odometry drift at the stamp."""
         self.rays.append(ray)
         self.last, self.drift = max(self.last, stamp), drift
         if len(self.rays) > _LONGEST:
@@ -78,14 +67,14 @@ class Track:
         self._lines = [*self._lines[1 - _RECENT :], np.array([*origin, *n, sigma, range_, range_sigma])]
 
     def sight(self, graph: IncrementalGraph) -> Observations:
-        """Its rays in map, as the graph has the poses now."""
+        """Return its rays in map at the current poses of the graph."""
         _, keyframe, direction, sigma, range_, range_sigma = zip(*self.rays, strict=True)
         poses = np.array([graph.pose(k) for k in keyframe])
         ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], np.array(direction))
         return Observations.of_lines(poses[:, :3, 3], ahead, np.array(sigma), np.array(range_), np.array(range_sigma))
 
     def move(self, new_T_old: Floats) -> None:
-        """Put it where the map has been moved to by a pose (4, 4)."""
+        """Move its position and lines by a pose (4, 4)."""
         turn = new_T_old[:3, :3]
         self.position = turn @ self.position + new_T_old[:3, 3]
         self.covariance = turn @ self.covariance @ turn.T
@@ -95,7 +84,7 @@ class Track:
 
 
 def update_positions(tracks: Sequence[Track]) -> None:
-    """Where tracks are, all at once: where the last of their rays meet; along these, what they do not tell stays."""
+    """Triangulate the newest rays of every track in one batch, with a weak prior on the distance along the last ray."""
     if not tracks:
         return
     number = np.array([len(t._lines) for t in tracks])

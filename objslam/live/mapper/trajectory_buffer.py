@@ -1,6 +1,4 @@
-"""The last stretch of the robot's path, as a stream: poses between the stamps, and the drift gathered by then."""
-
-from __future__ import annotations
+"""A buffer of the newest poses of a path, with interpolation and accumulated drift."""
 
 from bisect import bisect_left
 from typing import NamedTuple
@@ -12,12 +10,11 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.frontend.odometry_drift import add_step
 
-_PLANAR = 1e-6
-"""m and rad by which a pose may leave the plane of the first one, as in `geometry.is_planar`; larger calls more planar."""
+_PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_planar`. A larger value accepts more paths.
 
 
 class OnPath(NamedTuple):
-    """Where a path has the robot at a stamp: pose (4, 4), drift (6, 6) gathered by then, number of the stretch."""
+    """A pose (4, 4) on a path, the drift (6, 6) accumulated up to the pose, and the number of its stretch."""
 
     pose: Floats
     drift: Floats
@@ -25,78 +22,68 @@ class OnPath(NamedTuple):
 
 
 class PathBuffer:
-    """Poses of base as they come, the newest `seconds` of them; drift is summed up in the frame of the first pose.
+    """The poses of base from the last `seconds` of a path. Drift is accumulated in the frame of the first pose.
 
-    max_gap: s; a longer gap between two poses ends a stretch, and nothing is read off it.
-    planar: whether all of them so far keep one height, roll and pitch. stretch_begin: the stamp that the newest stretch
-    begins at, inf without any.
+    max_gap: s, a longer gap ends a stretch and is not interpolated. planar: whether all poses so far have one height, roll
+    and pitch. newest: the stamp of the newest pose. stretch_begin: the first stamp of the newest stretch, inf without poses.
     """
 
     def __init__(self, settings: Odometry, seconds: float, max_gap: float) -> None:
         self._settings, self._seconds, self._max_gap = settings, seconds, max_gap
         self._stamps: list[float] = []
-        self._poses: list[Floats] = []
-        self._drift: list[Floats] = []
-        self._stretch: list[int] = []
+        self._path: list[OnPath] = []
         self._from_start = self._last = np.eye(4)
         self.planar = True
         self.newest = -np.inf
         self.stretch_begin = np.inf
 
     def append(self, stamp: float, pose: Floats) -> None:
-        """One more pose (4, 4), newer than all before; it and its drift are not to be changed."""
+        """Append a pose (4, 4) that is newer than all others. The caller must not change its array."""
         if not self._stamps:
             self._from_start, drift, stretch = inverse(pose), np.zeros((6, 6)), 0
             self._last = self._from_start @ pose
         else:
             last, self._last = self._last, self._from_start @ pose
-            self.planar = self.planar and _upright(self._last)
-            drift = add_step(self._drift[-1], last, self._last, self._settings, self.planar)
-            stretch = self._stretch[-1] + (stamp - self.newest > self._max_gap)
-        if not self._stretch or stretch != self._stretch[-1]:
+            x, y, z, height = self._last[2].tolist()
+            self.planar = self.planar and max(abs(x), abs(y), abs(z - 1.0), abs(height)) <= _PLANAR
+            drift = add_step(self._path[-1].drift, last, self._last, self._settings, self.planar)
+            stretch = self._path[-1].stretch + (stamp - self.newest > self._max_gap)
+        if not self._path or stretch != self._path[-1].stretch:
             self.stretch_begin = stamp
         self._stamps.append(stamp)
-        self._poses.append(pose)
-        self._drift.append(drift)
-        self._stretch.append(stretch)
+        self._path.append(OnPath(pose, drift, stretch))
         self.newest = stamp
         half = len(self._stamps) // 2
-        if self._stamps[half] < stamp - self._seconds:  # now and then, for it moves all that stays
-            for column in (self._stamps, self._poses, self._drift, self._stretch):
-                del column[:half]
+        if self._stamps[half] < stamp - self._seconds:  # Each deletion moves all other poses, so it must be rare.
+            del self._stamps[:half], self._path[:half]
 
     @property
     def oldest(self) -> float:
-        """The stamp of the oldest pose, inf without any."""
+        """The stamp of the oldest pose, inf without poses."""
         return self._stamps[0] if self._stamps else np.inf
 
     def stretch(self, stamp: float) -> int | None:
-        """The number of the stretch that a stamp lies on; None outside the path or in a gap that is too long."""
+        """Return the number of the stretch at a stamp. None outside the path or in a gap above max_gap."""
         if not self.oldest <= stamp <= self.newest:
             return None
         after = bisect_left(self._stamps, stamp)
-        on = self._stretch[after]
-        return on if self._stamps[after] == stamp or self._stretch[after - 1] == on else None
+        on = self._path[after].stretch
+        return on if self._stamps[after] == stamp or self._path[after - 1].stretch == on else None
 
     def at(self, stamp: float) -> OnPath | None:
-        """Where the robot was at a stamp; None outside the path or in a gap that is too long."""
+        """Return the interpolated pose and drift at a stamp. None outside the path or in a gap above max_gap."""
         stretch = self.stretch(stamp)
         if stretch is None:
             return None
         after = bisect_left(self._stamps, stamp)
         if self._stamps[after] == stamp:
-            return OnPath(self._poses[after], self._drift[after], stretch)
-        pair = slice(after - 1, after + 1)
-        before, then = self._stamps[pair]
-        poses, _ = interpolate(np.array([before, then]), np.array(self._poses[pair]), np.array([stamp]), self._max_gap)
-        share = (stamp - before) / (then - before)
-        return OnPath(poses[0], (1 - share) * self._drift[after - 1] + share * self._drift[after], stretch)
+            return self._path[after]
+        (begin, end), (before, then) = self._stamps[after - 1 : after + 1], self._path[after - 1 : after + 1]
+        pair, asked = np.array([before.pose, then.pose]), np.array([stamp])
+        poses, _ = interpolate(np.array([begin, end]), pair, asked, self._max_gap)
+        share = (stamp - begin) / (end - begin)
+        return OnPath(poses[0], (1 - share) * before.drift + share * then.drift, stretch)
 
     def from_start(self, pose: Floats) -> Floats:
-        """A pose (4, 4) in the frame of the first one."""
+        """Return a pose (4, 4) in the frame of the first pose."""
         return np.asarray(self._from_start @ pose)
-
-
-def _upright(pose: Floats) -> bool:
-    x, y, z, height = pose[2].tolist()
-    return max(abs(x), abs(y), abs(z - 1.0), abs(height)) <= _PLANAR

@@ -1,4 +1,1 @@
-"""ROS messages of a live robot: which topics to take, and what each message tells a session.
-
-How messages arrive is in `live.adapters`; what they mean by themselves is in `ros`.
-"""
+"""The ROS messages of a running robot become pushes. `live.adapters` receive them, and `ros` knows their types."""

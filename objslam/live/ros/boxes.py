@@ -1,25 +1,32 @@
-"""The boxes of one image on their way to a session, and how what is dropped on it is told."""
+"""The boxes of one image before they are pushed, and the depth images that give their depths."""
 
-from __future__ import annotations
-
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from objslam.core.arrays import Floats
+from objslam.core.camera import Camera
+from objslam.frontend.box_depths import MAX_IMAGE_LAG, box_depth
+from objslam.ros.bag.records import frame_name
+from objslam.ros.messages.decode import DecodeError
+from objslam.ros.messages.images import DEPTH_SCALE, depth_image
 
-Drop = Callable[[str, str], None]
-"""Called with the reason why something was dropped, and where."""
+_KEPT = 30  # The depth images kept per frame: 1 s at 30 Hz, the delay of a detector. A larger number costs memory.
+_MAX_FRAMES = 16  # The most frames with depth images. It bounds the memory.
+Drop = Callable[[str, str], None]  # A function that counts a drop, given its reason and its place.
 
 
 @dataclass
 class Boxes:
-    """The boxes of one image: stamp, s; frame: the camera's, as tf names it, "" where unknown; arrived: s, any clock.
+    """The boxes of one image.
 
-    points: by the index of its box, a tag that comes without a box (see boxes2d). size: of the image, where known.
-    whole: as `types.Detections` has it. image: (H, W, 3) uint8 BGR, where it was at hand.
+    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: s, any clock. points: by the index of a box, the tag that
+    replaces the box, (5, 3) m in the camera frame. size: (width, height) of the image, px, None if unknown. whole: as in
+    `types.Detections`. image: (H, W, 3) uint8 BGR, None if not available.
     """
 
     topic: str
@@ -37,4 +44,49 @@ class Boxes:
 
     @property
     def place(self) -> str:
+        """The topic and the stamp, as reports name the image."""
         return f"{self.topic} at {self.stamp:.3f} s"
+
+
+class DepthImages:
+    """Keeps depth image messages, and decodes a message when boxes need it."""
+
+    def __init__(self, drop: Drop) -> None:
+        self._drop = drop
+        self._kept: dict[str, deque[tuple[float, str, Any]]] = {}
+
+    def add(self, topic: str, message: Any, stamp: float) -> None:
+        """Keep a depth image that is registered to the camera of its frame. stamp: s."""
+        frame = frame_name(message.header.frame_id)
+        if frame not in self._kept and len(self._kept) >= _MAX_FRAMES:
+            self._drop(f"depth image beyond the first {_MAX_FRAMES} frames", topic)
+            return
+        self._kept.setdefault(frame, deque(maxlen=_KEPT)).append((stamp, topic, message))
+
+    def awaits(self, boxes: Boxes) -> bool:
+        """Return whether the depth image of the boxes may still arrive, because all present ones are older."""
+        kept = self._kept.get(boxes.frame)
+        return kept is not None and kept[-1][0] < boxes.stamp - MAX_IMAGE_LAG
+
+    def at(self, boxes: Boxes, camera: Camera) -> Floats | None:
+        """Return the depths (B,) of boxes, m, NaN where unknown; None if their camera has no depth images."""
+        kept = self._kept.get(boxes.frame)
+        if not kept:
+            return None
+        depths = np.full(len(boxes.boxes), np.nan)
+        stamp, topic, message = min(kept, key=lambda entry: abs(entry[0] - boxes.stamp))
+        place = f"{topic} at {stamp:.3f} s"
+        if abs(stamp - boxes.stamp) > MAX_IMAGE_LAG:
+            self._drop("depth of a frame without a depth image", boxes.place)
+            return depths
+        try:
+            image = depth_image(message)
+        except DecodeError as error:
+            self._drop("depth image that cannot be decoded", f"{place}: {error}")
+            return depths
+        if image.shape != (camera.height, camera.width):
+            self._drop("depth image that has not the camera's size", place)
+            return depths
+        for index in np.flatnonzero(np.isfinite(boxes.boxes).all(axis=1)).tolist():
+            depths[index] = box_depth(image, boxes.boxes[index]) / DEPTH_SCALE
+        return depths

@@ -1,4 +1,4 @@
-"""A detector on live images, in a thread of its own: the newest image of each topic counts, older ones are dropped."""
+"""A detector in its own thread, which always processes the newest image of each topic."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from objslam.ros.messages.images import colour_image
 if TYPE_CHECKING:
     from objslam.detection import Detector
 
-_MAX_TOPICS = 64  # The most topics whose images wait; chosen to bound the memory.
-_IN_A_ROW = 5  # The images of a topic that fail one after the other before a user is told; larger: told later.
-_FAILED, _ENDED = "image that the detector failed on", "image that came after the detector had ended"
+_MAX_TOPICS = 64  # The most topics with a waiting image. It bounds the memory.
+_IN_A_ROW = 5  # The number of consecutive failed images of a topic before a warning. A larger number warns later.
+_FAILED, _ENDED = "image that the detector failed on", "image that arrived after the detector had ended"
 
 
 class DetectorWorker:
-    """Runs a detector on the images that are offered and hands on what it finds.
+    """Runs a detector on offered images, and delivers its boxes.
 
-    One image a topic waits at a time; a newer one takes its place, so boxes are never older than one detection takes for
-    each topic. What is dropped is counted.
+    One image per topic waits, until a newer image replaces it. So boxes are at most one detection per topic old.
     """
 
     def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
@@ -36,24 +35,16 @@ class DetectorWorker:
         self._thread: threading.Thread | None = None
         self._closed = self._ended = False
         self._in_a_row: Counter[str] = Counter()
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
 
     def start(self, deliver: Callable[[Boxes], None], drop: Drop, warn: Callable[[str], None]) -> None:
-        """Start the thread that runs the detector.
-
-        The three functions may be called from any thread, also from the detector's own.
-
-        Args:
-            deliver: receives the boxes of an image.
-            drop: receives the reason and the place of each drop.
-            warn: receives what a user should know.
-        """
+        """Start the detector's thread. Any thread may call deliver (boxes), drop (reason, place) and warn (message)."""
         self._deliver, self._drop, self._warn = deliver, drop, warn
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
         self._thread.start()
 
     def offer(self, topic: str, message: Any, stamp: float) -> None:
-        """Take an image message; returns at once."""
+        """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
             late = self._waiting.pop(topic, None)
@@ -64,12 +55,12 @@ class DetectorWorker:
         if ended:
             self._drop(_ENDED, f"{topic} at {stamp:.3f} s")
         elif late is not None:
-            self._drop("image that a newer one overtook before the detector had time for it", f"{topic} at {late[1]:.3f} s")
+            self._drop("image replaced by a newer one before the detector was free", f"{topic} at {late[1]:.3f} s")
         elif full:
             self._drop(f"image of a topic beyond the first {_MAX_TOPICS}", topic)
 
     def close(self) -> None:
-        """End the thread, after the image that it is at."""
+        """End the thread after its present image."""
         with self._ready:
             self._closed = True
             self._ready.notify()
@@ -80,16 +71,15 @@ class DetectorWorker:
         try:
             while (waiting := self._next()) is not None:
                 self._look(*waiting)
-        except BaseException as error:  # noqa: BLE001 - a thread that is told to exit has nobody else to tell
+        except BaseException as error:  # noqa: BLE001 - the warning reports it: nothing catches what a thread raises
             with self._ready:
                 self._ended = True
                 left, self._waiting = self._waiting, {}
-            self._warn(f"the detector has ended, no image is looked at any more: {_one_line(error)}")
+            self._warn(f"the detector has ended, later images are dropped: {_one_line(error)}")
             for topic, (_, stamp) in left.items():
                 self._drop(_ENDED, f"{topic} at {stamp:.3f} s")
 
     def _next(self) -> tuple[str, Any, float] | None:
-        """The topic, message and stamp of the image that has waited longest; None in the end."""
         with self._ready:
             self._ready.wait_for(lambda: self._waiting or self._closed)
             if self._closed:
@@ -98,7 +88,6 @@ class DetectorWorker:
             return topic, *self._waiting.pop(topic)
 
     def _look(self, topic: str, message: Any, stamp: float) -> None:
-        """Find the boxes of an image and hand them on; whatever goes wrong is counted, and the next image may do better."""
         reason = _FAILED
         try:
             image = colour_image(message)
@@ -118,19 +107,19 @@ class DetectorWorker:
             self._in_a_row.pop(topic, None)
 
     def _fail(self, reason: str, topic: str, stamp: float, error: BaseException) -> None:
-        """Count an image without boxes; where one of a topic follows the other, say so, once."""
+        """Count a failed image, and warn once per topic when several fail in a row."""
         why = _one_line(error)
         self._drop(reason, f"{topic} at {stamp:.3f} s: {why}")
         self._in_a_row[topic] += 1
-        if self._in_a_row[topic] == _IN_A_ROW and topic not in self._told:
-            self._told.add(topic)
+        if self._in_a_row[topic] == _IN_A_ROW and topic not in self._warned:
+            self._warned.add(topic)
             self._warn(
                 f"{topic}: the detector gave no boxes for {_IN_A_ROW} images in a row, the last at {stamp:.3f} s: {why}"
             )
 
 
 def _one_line(error: BaseException) -> str:
-    """What went wrong; whose message is no sentence of ours is named by its kind."""
+    """Return the message of an error, with its type unless the error is from objslam."""
     if isinstance(error, (ObjslamError, DecodeError)):
         return first_line(error)
     kind = type(error).__name__

@@ -1,4 +1,4 @@
-"""ROS messages become pushes: odometry, transforms, calibrations, boxes, images, whatever middleware brought them."""
+"""Turns ROS messages of any middleware into pushes: odometry, transforms, calibrations, boxes and images."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ from objslam.sources.ros_bag.options import RosOptions
 if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
-_GRACE = 2.0  # The time before tf stands in for an odometry topic, s; larger: a robot without one starts later.
-_LONGEST = 160  # The most letters of a place that the ledger keeps; chosen for a line that can be read.
-_MAX_TRACKS = 100_000  # The most names of tracks that are kept; chosen to bound the memory.
+_GRACE = 2.0  # The time before tf replaces an odometry topic, s. A larger value starts a robot without such a topic later.
+_LONGEST = 160  # The most letters of a place in the ledger. It keeps lines readable.
+_MAX_TRACKS = 100_000  # The most track names that are kept. It bounds the memory.
 
 
 class RosMessages:
-    """Takes messages of ROS 1 or 2 by type and pushes what they say into a sink; callable from any thread.
+    """Takes messages of ROS 1 or 2 by type, and pushes their content into a sink. Any thread may call it.
 
-    Odometry comes from one topic, else from tf; localisation from tf (each new map -> odom, with the odometry that follows
-    it), or from poses in map. What cannot be used is counted in `ledger`. `chosen` holds the topics that the options choose.
+    Odometry comes from one topic, or from tf without a topic. Localisation comes from poses in map, or from tf: each new
+    map -> odom is pushed with the next odometry.
+    ledger: the counts of unusable messages. chosen: the topics of the options. sources: the used topic, or "tf", by role.
     """
 
     def __init__(
@@ -57,9 +58,8 @@ class RosMessages:
         self._lock = threading.RLock()
         self._tf = TfBuffer()
         self._cameras = Cameras(sink, self._tf, self._base, self.refuse, calibrations, options.rectified)
-        self._sources = {role: names[0] for (_, role), names in self.chosen.names.items() if len(names) == 1}
-        self._child = ""
-        self._odom = ""
+        self.sources = {role: names[0] for (_, role), names in self.chosen.names.items() if len(names) == 1}
+        self._child = self._odom = ""
         self._correction: Floats | None = None
         self._corrected = False
         self._tf_since: float | None = None
@@ -69,7 +69,7 @@ class RosMessages:
             detector.start(self.add_boxes, self.refuse, self._warn)
 
     def receive(self, type_: str, topic: str, message: Any, received: float) -> None:
-        """Take a message. type_: as ROS 2 writes it (nav_msgs/msg/Odometry). received: s since 1970, for unset stamps."""
+        """Take a message. type_: its type in ROS 2, as nav_msgs/msg/Odometry. received: s since 1970, for unset stamps."""
         with self._lock:
             if type_ == ODOMETRY:
                 self._take_odometry(topic, message, received)
@@ -81,47 +81,43 @@ class RosMessages:
                 self._take_boxes(type_, topic, message, received)
             elif type_ == CAMERA_INFO:
                 self._cameras.add_info(topic, message)
-                self._cameras.settle(self._clock())
+                self.tick()
             elif type_ in IMAGES and topic in self.chosen.of("depth"):
-                self._cameras.add_depth(topic, message, _stamp(message.header, received))
-                self._cameras.settle(self._clock())
+                self._cameras.depths.add(topic, message, _stamp(message.header, received))
+                self.tick()
             elif type_ in IMAGES and self._detector is not None:
                 self._detector.offer(topic, message, _stamp(message.header, received))
 
     def refuse(self, reason: str, where: str, count: int = 1) -> None:
-        """Count what cannot be used, from any thread."""
+        """Count an unusable message, from any thread."""
         with self._lock:
             self.ledger.drop(reason, count, where[:_LONGEST] or None)
 
     def tick(self) -> None:
-        """To be called some times a second: gives up on what has waited too long."""
+        """Push or drop the boxes that wait. An adapter calls it several times a second."""
         with self._lock:
             self._cameras.settle(self._clock())
 
     def add_boxes(self, boxes: Boxes) -> None:
-        """Push the boxes of an image, however they were found."""
+        """Push the boxes of an image, or keep them until their camera is known."""
         with self._lock:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """The image (H, W, 3), uint8 BGR, that the detector saw at a stamp, s; None where it is not one of the newest."""
+        """Return the detector's image (H, W, 3), uint8 BGR, at a stamp, s; None if it is not among the newest."""
         with self._lock:
             return self._cameras.image(camera, stamp)
-
-    def serves(self, role: str) -> str | None:
-        """The topic (or "tf") that plays a role by now."""
-        return self._sources.get(role)
 
     def _warn(self, message: str) -> None:
         with self._lock:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Whether a source plays a role: the one that was chosen, else the first that came."""
-        if self._sources.setdefault(role, source) == source:
+        """Return whether a source is used for a role: the chosen source, or else the first that arrived."""
+        if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:
-            self.refuse(f"{role} from another topic than the one taken", source)
+            self.refuse(f"{role} from a second topic", source)
         return False
 
     def _base(self) -> str:
@@ -135,21 +131,22 @@ class RosMessages:
         if not self._takes(role, topic):
             return
         if pose is None:
-            self.refuse(f"{role} message that is no pose (not finite, or a zero quaternion)", f"{topic} at {stamp:.3f} s")
+            fault = "message without a valid pose (not finite or a zero quaternion)"
+            self.refuse(f"{role} {fault}", f"{topic} at {stamp:.3f} s")
             return
         base = self._base() if child else ""
         if child and base != child and {child, base} <= self._tf.frames:
             try:
                 pose, covariance = pose @ self._tf.at(child, base, stamp), None
             except UnknownTransform as unknown:
-                self.refuse(f"{role} message at whose time its frame's place on the robot is not known", str(unknown))
+                self.refuse(f"{role} message without a transform from its frame to the robot at that time", str(unknown))
                 return
         if role == "localization":
             self._sink.push_localization(stamp, pose, covariance)
             return
         if (frame, child) != (self._odom, self._child):
             self._odom, self._child = frame, child
-            with suppress(UnknownTransform):  # no localisation by tf, so far
+            with suppress(UnknownTransform):  # tf gives no localisation yet
                 self._correct(frame)
         self._push_odometry(stamp, pose, covariance)
 
@@ -160,13 +157,13 @@ class RosMessages:
             self._sink.push_localization(stamp, self._correction @ odom_T_base)
 
     def _take_pose(self, topic: str, message: Any, received: float) -> None:
-        if topic not in self.chosen.of("localization"):  # a goal is a pose too: nothing is taken unasked
+        if topic not in self.chosen.of("localization"):  # a goal is a pose too, so only chosen topics are used
             return
         stamp, covariant = _stamp(message.header, received), hasattr(message.pose, "pose")
         place = message.pose.pose if covariant else message.pose
         pose = one_pose(place.position, place.orientation)
         if pose is None:
-            self.refuse("localization message that is no pose (not finite, or a zero quaternion)", topic)
+            self.refuse("localization message without a valid pose (not finite or a zero quaternion)", topic)
             return
         self._sink.push_localization(stamp, pose, _covariance(message.pose.covariance) if covariant else None)
 
@@ -179,12 +176,12 @@ class RosMessages:
             except ValueError as error:
                 frames = f"{transform.header.frame_id} -> {transform.child_frame_id}"
                 self.refuse(str(error), f"{topic}: {plain(frames)}")
-        with suppress(UnknownTransform):  # the tree is not whole yet: the boxes that wait for what is missing will say so
+        with suppress(UnknownTransform):  # waiting boxes report what is missing in an incomplete tree
             self._read_path(changed)
-        self._cameras.settle(self._clock())
+        self.tick()
 
     def _read_path(self, changed: set[str]) -> None:
-        """Odometry and localisation out of the transforms that have just changed."""
+        """Push odometry and localisation from the changed transforms."""
         base = self._base()
         above = self._tf.above(base)
         odom = self._odom or find_odom(above)
@@ -202,14 +199,12 @@ class RosMessages:
             self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
 
     def _news(self, top: str, base: str) -> float | None:
-        """The newest stamp at which top_T_base is known, None where it is the same as last time, or all is static."""
-        stamp = self._tf.newest(top, base)
-        news = None if stamp == self._tf_stamp else stamp
-        self._tf_stamp = stamp
-        return news
+        """Return the newest stamp of top_T_base; None if it is the same as last time or all transforms are static."""
+        before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
+        return None if self._tf_stamp == before else self._tf_stamp
 
     def _correct(self, odom: str) -> None:
-        """A new map -> odom: it is pushed with the odometry that comes next. One that is only repeated tells nothing new."""
+        """Keep map -> odom to be pushed with the next odometry, unless it only repeats the last one."""
         world = find_world(self._tf.above(odom)[1:])
         if not world or not self._takes("localization", TF):
             return
@@ -218,9 +213,9 @@ class RosMessages:
             self._correction, self._corrected = correction, True
 
     def _odometry_by_tf(self) -> bool:
-        """Whether tf gives the odometry: where a user says so, or no topic has come up for a while."""
-        if "odometry" in self._sources:
-            return self._sources["odometry"] == TF
+        """Return whether tf gives the odometry: by the user's choice, or because no topic has appeared for a while."""
+        if "odometry" in self.sources:
+            return self.sources["odometry"] == TF
         now = self._clock()
         self._tf_since = now if self._tf_since is None else self._tf_since
         return now - self._tf_since > _GRACE
@@ -229,22 +224,22 @@ class RosMessages:
         stamp = _stamp(message.header, received)
         try:
             found = list(find_boxes(type_, message))
-            rows = np.array([box for box, *_ in found], dtype=np.float64).reshape(-1, 4)
-            scores = np.array([score for _, _, score, _, _ in found], dtype=np.float64)
+            rows = np.array([f.box for f in found], dtype=np.float64).reshape(-1, 4)
+            scores = np.array([f.score for f in found], dtype=np.float64)
         except WRONG_LAYOUT as error:
-            self.refuse("message not laid out as detections are", f"{topic}: {error}")
+            self.refuse("detection message with an unexpected layout", f"{topic}: {error}")
             return
         if len(found) > MAX_BOXES:
             self.refuse(f"message with more than {MAX_BOXES} detections", topic)
             return
         frame = message.header.frame_id
-        if not frame and found:  # some detectors fill in the header of each box alone
+        if not frame and found:  # some detectors fill in only the header of each box
             frame = getattr(getattr(next(iter(getattr(message, "detections", ())), None), "header", None), "frame_id", "")
-        labels = [label or self._options.label or "" for _, label, _, _, _ in found]
-        if len(self._tracks) > _MAX_TRACKS:  # a tracker that never repeats a name says nothing by them
+        labels = [f.label or self._options.label or "" for f in found]
+        if len(self._tracks) > _MAX_TRACKS:  # a tracker that never repeats a name gives no information
             self._tracks.clear()
-        tracks = [track_number(track, self._tracks) for _, _, _, track, _ in found]
-        points = {index: place for index, (*_, place) in enumerate(found) if place is not None}
+        tracks = [track_number(f.track, self._tracks) for f in found]
+        points = {i: f.points for i, f in enumerate(found) if f.points is not None}
         known = tracks if any(track >= 0 for track in tracks) else None
         place = topic, stamp, frame_name(frame), self._clock()
         self._cameras.add(Boxes(*place, rows, labels, scores, known, points, whole=is_tags(type_)))
@@ -255,6 +250,6 @@ def _stamp(header: Any, received: float) -> float:
 
 
 def _covariance(values: Any) -> Floats | None:
-    """(6, 6), None where nobody has filled it in."""
+    """Return a covariance (6, 6); None if the message does not fill it in."""
     matrix = np.array(values, dtype=np.float64)
     return matrix.reshape(6, 6) if matrix.size == 36 and np.isfinite(matrix).all() and matrix.any() else None

@@ -1,4 +1,1 @@
-"""A session: messages checked and queued, journalled, worked in by a thread, shown as snapshots, ended with a result.
-
-The map itself is in `live.mapper`; where messages come from is in `live.adapters`.
-"""
+"""A session turns messages into a map and a result. `live.mapper` makes the map, and `live.adapters` bring the messages."""

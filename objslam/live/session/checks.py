@@ -1,10 +1,8 @@
-"""What a message must be to be taken: values of any type as the numbers, names and cameras that they stand for, or None."""
-
-from __future__ import annotations
+"""Checks of pushed messages: values of any type become valid numbers, names, cameras and frames, or None."""
 
 import math
 from collections.abc import Mapping, Set
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +12,17 @@ from objslam.core.camera import COEFFICIENTS, Camera
 from objslam.core.types import MAX_BOXES
 from objslam.sources.journal.records import FrameMessage
 
-LARGEST = 1e9
-"""m, or px; numbers beyond it are no lengths. Larger takes more nonsense."""
-
-_LATEST = 1e11
-"""s; stamps beyond it are no stamps, since a float has no microseconds there."""
-_RIGID = 1e-3
-"""The most that an entry of R^T R may differ from the identity; larger takes matrices that are no rotation."""
-_LONGEST_NAME = 1000
-"""Letters that the name of a camera may have."""
-_LETTERS = 80
-"""Letters of a name that a report tells."""
-_NUMBERS = "iufO"
-"""Kinds of numpy arrays that may hold numbers: integers, unsigned ones, floats, and objects."""
-_EXACT = 2**53
-"""Whole numbers below it are exact in a float."""
+LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more nonsense.
+_LATEST = 1e11  # The largest valid stamp, s. A float has no microseconds beyond it. A larger value accepts more nonsense.
+_RIGID = 1e-3  # The most that an entry of R^T R differs from the identity. A larger value accepts worse rotations.
+_LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
+_LETTERS = 80  # The most letters of a text in a report. A larger number makes longer lines.
+_NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
+_EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
 def floats(values: object, *shape: int) -> Floats | None:
-    """Values as an array of its own of that shape, None where they are none; without a box, any empty list has the shape."""
+    """Copy values into an array of a shape; None if that fails. An empty list fits any shape that holds no number."""
     found = _array(values, np.float64)
     if found is None or found.shape == shape:
         return found
@@ -40,7 +30,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Track ids (count,), -1 where unknown, None where they are none; None or a list, as `Sink.push_detections` has it."""
+    """Copy the track ids of `Sink.push_detections` into an array (count,), -1 where unknown; None if they are invalid."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)
@@ -55,40 +45,40 @@ def track_numbers(values: object, count: int) -> Ints | None:
 
 
 def stamp_of(value: object) -> float | None:
-    """A stamp, s, None where it is not finite or no number."""
+    """Return a stamp, s; None if it is no number, not finite or out of range."""
     found = floats(value)
     return float(found) if found is not None and abs(float(found)) <= _LATEST else None
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
-    """Labels in their order, None where they have none."""
+    """Return the labels of an ordered collection; None for a text or an unordered collection."""
     if isinstance(labels, str | bytes | Mapping | Set) or not _is_short(labels):
         return None
     try:
         return tuple(labels)  # type: ignore[arg-type]
-    except Exception:  # noqa: BLE001 - what somebody else made may raise anything: the message is refused and counted
+    except Exception:  # noqa: BLE001 - a foreign object may raise anything; its message is refused and counted
         return None
 
 
 def is_name(value: object) -> bool:
-    """Whether a value is a text that can name something on one line."""
+    """Return whether a value is a printable text on one line that is not blank."""
     return isinstance(value, str) and value.isprintable() and bool(value.strip())
 
 
 def is_camera_name(value: object) -> bool:
-    """Whether a value can name a camera."""
+    """Return whether a value can name a camera."""
     return is_name(value) and len(str(value)) <= _LONGEST_NAME
 
 
 def told(value: object) -> str:
-    """A value of any type as a report names it: text and floats themselves, else what type it is."""
+    """Return how a report names a value: a text or a float by itself, any other value by its type."""
     if isinstance(value, str):
         return value[:_LETTERS] if value.isprintable() else ascii(value[:_LETTERS])
     return f"{value:.3f}" if isinstance(value, float) else f"of type {type(value).__name__}"
 
 
 def rigid(pose: object) -> Floats | None:
-    """The rigid pose (4, 4) as an array of its own, None where it is none."""
+    """Copy a rigid pose into an array (4, 4); None if it is not rigid."""
     matrix = floats(pose, 4, 4)
     if matrix is None or not np.isfinite(matrix).all() or np.abs(matrix[:3]).max() > LARGEST:
         return None
@@ -100,7 +90,7 @@ def rigid(pose: object) -> Floats | None:
 
 
 def sound_camera(camera: object) -> Camera | str:
-    """The camera with arrays of its own; else what is wrong with it, to be said after "camera"."""
+    """Return a copy of a camera; if the camera is invalid, return the fault, which is worded to follow "camera"."""
     if not isinstance(camera, Camera) or not is_camera_name(camera.name):
         return "without a name"
     matrix, distortion = floats(camera.matrix, 3, 3), _array(camera.distortion, np.float64)
@@ -112,49 +102,33 @@ def sound_camera(camera: object) -> Camera | str:
     model: object = camera.distortion_model
     counts = COEFFICIENTS.get(camera.distortion_model, ()) if isinstance(model, str) else ()
     if distortion is None or distortion.ndim != 1 or len(distortion) not in counts or not np.isfinite(distortion).all():
-        return "with a lens model that is not known"
+        return "with an unknown lens model"
     base_T_camera = rigid(camera.base_T_camera)
     if base_T_camera is None:
-        return "whose mount is no pose"
+        return "whose mount is not a rigid pose"
     scale = floats(camera.depth_scale)
     if scale is None or not 0 < float(scale) < math.inf:
         return "whose depth scale is not above zero"
     sees_size: object = camera.sees_size
     if not isinstance(sees_size, bool | np.bool_):
-        return "that does not say whether it sees sizes"
+        return "whose sees_size is neither true nor false"
     lens = matrix, camera.distortion_model, distortion
     return Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size))
 
 
-class SoundFrame(NamedTuple):
-    """A frame as a message, without boxes that cannot be right; None where it is malformed as a whole.
-
-    fault: what is wrong with it as a whole, to be said after that something was dropped. where: what a report calls it.
-    left_out: boxes by what is wrong with them.
-    """
-
-    message: FrameMessage | None
-    fault: str
-    where: str
-    left_out: dict[str, int]
-
-
 def sound_frame(
-    stamp: object,
-    camera: str,
-    boxes: object,
-    labels: object,
-    scores: object,
-    depths: object,
-    track_ids: object,
-    whole: object,
-) -> SoundFrame:
-    """A frame as `Sink.push_detections` is given it, of values of any type."""
+    stamp: Any, camera: str, boxes: Any, labels: Any, scores: Any, depths: Any, track_ids: Any, whole: Any
+) -> tuple[FrameMessage | None, str, str, dict[str, int]]:
+    """Check the arguments of `Sink.push_detections`, which may be of any type.
+
+    Return the frame without its invalid boxes (None if the whole frame is malformed), the reason for dropping the whole
+    frame, the frame's name in reports, and the number of invalid boxes by reason.
+    """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:
-        return SoundFrame(None, "frame without a stamp", where, {})
+        return None, "frame without a stamp", where, {}
     where = f"{where}, stamp {given:.3f}"
-    malformed = SoundFrame(None, "frame that is malformed", where, {})
+    malformed = None, "frame that is malformed", where, dict[str, int]()
     words = label_list(labels)
     if words is None or not is_camera_name(camera) or not isinstance(whole, bool | np.bool_):
         return malformed
@@ -180,13 +154,12 @@ def sound_frame(
             left_out[reason] = int((good & ~fine).sum())
             good &= fine
     kept = np.flatnonzero(good)
-    names_kept = tuple(str(words[i]) for i in kept.tolist())
-    columns = corners[kept], names_kept, score[kept], depth[kept], track[kept]
-    return SoundFrame(FrameMessage(given, camera, *columns, bool(whole)), "", where, left_out)
+    columns = corners[kept], tuple(str(words[i]) for i in kept.tolist()), score[kept], depth[kept], track[kept]
+    return FrameMessage(given, camera, *columns, bool(whole)), "", where, left_out
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Values as an array of its own, None where they are no numbers (but text, truth values, times) or no array at all."""
+    """Copy values into an array; None if they are no numbers (text, truth values, times) or no array."""
     if not _is_short(values, scalar=True):
         return None
     try:
@@ -195,15 +168,15 @@ def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
             if found.dtype.kind not in _NUMBERS:
                 return None
             return found if dtype is None else found.astype(dtype)
-    except Exception:  # noqa: BLE001 - what somebody else made may raise anything: the message is refused and counted
+    except Exception:  # noqa: BLE001 - a foreign object may raise anything; its message is refused and counted
         return None
 
 
 def _is_short(values: object, scalar: bool = False) -> bool:
-    """Whether values are a list of any kind that is not too long to look at, or, where it may be, a scalar."""
+    """Return whether values have a length of at most MAX_BOXES; `scalar` is the answer for values without a length."""
     try:
         return len(values) <= MAX_BOXES  # type: ignore[arg-type]
-    except Exception:  # noqa: BLE001 - the same
+    except Exception:  # noqa: BLE001 - a foreign object may raise anything
         return scalar
 
 
@@ -213,6 +186,5 @@ def _count(value: object) -> int | None:
 
 
 def _is_pinhole(matrix: Floats) -> bool:
-    focal = matrix[0, 0], matrix[1, 1]
     plain = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0, 0, 1])
-    return bool(plain and np.abs(matrix).max() <= LARGEST and min(focal) >= 1 / LARGEST)
+    return bool(plain and np.abs(matrix).max() <= LARGEST and min(matrix[0, 0], matrix[1, 1]) >= 1 / LARGEST)

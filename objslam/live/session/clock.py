@@ -1,25 +1,21 @@
-"""One time that never goes back, whatever the robot's clock does."""
-
-from __future__ import annotations
+"""The session's clock: session time never goes back, even when the robot's clock does."""
 
 from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5
-"""Poses in a row, each newer than the last and all older than what came before, that show a clock set back; larger drops
-more poses until it is followed, and takes fewer late ones for it."""
-_BACK = 0.5
-"""s; what is less far back is late, not from another clock. Larger takes a clock that is set back a little for lateness."""
-_KEPT = 8
-"""Clocks set back that stamps may still belong to; more only cost memory."""
-_MISSED = 0.005
-"""s that the path is taken to have gone on while the clock was set back: a step of 200 Hz odometry."""
+_SURE = 5  # The consecutive older poses that prove a clock set back. A larger number follows it later, but more surely.
+_BACK = 0.5  # The least step of a clock set back, s. A smaller step is lateness. A larger value ignores small steps.
+_KEPT = 8  # The number of earlier clocks that stamps may still belong to. More clocks only cost memory.
+_MISSED = 0.005  # The advance of the path while the clock is set back, s. It is a step of odometry at 200 Hz.
 
 
 @dataclass
 class Clock:
-    """Adds to every stamp what makes the path's stamps increase; shift: s, as of now."""
+    """Converts stamps to session time, in which the stamps of the path increase.
+
+    shift: the time, s, that is now added to a stamp. newest: the newest stamp of the path in session time, s, or -inf.
+    """
 
     shift: float = 0.0
     newest: float = -float("inf")
@@ -27,7 +23,7 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """A stamp of the path as session time, None for one that is late or repeats, and whether the clock was set back."""
+        """Return a path's stamp in session time (None if late or repeated), and whether the clock was set back."""
         time = stamp + self.shift
         if time > self.newest:
             self.newest = time
@@ -47,7 +43,7 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """A stamp of anything else as session time: by the latest clock that puts it between oldest and latest."""
+        """Return any other stamp in session time, by the latest clock that puts it between oldest and latest."""
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:
                 return stamp + shift
@@ -55,9 +51,9 @@ class Clock:
 
 
 class Lead:
-    """Whose stamps set the clock: the odometry's, or the localisation's once it has gone on for max_gap (s) without it.
+    """Chooses the `path` whose stamps set the clock (None before the first pose).
 
-    path: the one that does; None before the first pose.
+    The odometry sets the clock. The localisation takes over when it continues for max_gap (s) without odometry.
     """
 
     def __init__(self, clock: Clock, max_gap: float) -> None:
@@ -67,13 +63,13 @@ class Lead:
         self.path: PathKind | None = None
 
     def choose(self, path: PathKind, at: float) -> None:
-        """A pose of a path comes, at a session time; a path that leads again goes on where it was."""
+        """Update the leading path for a new pose at a session time. A path that leads again resumes at its newest stamp."""
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))
 
     def heard(self, path: PathKind, at: float) -> None:
-        """That pose was taken."""
+        """Record that a pose at a session time was accepted."""
         self._newest[path] = at
         if path == "odometry":
             self._odometry_until = max(self._newest.values())

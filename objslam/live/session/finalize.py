@@ -1,9 +1,6 @@
-"""The end of a session: everything it kept, solved once more as offline does, becomes a result."""
-
-from __future__ import annotations
+"""The end of a session: its keyframes and rays are solved once more as offline, and become a result."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +18,10 @@ from objslam.mapping.describe import describe, summarise
 
 
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
-    """The result of a session: the joint mode's association and solve in turns, from what the session knows.
+    """Return the result of a session: association and solve alternate as in the joint mode, from the session's estimate.
 
-    Where labels tell objects apart, or there are more rays than live.reassociate, its association stands.
-
-    SolveError where nothing was seen.
+    If labels identify objects, or there are more rays than live.reassociate, the session's association is kept. SolveError
+    when no box could be mapped.
     """
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
@@ -37,9 +33,9 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
         came = m.counters.accepted()
         came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
-        missing = [f"no {what} came" for what, kind in kinds.items() if not came.get(kind)]
+        missing = [f"no {what} arrived" for what, kind in kinds.items() if not came.get(kind)]
         hint = "; ".join(missing + ledger.lines())
-        raise SolveError("nothing was seen that could be mapped", where=name, hint=hint or None)
+        raise SolveError("no box could be mapped", where=name, hint=hint or None)
     cameras = tuple(m.cameras)
     if m.by_label or len(rays) > settings.live.reassociate:
         estimate = _solve_joint(keyframes, rays, association, settings, ledger, poses)
@@ -47,15 +43,12 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     else:
         start = InitialEstimate(poses, association, positions)
         solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start)
-    keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
+    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     accepted = m.counters.accepted()
-    counts = {
-        "detection_frames": accepted.get("frames", 0),
-        "frames_on_path": sum(m.frames.values()),
-        "detections": accepted.get("boxes", 0),
-    }
+    counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
+    counts["detections"] = accepted.get("boxes", 0)
     seconds = {"finish": round(time.perf_counter() - begin, 4)}
     summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
     stamps, first = np.unique(keyframes.stamps, return_index=True)
@@ -64,7 +57,7 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         keyframes=keyframes,
         map_T_base=estimate.map_T_base,
         rays=rays,
-        association=association,
+        association=solution.association,
         origins=origins,
         directions=directions,
         residual=residual,
@@ -80,39 +73,36 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
 def _solve_joint(
     keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
 ) -> Estimate:
-    """The joint solve from the session's poses (K, 4, 4), or the one that offline would make, if that fits better.
-
-    What a session rejected early on, when little was known, it may never have looked at in a better light.
-    """
+    """Return the joint solve from the session's poses (K, 4, 4), or the offline solve if its residuals are smaller."""
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements
     from objslam.graph.outlier_rejection import misfit
 
     found = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
-    if not association.count or len(rays) > settings.live.reassociate:
+    few = association.count and len(rays) <= settings.live.reassociate
+    if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return found
-    if keyframes.odom_T_base is None or keyframes.localized_every:
-        return found
-    said = Ledger()
+    other_ledger = Ledger()  # the session may have rejected a ray early, and never tested it again
     try:
-        other = batch_solver.solve_joint(keyframes, rays, association, settings, said)
-    except SolveError:  # then there is nothing to choose from
+        other = batch_solver.solve_joint(keyframes, rays, association, settings, other_ledger)
+    except SolveError:
         return found
     measured = Measurements.of(keyframes, rays, settings)
     before, after = (
-        misfit(one.map_T_base @ keyframes.base_T_camera, one.positions, measured, association) for one in (found, other)
+        misfit(estimate.map_T_base @ keyframes.base_T_camera, estimate.positions, measured, association)
+        for estimate in (found, other)
     )
     if not after < before:
         return found
-    ledger.add(said)
+    ledger.add(other_ledger)
     return other
 
 
 def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats]:
-    """Keyframes in the order of time, rays in theirs, who is whose, camera poses (K, 4, 4) and places (N, 3).
+    """Return keyframes in the order of time, their rays, the association, camera poses (K, 4, 4) and positions (N, 3).
 
-    With a localisation, keyframes that it does not cover are left out, as offline does. Tracks with enough rays are
-    objects too, which the solve may leave unresolved.
+    With a localisation, keyframes that it does not cover are left out, as offline. Tracks with enough rays become objects,
+    which the solve may leave unresolved.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
@@ -130,31 +120,25 @@ def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats
     at = number[r.keyframe]
     rows = np.flatnonzero(at >= 0)
     rows = rows[np.argsort(at[rows], kind="stable")]
-    rays = Rays(
-        keyframe=at[rows],
-        direction=r.direction[rows],
-        sigma=r.sigma[rows],
-        range=r.range[rows],
-        range_sigma=r.range_sigma[rows],
-        label=r.label[rows],
-        score=r.score[rows],
-        box=r.box[rows],
-        track_id=r.track[rows],
-        label_names=tuple(m.labels),
-    )
+    rays = offline_rays(m, rows, at[rows])
     poses = m.graph.poses(k.id[order])
-    frames = m.keyframe_arrays(order)
-    frames = replace(frames, map_T_base=frames.map_T_base.copy())
     kept = np.unique(rays.keyframe)
-    keyframes, rays = seen_something(frames, rays)
-    held, object_ = np.unique(owner[rows], return_inverse=True)
-    none = len(held) > 0 and held[0] < 0
-    association = Association(object_ - int(none), label[held[int(none) :]])
-    return keyframes, rays, association, poses[kept], place[held[int(none) :]]
+    keyframes, rays = seen_something(m.keyframe_arrays(order), rays)
+    owners, index = np.unique(owner[rows], return_inverse=True)
+    objects = owners[owners >= 0]
+    association = Association(index - (len(owners) - len(objects)), label[objects])
+    return keyframes, rays, association, poses[kept], place[objects]
+
+
+def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
+    """Return the rays at these rows (R,) in the type of the offline estimation. keyframe: (R,) their keyframes there."""
+    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
+    columns = {name: getattr(m.rays, name)[rows] for name in names}
+    return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """The object (R,) of each ray, -1 none, tracks after the landmarks, and the label and place of each object."""
+    """Return the object (R,) of each ray, -1 without one, and the objects' labels (N,) and positions (N, 3)."""
     landmarks, rays = m.landmarks, m.rays
     owner = rays.owner.copy()
     first = int(landmarks.id.max(initial=-1)) + 1

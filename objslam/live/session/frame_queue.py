@@ -1,6 +1,4 @@
-"""The frames of a session wait here until the path covers them, and then go into the map in their order."""
-
-from __future__ import annotations
+"""The queue of frames that wait until the path covers them, and then enter the map in the order of their stamps."""
 
 import bisect
 import time
@@ -12,36 +10,31 @@ from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.sources.journal.records import FrameMessage, Message
 
-TOO_SLOW = "frames that waited too long (live.max_lag)"
-"""Why a frame was left out that the session had no time for."""
-_RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or it is too short"
+TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason for dropping a frame that the session had no time for.
+_RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or live.max_lag is too short"
 _NEVER_COVERED = "frames that the path never covered"
 
 
 class FrameQueue:
-    """Works messages into the map. patient: no frame is too old.
+    """Feeds messages to the mapper. patient: whether frames of any age are accepted.
 
-    lag: s from the arrival of the newest frame to its place in the map. worked: when the last one was done, by the clock of
-    `time.perf_counter`.
+    lag: time, s, from the arrival of the newest frame until the map contains it. worked: when the last frame was processed,
+    s, by `time.perf_counter`.
     """
 
     def __init__(self, settings: Settings, counters: Counters, mapper: Mapper, patient: bool) -> None:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
         self._counters, self._mapper, self._patient = counters, mapper, patient
-        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, which it was to come, frame, arrival
+        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, order of arrival, frame, arrival
         self._frames = 0
         self.lag = 0.0
         self.worked = -np.inf
 
-    def recall(self, message: Message) -> None:
-        """Take a message that a journal holds: it is not measured, and no frame is too old."""
-        self._take(message, time.perf_counter(), measured=False)
+    def take(self, message: Message, arrival: float, measured: bool = True) -> bool:
+        """Take a message that arrived at a time, s, and return whether any frame left the queue.
 
-    def take(self, message: Message, arrival: float) -> bool:
-        """Take a message that arrived then; whether it was a frame's turn."""
-        return self._take(message, arrival, measured=True)
-
-    def _take(self, message: Message, arrival: float, measured: bool) -> bool:
+        measured: whether the lag is recorded and limited. It is not for a message of a journal.
+        """
         if isinstance(message, FrameMessage):
             self._frames += 1
             bisect.insort(self._waiting, (message.stamp, self._frames, message, arrival))

@@ -1,19 +1,15 @@
-"""A session: what is pushed from any thread becomes a map in a thread of its own."""
-
-from __future__ import annotations
+"""A session: messages pushed from any thread become a map in the session's own thread."""
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
-from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.snapshot import Snapshot
@@ -28,27 +24,22 @@ from objslam.live.session.snapshots import Describer, take_snapshot
 from objslam.sources.journal.file import Journal, messages
 from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
 
-_MOST_POSES = 20_000
-"""Messages besides frames that may wait, 100 s of odometry at 200 Hz; more cost memory."""
-_IDLE = 0.05
-"""s until the thread looks up where nothing comes, and that a snapshot waits for the next frame; longer answers later."""
-_SHORT = 0.015
-"""s; after a frame that took longer no snapshot is made, for the next one may be there. Longer delays more frames."""
-_LONG = 0.5
-"""s; a snapshot that has been waited for longer is made after any frame. Longer answers later while frames take long."""
-_PATIENCE = 5.0
-"""s that a snapshot is waited for until the last one is returned; longer keeps the caller waiting."""
+_MOST_POSES = 20_000  # The most waiting messages besides frames: 100 s of odometry at 200 Hz. A larger number costs memory.
+_IDLE = 0.05  # The longest sleep of the idle thread and wait of a snapshot for a frame, s. A larger value answers later.
+_SHORT = 0.015  # The longest time of a frame, s, that a snapshot follows. A larger value delays more frames.
+_LONG = 0.5  # The wait for a snapshot, s, after which it follows any frame. A larger value answers later.
+_PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
-class Session:
-    """Implements `Sink`. `start` it, push from any thread, take a `snapshot` at any time, `stop` it for the result.
+class Session(Intake):
+    """A `Sink` that builds a map. `start` it, push from any thread, take a `snapshot` at any time, `stop` it for the result.
 
-    journal: a file that every accepted message is written to first. resume: go on with the journal that is there; its
-    messages are worked in by `start`. Not more than one session writes a journal. patient: no frame is too old, for a
-    source that waits for the session.
+    An error in the session's thread ends the session early. Then `failure` holds the error, every wait for the session ends,
+    pushes are refused, and `stop` returns the result of the messages until then.
 
-    An error in the session's thread ends it early: `failure` tells, nobody who waits for the session goes on waiting, what
-    is pushed is refused, and `stop` gives the result of what came until then.
+    journal: the file that receives every accepted message before it is processed. Only one session may write the file.
+    resume: whether to continue an existing journal, whose messages `start` processes. patient: whether frames of any age are
+    accepted, for a source that waits for the session.
     """
 
     def __init__(
@@ -59,73 +50,39 @@ class Session:
         name: str = "live",
         patient: bool = False,
     ) -> None:
-        self._settings, self._name = settings, name
-        self.counters = Counters()
+        super().__init__(settings, Counters(), self._enqueue)
         self._mapper = Mapper(settings, self.counters)
         self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, patient)
-        self._journal_file, self._resume = journal, resume
+        self._name, self._journal_file, self._resume = name, journal, resume
         self._journal = Journal(journal, resume) if journal is not None else None
         if self._journal is not None and self._journal.torn:
             self.counters.drop("torn record at the end of the journal", f"{journal}, {self._journal.torn} bytes")
-        self._intake = Intake(settings, self.counters, self._enqueue)
         self._queue: deque[tuple[Message, float]] = deque()
         self._taken: deque[tuple[Message, float]] = deque()
         self._frames = self._others = 0
         self._changed = threading.Condition()
-        self._busy = False
-        self._wanted = 0
-        self._given = 0
-        self._running = self._stopping = False
-        self._failure: Exception | None = None
+        self._wanted = self._given = 0
+        self._busy = self._running = self._stopping = False
+        self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._describer = Describer()
         self._asked = -np.inf
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:
-        """Work in what the journal holds, then begin to take messages."""
-        import cv2  # noqa: F401 - now, for the first frame should not wait for it
+        """Process the messages of the journal, then begin to take pushed messages."""
+        import cv2  # noqa: F401 - imported here, so that the first frame does not wait for the import
 
-        self._guard(self._go_on)
-        if self._failure is None:
+        self._guard(self._replay_journal)
+        if self.failure is None:
             self._running = True
             self._thread.start()
         else:
             self._end()
         return self
 
-    def push_camera(self, camera: Camera) -> bool:
-        """As `Sink` says."""
-        return self._intake.push_camera(camera)
-
-    def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """As `Sink` says."""
-        return self._intake.push_odometry(stamp, odom_T_base, covariance)
-
-    def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """As `Sink` says."""
-        return self._intake.push_localization(stamp, map_T_base, covariance)
-
-    def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
-        """As `Sink` says."""
-        return self._intake.push_mount(stamp, camera, base_T_camera)
-
-    def push_detections(
-        self,
-        stamp: float,
-        camera: str,
-        boxes: Floats,
-        labels: Sequence[str],
-        scores: Floats,
-        depths: Floats | None = None,
-        track_ids: Sequence[int] | None = None,
-        whole: bool = False,
-    ) -> bool:
-        """As `Sink` says."""
-        return self._intake.push_detections(stamp, camera, boxes, labels, scores, depths, track_ids, whole)
-
     def snapshot(self) -> Snapshot:
-        """The map as of now; the last one where the session has stopped, or is too busy to answer within seconds."""
+        """Return the present map, or the last snapshot if the session has stopped or is busy for several seconds."""
         with self._changed:
             if not self._running:
                 return self._snapshot
@@ -138,84 +95,65 @@ class Session:
             return self._snapshot
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until everything pushed so far is worked in; whether it is.
+        """Wait until all pushed messages are processed, at most timeout (s), and return whether they are.
 
-        A session that ended early, or was never started, is not waited for.
+        Return at once if the session ended early or was never started.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._is_done() or not self._running, timeout)
-            return self._is_done() and self._failure is None
-
-    @property
-    def backlog(self) -> int:
-        """Messages that wait."""
-        return len(self._queue)
+            self._changed.wait_for(lambda: not (self._queue or self._busy) or not self._running, timeout)
+            return not (self._queue or self._busy) and self.failure is None
 
     def stop(self) -> RunResult:
-        """Work in what was pushed, end the thread, and solve everything once more.
+        """Process the pushed messages, end the thread, and solve the whole map once more.
 
-        After a `failure` the result is of what came until then, and the ledger is warned; the failure itself is raised where
-        there is none. SolveError where nothing was seen that could be mapped.
+        After a `failure` the result covers the messages until then, and the ledger gets a warning. Raises the `failure` if
+        it left no result. SolveError when no box could be mapped.
         """
-        with self._changed:
-            self._stopping = True
-            self._changed.notify_all()
         self._close()
-        if self._failure is None:
-            return finish(self._mapper.state, self._name, self._journal_file)
-        said = one_line(self._failure)
-        self.counters.ledger.warn(f"the session ended early, the map is of what came until then: {said}")
+        if self.failure is not None:
+            reason = one_line(self.failure)
+            self.counters.ledger.warn(f"the session ended early, the map covers the messages until then: {reason}")
         try:
             return finish(self._mapper.state, self._name, self._journal_file)
-        except Exception as error:  # the failure left nothing to make a result of
-            raise self._failure from error
+        except Exception as error:
+            if self.failure is None:
+                raise
+            raise self.failure from error
 
     def abort(self) -> None:
-        """End the thread and let go of the journal, without a result."""
+        """End the thread and close the journal without a result."""
+        self._close(discard=True)
+
+    def _close(self, discard: bool = False) -> None:
+        """End the thread, then close the journal, which no push writes any more."""
         with self._changed:
             self._stopping = True
-            self._queue.clear()
+            if discard:
+                self._queue.clear()
             self._changed.notify_all()
-        self._close()
-
-    @property
-    def newest(self) -> float:
-        """The newest stamp of the path, s; -inf without any."""
-        return self._intake.newest
-
-    @property
-    def failure(self) -> Exception | None:
-        """The error that ended the session early, None without one."""
-        return self._failure
-
-    def _close(self) -> None:
-        """Wait for the thread's end, then let go of the journal; no push writes there any more."""
         if self._thread.is_alive():
             self._thread.join()
         if self._journal is not None:
             try:
                 self._journal.close()
-            except OutputError as error:  # the map is worth more
+            except OutputError as error:  # the map matters more than the journal
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into the journal, then into the queue: into both or none, so that what is journalled was accepted.
-
-        A note is for the journal alone.
-        """
+        """Put a message into the journal and into the queue, or into neither. A note goes into the journal alone."""
         with self._changed:
             if self._stopping:
-                self.counters.drop("messages after the end")
+                self.counters.drop("messages after the end of the session")
                 return False
             frame, note = isinstance(message, FrameMessage), isinstance(message, NoteMessage)
             if not frame and not note and self._others >= _MOST_POSES:
-                self.counters.drop("poses that found no place in the queue")
+                self.counters.drop("poses refused because the queue was full")
                 return False
             if self._journal is not None:
                 try:
                     self._journal.write(message)
                 except OutputError as error:
-                    self.counters.drop(f"messages that the journal could not take: {error.message}")
+                    self.counters.drop(f"messages that could not be written to the journal: {error.message}")
                     return False
             if not note:
                 self._queue.append((message, arrival))
@@ -233,19 +171,17 @@ class Session:
                 self.counters.drop_frame(message, TOO_SLOW)
                 return
 
-    def _go_on(self) -> None:
-        """Work in what the journal holds, where the session resumes."""
+    def _replay_journal(self) -> None:
         past = messages(self._journal_file, self.counters.ledger) if self._journal_file and self._resume else ()
         for message in past:
-            self._intake.recall(message)
-            self._frames_waiting.recall(message)
+            self.recall(message)
+            self._frames_waiting.take(message, time.perf_counter(), measured=False)
 
     def _work(self) -> None:
         self._guard(self._serve)
         self._end()
 
     def _serve(self) -> None:
-        """Work in what comes, until the session is to stop."""
         while True:
             with self._changed:
                 self._busy = False
@@ -265,14 +201,14 @@ class Session:
                 self._answer()
 
     def _guard(self, work: Callable[[], None]) -> None:
-        """Do work whose error ends the session: the first is kept for whoever stops it, for a thread has nobody to tell."""
+        """Do work, and keep its error as the session's `failure` unless there is an earlier one."""
         try:
             work()
-        except Exception as error:  # noqa: BLE001 - told as the session's `failure`
-            self._failure = self._failure or error
+        except Exception as error:  # noqa: BLE001 - `failure` reports it: nothing catches what a thread raises
+            self.failure = self.failure or error
 
     def _end(self) -> None:
-        """The last snapshot; what was not worked in is counted, and whoever waits goes on."""
+        """Make the last snapshot, count the messages that remain, and wake all waiting threads."""
         with self._changed:
             self._stopping = True
         self._guard(self._answer)
@@ -284,20 +220,16 @@ class Session:
             self._busy = self._running = False
             self._changed.notify_all()
 
-    def _is_done(self) -> bool:
-        return not self._queue and not self._busy
-
     def _idle(self) -> float:
-        """How long nothing needs to be done where nothing comes, s."""
+        """Return how long the thread may sleep without a message, s."""
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Whether to answer now: right after a frame that took little, for then the next one is furthest away."""
+        """Return whether to make a snapshot now. Right after a short frame, the next frame is furthest away."""
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
     def _answer(self) -> None:
-        """A new snapshot, where one is wanted, or the session ends."""
         wanted = self._wanted
         if wanted == self._given and not self._stopping:
             return

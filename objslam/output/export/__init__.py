@@ -1,6 +1,6 @@
-"""Exports: a result in the formats of other tools, one file each. The formats themselves are in `formats`.
+"""Export of a result to the file formats of other tools, with one module for each format in `formats`.
 
-What draws or records a result is in `plot`, `viewer` and `report`.
+Pictures, recordings and reports are made in `plot`, `viewer` and `report`.
 """
 
 from __future__ import annotations
@@ -12,20 +12,18 @@ from objslam.errors import ConfigError, OutputError
 from objslam.output.export.formats import FORMATS
 
 if TYPE_CHECKING:
-    from objslam.output.export.datum import Datum
+    from objslam.output.export.content import Datum
 
 
 def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | None = None) -> Path:
-    """Write a result in another tool's format.
+    """Write the result in the folder `out` in another tool's format and return the path of the file.
 
     Args:
         to: the name of a format in `FORMATS`.
-        file: where to write; by default the format's usual file in the result folder `out`.
-    Returns:
-        The path of the file.
+        file: the file to write; by default the format's usual file in `out`.
     Raises:
         ConfigError: the format does not exist, or takes no datum.
-        OutputError: the result cannot be read, lacks what the format needs, or the file cannot be written.
+        OutputError: the result cannot be read or lacks data that the format needs, or the file cannot be written.
     """
     from objslam.io.atomic_files import write_file
     from objslam.output.export.content import load_content

@@ -1,4 +1,4 @@
-"""What a module in `formats` declares of its format."""
+"""The declaration of an export format."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One format of `objslam export`."""
+    """One format of `objslam export`; each module in `formats` declares one."""
 
-    name: str  # What `--to` takes.
-    file: str  # The usual name of the file in a result folder; a new run removes the file of that name.
-    help: str  # A few words for `--help`, without a full stop.
-    dump: Callable[[Content], bytes]  # The content of the file; OutputError where the result lacks what the format needs.
-    takes_datum: bool = False  # Whether `Content.datum` has a meaning for the format.
+    name: str  # The value of `--to`.
+    file: str  # The usual name of the file in a result folder. A new run deletes the file with this name.
+    help: str  # A short description for `--help`, without a full stop.
+    dump: Callable[[Content], bytes]  # Makes the content of the file. OutputError if the result lacks data.
+    takes_datum: bool = False  # Whether the format uses `Content.datum`.

@@ -1,10 +1,11 @@
-"""A map as ROS 2 messages: objects, markers and the path, for files and for a robot that is running.
+"""Conversion of a map to ROS 2 messages (objects, markers, path), for MCAP files and for DDS; ROS is not needed.
 
-https://docs.ros.org/en/rolling/p/vision_msgs, https://docs.ros.org/en/rolling/p/visualization_msgs. No ROS is needed.
+Sources: https://docs.ros.org/en/rolling/p/vision_msgs, https://docs.ros.org/en/rolling/p/visualization_msgs.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -18,51 +19,50 @@ from objslam.output.plot.style import captions, ellipsoid, label_colours
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # Types and actions of visualization_msgs/Marker.
-_MIN_SIZE = 0.05  # The least diameter of an object's marker, m: smaller ones cannot be seen in a room.
-_TEXT_SIZE = 0.15  # The height of a name, m.
+_SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # These are types and actions of visualization_msgs/Marker.
+_MIN_SIZE = 0.05  # An object's marker has at least this diameter, m. Smaller markers are invisible at the scale of a room.
+_TEXT_SIZE = 0.15  # The text of a label has this height, m.
 
 
 class MapMessages:
-    """Makes messages in one frame, of types that ROS 2 Humble and later have; `store` serialises them."""
+    """Makes messages in one frame; ROS 2 Humble and later have their types, and `store` serialises them."""
 
     def __init__(self, frame: str) -> None:
         self.frame, self.store = frame, typestore()
 
     def make(self, name: str, *values: Any) -> Any:
-        """A message by its type, package/Name, and its fields in order."""
+        """Make a message from its type, package/Name, and its fields in order."""
         package, _, plain = name.partition("/")
         return self.store.types[f"{package}/msg/{plain}"](*values)
 
     def header(self, stamp: float) -> Any:
-        """A std_msgs/Header; stamp: s."""
-        nanoseconds = round(stamp * 1e9)
-        return self.make("std_msgs/Header", self.make("builtin_interfaces/Time", *divmod(nanoseconds, 10**9)), self.frame)
+        """Make a std_msgs/Header from a stamp, s."""
+        time = self.make("builtin_interfaces/Time", *divmod(round(stamp * 1e9), 10**9))
+        return self.make("std_msgs/Header", time, self.frame)
 
     def _vector(self, kind: str, values: Floats) -> Any:
         return self.make(f"geometry_msgs/{kind}", *(float(value) for value in values))
 
     def pose(self, pose: Floats) -> Any:
-        """A geometry_msgs/Pose of a pose (4, 4)."""
+        """Make a geometry_msgs/Pose from a pose (4, 4)."""
         turn = self._vector("Quaternion", quaternion(pose[None])[0])
         return self.make("geometry_msgs/Pose", self._vector("Point", pose[:3, 3]), turn)
 
     def stamped(self, stamp: float, pose: Floats) -> Any:
-        """A geometry_msgs/PoseStamped of a pose (4, 4)."""
+        """Make a geometry_msgs/PoseStamped from a stamp, s, and a pose (4, 4)."""
         return self.make("geometry_msgs/PoseStamped", self.header(stamp), self.pose(pose))
 
     def path(self, stamp: float, stamps: Floats, poses: Floats) -> Any:
-        """A nav_msgs/Path of poses (N, 4, 4) at stamps (N,), s."""
+        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s."""
         stamped = [self.stamped(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
         return self.make("nav_msgs/Path", self.header(stamp), stamped)
 
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
-        """A vision_msgs/Detection3DArray of objects: labels with their shares, positions with covariances.
+        """Make a vision_msgs/Detection3DArray from objects: labels with their shares, positions with covariances.
 
-        A box is as deep as it is wide; its size is 0 where that of the object is unknown.
+        The depth of a box equals its width. A box has size 0 if the size of its object is unknown.
         """
-        found = [self._detection(stamp, o) for o in objects]
-        return self.make("vision_msgs/Detection3DArray", self.header(stamp), found)
+        return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 
     def _detection(self, stamp: float, o: MapObject) -> Any:
         pose = self.pose(make_pose(np.eye(3), o.position))
@@ -70,21 +70,21 @@ class MapMessages:
         if o.covariance is not None:
             covariance[:3, :3] = o.covariance
         with_covariance = self.make("geometry_msgs/PoseWithCovariance", pose, covariance.ravel())
-        shares = o.labels or {o.label: 1.0}
-        hypotheses = [self.make("vision_msgs/ObjectHypothesis", *pair) for pair in shares.items()]
+        hypotheses = [self.make("vision_msgs/ObjectHypothesis", *pair) for pair in (o.labels or {o.label: 1.0}).items()]
         results = [self.make("vision_msgs/ObjectHypothesisWithPose", part, with_covariance) for part in hypotheses]
         width, height = o.extent or (0.0, 0.0)
         box = self.make("vision_msgs/BoundingBox3D", pose, self._vector("Vector3", np.array([width, width, height])))
         return self.make("vision_msgs/Detection3D", self.header(stamp), results, box, str(o.id))
 
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
-        """A visualization_msgs/MarkerArray: for each resolved object a ball, its 2-sigma ellipsoid and its name.
+        """Make a visualization_msgs/MarkerArray: a ball, a 2-sigma ellipsoid and a caption for each resolved object.
 
-        clear_first: whether the first marker removes all that were shown before.
+        Args:
+            clear_first: whether the first marker deletes all earlier markers.
         """
         colours, made = label_colours(objects), []
         if clear_first:
-            made.append(self._marker(stamp, "", 0, _SPHERE, np.eye(4), np.zeros(3), (0.0,) * 4, action=_DELETE_ALL))
+            made.append(replace(self._marker(stamp, "", 0, np.eye(4), np.zeros(3), (0.0,) * 4), action=_DELETE_ALL))
         for number, (o, name) in enumerate(zip(objects.objects, captions(objects), strict=True)):
             if o.status != "ok":
                 continue
@@ -92,12 +92,12 @@ class MapMessages:
             size = np.maximum([o.extent[0], o.extent[0], o.extent[1]] if o.extent else np.zeros(3), _MIN_SIZE)
             at = make_pose(np.eye(3), o.position)
             above = make_pose(np.eye(3), o.position + np.array([0.0, 0.0, size[2] / 2 + _TEXT_SIZE]))
-            made.append(self._marker(stamp, "objects", number, _SPHERE, at, size, (*colour, 0.9)))
-            made.append(self._marker(stamp, "labels", number, _TEXT, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
+            made.append(self._marker(stamp, "objects", number, at, size, (*colour, 0.9)))
+            made.append(self._marker(stamp, "labels", number, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
             axes = ellipsoid(o)
             if axes is not None:
                 turned = make_pose(axes[1], o.position)
-                made.append(self._marker(stamp, "covariances", number, _SPHERE, turned, 2 * axes[0], (*colour, 0.3)))
+                made.append(self._marker(stamp, "covariances", number, turned, 2 * axes[0], (*colour, 0.3)))
         return self.make("visualization_msgs/MarkerArray", made)
 
     def _marker(
@@ -105,44 +105,38 @@ class MapMessages:
         stamp: float,
         namespace: str,
         number: int,
-        kind: int,
         pose: Floats,
         size: Floats,
         colour: tuple[float, ...],
         text: str = "",
-        action: int = _ADD,
     ) -> Any:
-        make, never = self.make, self.make("builtin_interfaces/Duration", 0, 0)
-        nothing = make("sensor_msgs/CompressedImage", self.header(stamp), "", np.zeros(0, dtype=np.uint8))
-        mesh = make("visualization_msgs/MeshFile", "", np.zeros(0, dtype=np.uint8))
-        values = {
-            "header": self.header(stamp),
-            "ns": namespace,
-            "id": number,
-            "type": kind,
-            "action": action,
-            "pose": self.pose(pose),
-            "scale": self._vector("Vector3", np.maximum(size, 1e-3)),
-            "color": make("std_msgs/ColorRGBA", *(float(part) for part in colour)),
-            "lifetime": never,
-            "frame_locked": False,
-            "points": [],
-            "colors": [],
-            "texture_resource": "",
-            "texture": nothing,
-            "uv_coordinates": [],
-            "text": text,
-            "mesh_resource": "",
-            "mesh_file": mesh,
-            "mesh_use_embedded_materials": False,
-        }
+        make, header, nothing = self.make, self.header(stamp), np.zeros(0, dtype=np.uint8)
         marker: Any = self.store.types["visualization_msgs/msg/Marker"]
-        return marker(**values)
+        lists: dict[str, Any] = {"points": [], "colors": [], "uv_coordinates": []}
+        return marker(
+            header=header,
+            ns=namespace,
+            id=number,
+            type=_TEXT if namespace == "labels" else _SPHERE,
+            action=_ADD,
+            pose=self.pose(pose),
+            scale=self._vector("Vector3", np.maximum(size, 1e-3)),
+            color=make("std_msgs/ColorRGBA", *(float(part) for part in colour)),
+            lifetime=make("builtin_interfaces/Duration", 0, 0),
+            frame_locked=False,
+            texture_resource="",
+            texture=make("sensor_msgs/CompressedImage", header, "", nothing),
+            text=text,
+            mesh_resource="",
+            mesh_file=make("visualization_msgs/MeshFile", "", nothing),
+            mesh_use_embedded_materials=False,
+            **lists,
+        )
 
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The types of ROS 2 Humble, and vision_msgs."""
+    """Return the message types of ROS 2 Humble and of vision_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from objslam.ros.messages.definitions import VISION_MSGS_3D

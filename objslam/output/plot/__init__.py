@@ -1,4 +1,4 @@
-"""The picture map.png, and the colours, labels and extents that all pictures share.
+"""The picture map.png, and the colours, captions and label positions that all outputs share.
 
-The 3D recording is in `viewer`, the page in `report`.
+The 3D recording is in `viewer`, and the HTML page is in `report`.
 """

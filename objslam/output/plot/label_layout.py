@@ -1,40 +1,38 @@
-"""Where to write labels in a picture, so that none covers another label or a dot."""
-
-from __future__ import annotations
+"""Placement of labels in a picture, so that no label covers another label or a dot."""
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 
-# All lengths and costs are in px.
-_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # Directions, rad, in which a label is tried around its dot.
-_RADII = (9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0)  # Distances that are tried; each costs its own length.
-_DOT = 6.0  # Half the side of the square around each dot that stays free of labels.
-_PAD = 2.0  # The gap that stays free around each label.
-_CROWDED = 60.0  # Dots within this distance crowd a dot; the most crowded choose first.
-_FAR = 14.0  # A label farther than this from its dot gets a leader line.
-_AMBIGUOUS = 2.0  # A label must be nearer to its own dot than to others by more than this, or it is read as another's.
-_AMBIGUOUS_COST = 60.0  # What an ambiguous label costs: it moves this much farther out to avoid being one.
-_COVER_COST = 1.5  # What each covered point to avoid costs.
-_MOST_COVERED = 20  # The number of covered points from which more of them cost no more.
-_CROSSING_COST = 60.0  # What each line, label or dot costs that the line from dot to label crosses.
-_OUTWARD_GAIN = 0.05  # What each px away from the middle of all dots gains: it keeps the middle free.
+_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # The candidates of a label lie in these directions, rad.
+_RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
+"""The candidates of a label lie at these distances, px, from its dot. The distance adds to the cost of a candidate."""
+_DOT = 6.0  # Labels keep out of a square around each dot. Half its side is this length, px.
+_PAD = 2.0  # Labels keep this distance, px, from each other.
+_CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
+_FAR = 14.0  # A label gets a leader line if it is farther than this, px, from its dot.
+_AMBIGUOUS = 2.0  # A label is ambiguous if its own dot is not nearer, by more than this distance, px, than every other dot.
+_AMBIGUOUS_COST = 60.0  # This is the cost, px, of an ambiguous label. A larger cost moves it farther out.
+_COVER_COST = 1.5  # This is the cost, px, of each point in `avoid` that a label covers.
+_MOST_COVERED = 20  # At most this many covered points count.
+_CROSSING_COST = 60.0  # This is the cost, px, of each line, label or dot that a leader line crosses.
+_OUTWARD_GAIN = 0.05  # Each px away from the mean of all dots lowers the cost by this, px, and keeps the middle free.
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
-    """Place labels greedily, the most crowded dots first; all lengths are px.
+    """Place labels greedily, the labels of the most crowded dots first; all lengths are px.
 
-    Each label takes the cheapest of a fan of places around its dot. The place lies in the frame and covers no dot and no
-    label placed before. Far places cost more than near ones; so do places on points to avoid, places nearer to another dot,
-    and places whose line to the dot crosses something.
+    Each label gets the cheapest of a fixed set of candidates around its dot. A candidate must lie in the frame, and must not
+    cover a dot or an earlier label. These properties of a candidate raise its cost: a large distance from the dot, covered
+    points of `avoid`, another dot that is nearer, and a leader line that crosses something.
 
     Args:
         anchors: (N, 2) the dots.
         sizes: (N, 2) width and height of each label.
-        frame: (2, 2) lower left and upper right corner.
-        avoid: (P, 2) points that are better not covered.
+        frame: (2, 2) the lower left and the upper right corner.
+        avoid: (P, 2) points that the labels should not cover.
     Returns:
-        The labels' lower left corners (N, 2), and which of them found room (N,).
+        The lower left corners (N, 2) of the labels, and a mask (N,) of the labels that were placed.
     """
     corners, found = np.zeros((len(anchors), 2)), np.zeros(len(anchors), dtype=bool)
     if len(anchors) == 0:
@@ -43,8 +41,7 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
     crowd = (gaps < _CROWDED).sum(axis=1)
     dots = np.concatenate([anchors - _DOT, anchors + _DOT], axis=1)
     centre = anchors.mean(axis=0)
-    taken = np.zeros((0, 4))
-    leaders = np.zeros((0, 4))
+    taken = leaders = np.zeros((0, 4))
     for j in np.argsort(-crowd, kind="stable"):
         boxes, reach = _candidates(anchors[j], sizes[j])
         padded = boxes + np.array([-_PAD, -_PAD, _PAD, _PAD])
@@ -54,8 +51,9 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
             continue
         near = np.clip(anchors[j], boxes[:, :2], boxes[:, 2:])
         lines = np.concatenate([np.broadcast_to(anchors[j], near.shape), near], axis=1)
-        covered = _contains(boxes, avoid).sum(axis=1)
-        outward = ((boxes[:, :2] + boxes[:, 2:]) / 2 - anchors[j]) @ _unit(anchors[j] - centre)
+        covered = np.all((boxes[:, None, :2] <= avoid) & (avoid <= boxes[:, None, 2:]), axis=2).sum(axis=1)
+        away = anchors[j] - centre
+        outward = ((boxes[:, :2] + boxes[:, 2:]) / 2 - anchors[j]) @ (away / max(float(np.linalg.norm(away)), 1.0))
         others = np.delete(dots, j, axis=0)
         crossings = _cross(lines, leaders).sum(axis=1) + _hits(lines, taken).sum(axis=1) + _hits(lines, others).sum(axis=1)
         own = np.linalg.norm(near - anchors[j], axis=1)
@@ -70,18 +68,15 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
 
 
 def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
-    """Boxes (C, 4) x1, y1, x2, y2 around a dot, and the cost (C,) of each: its distance, least on the right, then left."""
+    """Return boxes (C, 4) x1, y1, x2, y2 around a dot and their costs (C,), which favour the right side, then the left."""
     direction = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-    boxes, reach = [], []
-    for radius in _RADII:
-        centre = anchor + direction * (radius + np.abs(direction) @ (size / 2))[:, None]
-        boxes.append(np.concatenate([centre - size / 2, centre + size / 2], axis=1))
-        reach.append(radius + 2.0 * np.abs(direction[:, 1]) + 1.0 * (direction[:, 0] < -0.1))
-    return np.concatenate(boxes), np.concatenate(reach)
+    centre = anchor + direction * (_RADII[:, None] + np.abs(direction) @ (size / 2))[..., None]
+    reach = _RADII[:, None] + 2.0 * np.abs(direction[:, 1]) + 1.0 * (direction[:, 0] < -0.1)
+    return np.concatenate([centre - size / 2, centre + size / 2], axis=2).reshape(-1, 4), reach.ravel()
 
 
 def needs_leader(anchors: Floats, corners: Floats, sizes: Floats) -> Bools:
-    """Which labels (N,) need a line to their dot: those far from it, and those that may be read as another's."""
+    """Return a mask (N,) of the labels that need a line to their dot: distant labels and ambiguous labels."""
     boxes = np.concatenate([corners, corners + sizes], axis=1)
     own = np.linalg.norm(np.clip(anchors, corners, corners + sizes) - anchors, axis=1)
     others = np.array([_nearest(boxes[j : j + 1], np.delete(anchors, j, axis=0))[0] for j in range(len(anchors))])
@@ -89,27 +84,18 @@ def needs_leader(anchors: Floats, corners: Floats, sizes: Floats) -> Bools:
 
 
 def _nearest(boxes: Floats, points: Floats) -> Floats:
-    """The distance (A,) of each box (A, 4) from the nearest of points (P, 2); infinite without points."""
+    """Return the distance (A,) of each box (A, 4) from its nearest point (P, 2); infinite without points."""
     near = np.clip(points[None], boxes[:, None, :2], boxes[:, None, 2:])
     return np.linalg.norm(near - points[None], axis=2).min(axis=1, initial=np.inf)
 
 
-def _unit(v: Floats) -> Floats:
-    return v / max(float(np.linalg.norm(v)), 1.0)
-
-
 def _overlaps(a: Floats, b: Floats) -> Bools:
-    """Which boxes (A, 4) overlap which boxes (B, 4): (A, B)."""
+    """Return a mask (A, B): whether each box (A, 4) overlaps each box (B, 4)."""
     return np.all((a[:, None, :2] < b[None, :, 2:]) & (b[None, :, :2] < a[:, None, 2:]), axis=2)
 
 
-def _contains(boxes: Floats, points: Floats) -> Bools:
-    """Which boxes (A, 4) contain which points (P, 2): (A, P)."""
-    return np.all((boxes[:, None, :2] <= points[None]) & (points[None] <= boxes[:, None, 2:]), axis=2)
-
-
 def _cross(a: Floats, b: Floats) -> Bools:
-    """Which segments (A, 4) cross which segments (B, 4): (A, B)."""
+    """Return a mask (A, B): whether each segment (A, 4) crosses each segment (B, 4)."""
 
     def side(p: Floats, q: Floats, r: Floats) -> Floats:
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
@@ -120,6 +106,6 @@ def _cross(a: Floats, b: Floats) -> Bools:
 
 
 def _hits(lines: Floats, boxes: Floats) -> Bools:
-    """Which segments (A, 4) cross a diagonal of which boxes (B, 4): (A, B)."""
+    """Return a mask (A, B): whether each segment (A, 4) crosses a diagonal of each box (B, 4)."""
     falling = np.stack([boxes[:, 0], boxes[:, 3], boxes[:, 2], boxes[:, 1]], axis=1)
     return _cross(lines, boxes) | _cross(lines, falling)

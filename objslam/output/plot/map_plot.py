@@ -1,6 +1,4 @@
-"""map.png: the map at a glance, from above."""
-
-from __future__ import annotations
+"""The picture map.png: the map from above."""
 
 import warnings
 from pathlib import Path
@@ -14,28 +12,24 @@ from objslam.core.types import Truth
 from objslam.output.plot.label_layout import needs_leader, place_labels
 from objslam.output.plot.style import captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
 
-_MAX_RAYS = 2000  # The largest number of used rays that are drawn; more of them would be one blue area.
-_MAX_REJECTED = 400  # The largest number of rejected rays that are drawn: fewer, because they cross the whole map.
-_MAX_LABELS = 150  # The largest number of labels; the objects with the most rays are named first.
-_MAX_LETTERS = 28  # The largest number of letters of a label; the rest becomes an ellipsis.
-_PATH_POINTS = 1500  # The largest number of points of the path that labels try not to cover.
-_CROSS_POINTS = 5  # How many points of the path one true object counts as for that.
-_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the least width of the figure, inches.
-_FONT = 8.0  # The size of labels and legend, points.
-_USED, _REJECTED = "#8fbfee", "#ef8f86"  # The colours of used and rejected rays.
-_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The colours of both paths, and of objects in the legend.
+_MAX_RAYS = 2000  # The picture shows at most this many used rays. More rays would merge into one blue area.
+_MAX_REJECTED = 400  # The picture shows at most this many rejected rays, because they cross the whole map.
+_MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
+_MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
+_PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
+_CROSS_POINTS = 5  # For labels, a true object counts as much as this many points of the path.
+_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map, and the smallest width of the figure, are in inches.
+_FONT = 8.0  # Labels and legend have this font size, points.
+_USED, _REJECTED = "#8fbfee", "#ef8f86"  # Used rays are light blue, and rejected rays are light red.
+_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The path before, the path after, objects in the legend.
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw a run's map from above as a PNG: path before and after, rays, objects with 2-sigma ellipses, ground truth.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Draw a map from above as a PNG: paths, rays, objects, ground truth. OSError if the file cannot be written."""
     import matplotlib
 
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # the user's own style may write in TeX or in white
+        matplotlib.rcdefaults()  # The user's own style may use TeX or white text.
         _draw(result, file, truth)
 
 
@@ -49,20 +43,17 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     shown, low, high = _frame(result, points, crosses)
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
-
-    figure = Figure(figsize=_size(high - low), dpi=150, layout="constrained")
+    width, height = (high - low) / (high - low).max() * _LONG_SIDE
+    size = max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3  # Title and legend take the margins.
+    figure = Figure(figsize=size, dpi=150, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set_aspect("equal", adjustable="box")
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
     axes.grid(True, color="#ececec", linewidth=0.6)
     axes.set_axisbelow(True)
     for side in axes.spines.values():
         side.set_color("#c4c4c4")
-
     _draw_rays(axes, result)
     _draw_paths(axes, result)
     if len(crosses):
@@ -73,9 +64,9 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     for handle in legend.get_lines():
         handle.set(alpha=1.0, linewidth=1.2)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)  # a label in a script the font lacks
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)  # The font may lack letters of a label.
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # labels are placed by pixels, which must not move any more
+        figure.set_layout_engine("none")  # Labels are placed by pixels, so the layout is frozen.
         left_out = _draw_labels(axes, canvas.get_renderer(), result, points, shown, crosses)
         if left_out:
             note = f"{left_out} labels have no room"
@@ -85,50 +76,35 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
 
 
 def _frame(result: RunResult, points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
-    """Which objects are shown, and the lower left and upper right corner of the shown area."""
+    """Return a mask of the shown objects, and the lower left and the upper right corner of the shown area."""
     path = result.map_T_base[:, :2, 3]
     shown, low, high = frame_objects(np.concatenate([points, crosses]), path)
     side = (high - low).max()
-    # the path before may have drifted anywhere, and an object hardly placed has a huge ellipse: neither may squeeze the map
-    before = np.clip(result.path.poses[:, :2, 3], low - 0.15 * side, high + 0.15 * side)
-    ellipses = np.clip(_ellipse_corners(result, points, shown[: len(points)]), low - side, high + side)
-    both = np.concatenate([before, ellipses, [low, high]])
-    return shown[: len(points)], both.min(axis=0), both.max(axis=0)
-
-
-def _ellipse_corners(result: RunResult, points: Floats, shown: Bools) -> Floats:
-    """The lower left and upper right corners (2 E, 2) of the shown objects' 2-sigma ellipses."""
-    half = np.full_like(points, np.nan)
+    half = np.full_like(points, np.nan)  # The half sides of the boxes around the shown 2-sigma ellipses.
     for j, o in enumerate(result.map.objects):
         if o.status == "ok" and o.covariance is not None and shown[j]:
             half[j] = 2 * np.sqrt(np.maximum(np.diag(o.covariance)[:2], 0.0))
     drawn = np.isfinite(half).all(axis=1)
-    return np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
-
-
-def _size(extent: Floats) -> tuple[float, float]:
-    """Width and height in inches that suit the map's proportions, with room for title and legend."""
-    width, height = extent / extent.max() * _LONG_SIDE
-    return max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3
+    corners = np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
+    # A path with much drift, or a huge ellipse, must not shrink the rest of the map.
+    before = np.clip(result.path.poses[:, :2, 3], low - 0.15 * side, high + 0.15 * side)
+    both = np.concatenate([before, np.clip(corners, low - side, high + side), [low, high]])
+    return shown[: len(points)], both.min(axis=0), both.max(axis=0)
 
 
 def _draw_rays(axes: Any, result: RunResult) -> None:
     from matplotlib.collections import LineCollection
 
     kinds, ends = ray_kinds(result), ray_ends(result)
-    rejected = f"rejected rays ({int(kinds['rejected'].sum()):,})"
-    for mask, colour, most, label in (
-        (kinds["used"], _USED, _MAX_RAYS, "rays"),
-        (kinds["rejected"], _REJECTED, _MAX_REJECTED, rejected),
-    ):
+    used, out = kinds["used"], kinds["rejected"]
+    many = f"rejected rays ({int(out.sum()):,})"
+    for mask, colour, most, label in ((used, _USED, _MAX_RAYS, "rays"), (out, _REJECTED, _MAX_REJECTED, many)):
         index = sample(mask, most)
         if len(index):
             lines = list(np.stack([result.origins[index, :2], ends[index, :2]], axis=1))
-            # many lines are drawn fainter, so that the objects stand out
-            alpha = float(np.clip(150 / len(index), 0.25, 0.9))
-            axes.add_collection(
-                LineCollection(lines, colors=colour, linewidths=0.4, alpha=alpha, label=label, zorder=1), autolim=False
-            )
+            alpha = float(np.clip(150 / len(index), 0.25, 0.9))  # Many lines are fainter, so that objects stay visible.
+            drawn = LineCollection(lines, colors=colour, linewidths=0.4, alpha=alpha, label=label, zorder=1)
+            axes.add_collection(drawn, autolim=False)
 
 
 def _draw_paths(axes: Any, result: RunResult) -> None:
@@ -158,10 +134,9 @@ def _draw_objects(axes: Any, result: RunResult, points: Floats) -> None:
             values, vectors = np.linalg.eigh(o.covariance[:2, :2])
             width, height = 2 * 2 * np.sqrt(np.maximum(values, 0))
             angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
-            axes.add_patch(
-                Ellipse(point, width, height, angle=angle, facecolor=(*colour, 0.18), edgecolor=colour, lw=0.9, zorder=6)
-            )
-    # the legend shows objects in a neutral colour, because each label has its own
+            style: dict[str, Any] = {"facecolor": (*colour, 0.18), "edgecolor": colour, "lw": 0.9, "zorder": 6}
+            axes.add_patch(Ellipse(point, width, height, angle=angle, **style))
+    # The legend shows objects in a neutral colour, because each label has its own colour.
     dot: dict[str, Any] = {"marker": "o", "color": _NEUTRAL}
     if result.map.resolved():
         axes.add_line(Line2D([], [], **dot, linestyle="", markersize=5, label="objects, 2 sigma"))
@@ -182,10 +157,7 @@ def _title(result: RunResult, outside: int) -> str:
 
 
 def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, shown: Bools, crosses: Floats) -> int:
-    """Write the objects' labels where they cover neither each other nor a dot; the count of those that found no room.
-
-    The objects with the most rays get theirs first, as long as there are few enough to read.
-    """
+    """Draw at most `_MAX_LABELS` labels, and return the number of shown objects without a label."""
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=2.2, foreground="white", alpha=0.85)]
@@ -194,34 +166,27 @@ def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, sh
     order = np.argsort([-o.rays for o in result.map.objects], kind="stable")
     chosen = [int(j) for j in order if shown[j]][:_MAX_LABELS]
     names = captions(result.map)
-    texts = [axes.text(0, 0, _short(names[j]), **style) for j in chosen]
+    lines = [" ".join(names[j].split()) for j in chosen]
+    short = [line if len(line) <= _MAX_LETTERS else line[: _MAX_LETTERS - 1] + "…" for line in lines]
+    texts = [axes.text(0, 0, text, **style) for text in short]
     boxes = [text.get_window_extent(renderer) for text in texts]
     sizes = np.array([(box.width, box.height) for box in boxes]).reshape(-1, 2)
-    to_pixels = axes.transData
+    to_pixels, from_pixels = axes.transData, axes.transData.inverted()
     anchors = to_pixels.transform(points[chosen]) if chosen else np.zeros((0, 2))
     frame = axes.get_window_extent(renderer)
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS), :2, 3]
     avoid = to_pixels.transform(np.concatenate([path, np.repeat(crosses, _CROSS_POINTS, axis=0)]))
     edges = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
     corners, found = place_labels(anchors, sizes, edges, avoid)
-    inverse = to_pixels.inverted()
     led = needs_leader(anchors, corners, sizes)
-    for j, text, anchor, corner, size, has_room, line in zip(
-        chosen, texts, anchors, corners, sizes, found, led, strict=True
-    ):
-        if not has_room:
+    for i, (j, text) in enumerate(zip(chosen, texts, strict=True)):
+        if not found[i]:
             text.remove()
             continue
         colour = colours[result.map.objects[j].label]
-        text.set_position(inverse.transform(corner))
-        text.set_color(colour)
-        if line:
-            near = np.clip(anchor, corner, corner + size)
-            ends = inverse.transform(np.stack([anchor, near]))
+        text.set(position=from_pixels.transform(corners[i]), color=colour)
+        if led[i]:
+            near = np.clip(anchors[i], corners[i], corners[i] + sizes[i])
+            ends = from_pixels.transform(np.stack([anchors[i], near]))
             axes.plot(*ends.T, "-", color=colour, linewidth=0.6, alpha=0.8, zorder=8)
     return int(shown.sum() - found.sum())
-
-
-def _short(text: str) -> str:
-    line = " ".join(text.split())
-    return line if len(line) <= _MAX_LETTERS else line[: _MAX_LETTERS - 1] + "…"

@@ -1,9 +1,7 @@
-"""The report: a result folder as one HTML page that needs no network, to read, to print, to send to somebody.
+"""The report: one HTML page that shows a result folder, and that a reader can open offline, print or send.
 
-Errors against a truth are computed in `evaluation`; the map's picture comes from `plot`.
+The errors against the ground truth are computed in `evaluation`, and the picture of the map is drawn in `plot`.
 """
-
-from __future__ import annotations
 
 from objslam.output.report.page import write_report
 

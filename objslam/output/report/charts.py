@@ -1,6 +1,4 @@
-"""Histograms of residuals, as bars that a template draws in SVG."""
-
-from __future__ import annotations
+"""Histograms of residuals; the page's template draws their bars in SVG."""
 
 from dataclasses import dataclass
 
@@ -9,36 +7,38 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.output.plot.style import REJECTED_BELOW
 
-WIDTH, HEIGHT = 100.0, 40.0  # The size of the area in which the bars stand, in units of the drawing.
-_ENDS = np.array([1.0, 2.0, 2.5, 5.0, 10.0])  # The round numbers, times a power of ten, at which an axis may end.
+WIDTH, HEIGHT = 100.0, 40.0  # The area of the bars has this size, in units of the SVG drawing.
+_ENDS = np.array([1.0, 2.0, 2.5, 5.0, 10.0])  # An axis ends at one of these numbers times a power of ten.
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One bin."""
+    """One bin of a histogram; lengths are in units of the SVG drawing."""
 
     x: float
     width: float
-    used: float  # The height of its used rays.
-    rejected: float  # The height of its rejected rays, above the others.
-    text: str
+    used: float  # The height of the part for used rays.
+    rejected: float  # The height of the part for rejected rays, on top of the used rays.
+    text: str  # The tooltip.
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Bars with their axes; the last bar takes the rays beyond the axis too."""
+    """A histogram with its axes; the last bar includes the rays beyond the end of the axis."""
 
     bars: tuple[Bar, ...]
-    ticks: tuple[tuple[float, str], ...]  # Position and text below the bars.
-    counts: tuple[tuple[float, str], ...]  # Height and text beside them.
+    ticks: tuple[tuple[float, str], ...]  # Position and text of each tick below the bars.
+    counts: tuple[tuple[float, str], ...]  # Height and text of each tick beside the bars.
     highest: int  # The number of rays in the highest bar.
-    beyond: int  # The number of rays beyond the axis.
+    beyond: int  # The number of rays beyond the end of the axis.
 
 
 def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = None) -> Histogram | None:
-    """The histogram of residuals (R,), deg, which are used or rejected by their weight (R,); None without any.
+    """Count residuals (R,), deg, in bins, split into used and rejected rays; None if no residual is finite.
 
-    top: the end of the axis, deg; by default a round number that nearly all used residuals lie below.
+    Args:
+        weight: (R,) robust weights; a ray with a low weight is rejected.
+        top: the end of the axis, deg; by default a round number above nearly all used residuals.
     """
     known = np.isfinite(residual)
     residual, used = residual[known], weight[known] >= REJECTED_BELOW
@@ -47,28 +47,23 @@ def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = N
     edge = top or axis_end(residual[used] if used.any() else residual)
     index = np.minimum((residual / edge * bins).astype(int), bins - 1)
     counts = [np.bincount(index[mask], minlength=bins) for mask in (used, ~used)]
-    total = counts[0] + counts[1]
-    step = WIDTH / bins
+    highest = int((counts[0] + counts[1]).max())
+    step, scale = WIDTH / bins, HEIGHT / highest
     bars = []
     for i, (of, out) in enumerate(zip(*(c.tolist() for c in counts), strict=True)):
         low, high = edge * i / bins, edge * (i + 1) / bins
         place = f"{low:.3g} to {high:.3g} deg" if i < bins - 1 else f"more than {low:.3g} deg"
         text = f"{place}: {of} used" + (f", {out} rejected" if out else "")
-        scale = HEIGHT / total.max()
         bars.append(Bar(i * step, step, of * scale, out * scale, text))
     ticks = tuple((WIDTH * share, f"{edge * share:.3g}") for share in (0.0, 0.5, 1.0))
-    return Histogram(tuple(bars), ticks, _counts(int(total.max())), int(total.max()), int((residual > edge).sum()))
-
-
-def _counts(highest: int) -> tuple[tuple[float, str], ...]:
-    """Heights and texts of two to five round numbers of rays, from 0 to the highest bar."""
     power = 10.0 ** np.floor(np.log10(highest))
-    step = max(1, next(int(power * s) for s in (5.0, 2.0, 1.0, 0.5, 0.2) if highest >= 2 * power * s))
-    return tuple((HEIGHT * n / highest, f"{n}") for n in range(0, highest + 1, step))
+    rays = max(1, next(int(power * s) for s in (5.0, 2.0, 1.0, 0.5, 0.2) if highest >= 2 * power * s))
+    heights = tuple((HEIGHT * n / highest, f"{n}") for n in range(0, highest + 1, rays))
+    return Histogram(tuple(bars), ticks, heights, highest, int((residual > edge).sum()))
 
 
 def axis_end(residual: Floats) -> float:
-    """A round number (deg) that nearly all residuals (R,) lie below."""
+    """Return a round number, deg, above nearly all residuals (R,), deg."""
     most = max(float(np.quantile(residual, 0.98)), 1e-6)
     power = 10.0 ** np.floor(np.log10(most))
     return float(power * _ENDS[np.searchsorted(_ENDS, most / power - 1e-9)])

@@ -1,6 +1,4 @@
-"""Pictures of an object: its best boxes, cut out of the log's images while these are still there."""
-
-from __future__ import annotations
+"""Pictures of an object: crops of its best boxes from the images of the log."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,38 +18,38 @@ from objslam.io.text import read_bytes
 from objslam.output.plot.style import REJECTED_BELOW
 from objslam.sources import SourceOptions, read
 
-_SIDE = 160  # The longer side of a picture on the page, px.
-_MARGIN = 0.2  # What is shown around a box on each side, as a share of its longer side.
-_MIN_SIDE = 40  # The least part of an image that is shown, px.
-_FRAME = (60, 190, 255)  # The colour of the box, BGR: orange.
+_SIDE = 160  # The longer side of a crop on the page has this length, px.
+_MARGIN = 0.2  # A crop has a margin on each side of the box. The margin is this share of the box's longer side.
+_MIN_SIDE = 40  # A crop covers at least this length of the image, px.
+_FRAME = (60, 190, 255)  # The box is drawn in this BGR colour, orange.
 
 
 @dataclass(frozen=True)
 class Crop:
-    """What a box shows."""
+    """The crop of a box."""
 
     jpeg: bytes
     width: int  # px.
     height: int  # px.
-    stamp: float  # Of the ray, s.
-    score: float  # Of the box.
+    stamp: float  # The stamp of the ray, s.
+    score: float  # The score of the box.
     camera: str
 
 
 def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str | None]:
-    """The images of a log by camera, or, where there are none, the reason in words.
+    """Return the images of a log by camera, and a sentence that explains why there are none (None if there are some).
 
     Args:
-        path: the log; what is no path means that nobody knows where it is.
-        count: the number of images when the log was mapped; None where nobody knows.
+        path: the log; a value that is no path means that its place is unknown.
+        count: the number of images at the time of the run; None if unknown.
     """
     if count == 0:
         return {}, "The log has no images."
     if not isinstance(path, str | Path):
-        return {}, "The result does not say which log it is from."
+        return {}, "The result does not name its log: objslam report --log LOG names it."
     log = Path(path)
     if not log.exists():
-        return {}, f"The log is not at {log} any more: objslam report --log LOG says where it is."
+        return {}, f"The log is not at {log} any more: objslam report --log LOG names its new place."
     try:
         cameras = read(log, Ledger(), SourceOptions(with_range=False, with_images=False)).cameras
     except ObjslamError as error:
@@ -61,7 +59,10 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
 
 
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
-    """The best of an object's used rays: one, by score and size, in each of `count` parts of the time that it was seen.
+    """Return the indices of the best used rays of an object, at most `count`.
+
+    The used rays are split into `count` parts in the order of time. The ray with the best score (then the largest box) of
+    each part is returned.
 
     Args:
         mine: (M,) indices of the object's rays, in the order of time.
@@ -75,11 +76,14 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 def cut_crops(
     rays: RaysTable, chosen: Ints, images: dict[str, Images], progress: Callable[[int, int], None]
 ) -> dict[int, Crop]:
-    """The pictures of the chosen rays (C,), by ray; a ray without a readable image at its time has none."""
-    files = {int(i): file for i in chosen if (file := _file(rays, int(i), images)) is not None}
+    """Return the crops of the chosen rays (C,), by ray; a ray without a readable image at its stamp has no crop."""
     by_file: dict[Path, list[int]] = {}
-    for ray, file in files.items():
-        by_file.setdefault(file, []).append(ray)
+    for ray in chosen.tolist():
+        listed = images.get(str(rays.camera[ray]))
+        if listed is not None:
+            near = int(nearest_stamps(listed.stamps, rays.stamp[ray : ray + 1])[0])
+            if abs(listed.stamps[near] - rays.stamp[ray]) <= MAX_IMAGE_LAG:
+                by_file.setdefault(listed.paths[near], []).append(ray)
     crops = {}
     for done, (file, wanted) in enumerate(by_file.items()):
         try:
@@ -89,22 +93,13 @@ def cut_crops(
         for ray in wanted if image is not None else ():
             picture = _cut(image, rays.box[ray])
             if picture is not None:
-                jpeg, width, height = picture
-                crops[ray] = Crop(jpeg, width, height, float(rays.stamp[ray]), float(rays.score[ray]), str(rays.camera[ray]))
+                crops[ray] = Crop(*picture, float(rays.stamp[ray]), float(rays.score[ray]), str(rays.camera[ray]))
         progress(done + 1, len(by_file))
     return crops
 
 
-def _file(rays: RaysTable, ray: int, images: dict[str, Images]) -> Path | None:
-    listed = images.get(str(rays.camera[ray]))
-    if listed is None:
-        return None
-    index = int(nearest_stamps(listed.stamps, rays.stamp[ray : ray + 1])[0])
-    return listed.paths[index] if abs(listed.stamps[index] - rays.stamp[ray]) <= MAX_IMAGE_LAG else None
-
-
 def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
-    """A square around a box, with the box in it, as JPEG with its width and height; None for a box outside the image."""
+    """Cut a square around a box and draw the box: JPEG, width, height; None if the box is outside the image."""
     import cv2
 
     height, width = image.shape[:2]

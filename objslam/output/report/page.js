@@ -1,5 +1,5 @@
 "use strict";
-// A click on a column's head sorts the table by it, a second click the other way round; empty cells stay at the end.
+// A click on a column's head sorts the table by this column. A second click reverses the order. Empty cells stay at the end.
 for (const head of document.querySelectorAll("table.sortable th")) {
   const sort = () => {
     const table = head.closest("table"), body = table.tBodies[0];
@@ -18,7 +18,7 @@ for (const head of document.querySelectorAll("table.sortable th")) {
   };
   head.querySelector("button").addEventListener("click", sort);
 }
-// On paper nothing can be unfolded.
+// A printed page cannot be unfolded, so all details are open in print.
 let folded = [];
 addEventListener("beforeprint", () => {
   folded = [...document.querySelectorAll("details:not([open])")];

@@ -1,6 +1,4 @@
-"""The page of a result folder: everything is gathered here, and the template only lays it out."""
-
-from __future__ import annotations
+"""The HTML page of a result folder: this module collects the data, and a template lays them out."""
 
 import base64
 import json
@@ -16,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
-from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
 from objslam.evaluation.alignment import lay_truth
-from objslam.evaluation.evaluate import Evaluation, evaluate
+from objslam.evaluation.evaluate import evaluate
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.plot.style import REJECTED_BELOW, captions, is_date, label_colours
@@ -29,7 +26,7 @@ from objslam.output.report.crops import Crop, best_rays, cut_crops, images_of
 from objslam.results.files import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY
 from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
 
-_BINS, _FEW_BINS = 32, 16  # The number of bins in the histogram of all rays, and in that of one object.
+_BINS, _FEW_BINS = 32, 16  # The histogram of all rays has 32 bins. The histogram of one object has 16 bins.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -42,23 +39,23 @@ _COUNTS = {
     "objects": "objects",
     "unresolved": "unresolved objects",
 }
-"""What the page calls the counts of summary.json."""
+"""The words on the page for the counts of summary.json."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """An object with all that the page says of it."""
+    """The data of one object on the page."""
 
     object: MapObject
     caption: str
     colour: str
-    sigma: list[float] | None  # Along x, y and z, m.
-    seen: tuple[float, float]  # When it was seen first and last, s since the first ray.
-    rejected: int  # The number of its rejected rays.
-    error: float | None  # The distance from the true object, m; None where it matches none.
-    matched: str | None  # The true object that it matches, in words.
+    sigma: list[float] | None  # The standard deviations along x, y and z, m.
+    seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
+    rejected: int  # The number of rejected rays.
+    error: float | None  # The distance from the matching true object, m; None without a match.
+    matched: str | None  # A text that names the matching true object.
     histogram: Histogram | None
-    crops: tuple[Crop, ...]
+    crops: list[Crop]
 
 
 def write_report(
@@ -71,47 +68,43 @@ def write_report(
     """Write report.html into the result folder `out` and return its path.
 
     Args:
-        log: the log that the result is from, for the pictures; by default where summary.json says it is.
+        log: the log of the run, as the source of the pictures; by default the path in summary.json.
         crops: the number of pictures per object.
+        progress: is called with the stage, the steps done and the total number of steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
         LogError: the ground truth cannot be read.
     """
-    file = out / REPORT
-    write_file(file, render(out, log=log, crops=crops, progress=progress).encode("utf-8", errors="replace"))
-    return file
-
-
-def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, int, int], None]) -> str:
-    """The page of a result folder as text; all text that comes from the result is escaped."""
     import jinja2
 
     progress("reading the result", 0, 0)
     objects, rays, summary = load_map(out), load_rays(out), _json(out / SUMMARY)
-    settings = _settings(out / CONFIG)
+    try:
+        settings = load_settings(out / CONFIG)
+    except ConfigError as error:
+        raise OutputError(error.message.splitlines()[0], where=error.where) from error
     errors, scores = _evaluation(out, objects)
-    mine = {o.id: np.flatnonzero(rays.object == o.id) for o in objects.objects}
-    chosen = {number: best_rays(rays, index, crops) for number, index in mine.items()}
+    chosen = {o.id: best_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects.objects}
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
-    crops_of = {number: tuple(pictures[i] for i in index.tolist() if i in pictures) for number, index in chosen.items()}
+    crops_of = {number: [pictures[i] for i in index.tolist() if i in pictures] for number, index in chosen.items()}
     begin = float(rays.stamp.min()) if len(rays) else 0.0
-    residual_deg = np.degrees(rays.residual)
-    cards = _cards(objects, rays, residual_deg, mine, crops_of, errors, begin)
+    cards = _cards(objects, rays, crops_of, errors, begin)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.output.report", ""),
-        autoescape=True,
+        autoescape=True,  # Texts of the result may contain HTML.
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
-    picture = out / PICTURE
-    return environment.get_template("page.html.jinja").render(
-        style=_resource("page.css"),
-        script=_resource("page.js"),
+    picture, examples = out / PICTURE, summary.get("dropped_examples", {})
+    source = resources.files("objslam.output.report")
+    page = environment.get_template("page.html.jinja").render(
+        style=(source / "page.css").read_text(encoding="utf-8"),
+        script=(source / "page.js").read_text(encoding="utf-8"),
         name=str(summary.get("log", out.resolve().name)),
         folder=out.resolve().name,
         mode=settings.mode,
@@ -122,36 +115,33 @@ def render(out: Path, *, log: Path | None, crops: int, progress: Callable[[str, 
         cards=cards,
         with_errors=any(card.error is not None for card in cards),
         with_existence=any(card.object.existence is not None for card in cards),
-        histogram=histogram(residual_deg, rays.weight, _BINS),
+        histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
         unexplained=summary.get("unexplained_share", {}),
-        dropped=_dropped(summary),
-        warnings=summary.get("warnings", []),
-        seconds=summary.get("seconds", {}),
-        versions=summary.get("versions", {}),
+        dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
+        **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if key in summary},
         changed=_changed(settings),
         settings=dump_settings(settings),
     )
+    write_file(out / REPORT, page.encode("utf-8", errors="replace"))
+    return out / REPORT
 
 
 def _cards(
-    objects: ObjectMap,
-    rays: RaysTable,
-    residual_deg: Floats,
-    mine: dict[int, Ints],
-    crops: dict[int, tuple[Crop, ...]],
-    errors: dict[int, tuple[float, str]],
-    begin: float,
+    objects: ObjectMap, rays: RaysTable, crops: dict[int, list[Crop]], errors: dict[int, tuple[float, str]], begin: float
 ) -> list[Card]:
-    """The cards in the order of labels; mine: the rays of each object; begin: the stamp, s, from which times count."""
+    """Return the cards, sorted by label; the times on the page are relative to `begin`, s."""
+    residual_deg = np.degrees(rays.residual)
     kept = residual_deg[(rays.weight >= REJECTED_BELOW) & np.isfinite(residual_deg)]
     top = axis_end(kept) if len(kept) else None
-    colours, cards = label_colours(objects), []
+    colours = label_colours(objects)
+    cards = []
     for o, caption in zip(objects.objects, captions(objects), strict=True):
-        weight = rays.weight[mine[o.id]]
+        mine = rays.object == o.id
+        weight = rays.weight[mine]
         error, matched = errors.get(o.id, (None, None))
         card = Card(
             object=o,
@@ -162,7 +152,7 @@ def _cards(
             rejected=int((weight < REJECTED_BELOW).sum()),
             error=error,
             matched=matched,
-            histogram=histogram(residual_deg[mine[o.id]], weight, _FEW_BINS, top),
+            histogram=histogram(residual_deg[mine], weight, _FEW_BINS, top),
             crops=crops[o.id],
         )
         cards.append(card)
@@ -170,9 +160,10 @@ def _cards(
 
 
 def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """The errors of the matched objects by id, and what evaluation.json holds.
+    """Return the error and the match of each matched object by id, and the content of evaluation.json.
 
-    Without that file the map is compared with the truth here; one with a frame of its own is laid onto the truth first.
+    Without evaluation.json, the map is compared with the ground truth here. A map in a frame of its own is first aligned
+    with the truth.
     """
     if (out / EVALUATION).is_file():
         scores = _json(out / EVALUATION)
@@ -181,8 +172,7 @@ def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, s
         if truth is None:
             return {}, None
         align = "none" if lay_truth(objects, truth) is truth else "se2"
-        evaluation: Evaluation = evaluate(objects, truth, load_trajectory(out), align=align)  # type: ignore[arg-type]
-        scores = evaluation.to_dict()
+        scores = evaluate(objects, truth, load_trajectory(out), align=align).to_dict()  # type: ignore[arg-type]
     matched = scores.get("objects", [])
     whose = "to id {} there" if scores.get("truth") else "truth id {}"
     return {o["id"]: (float(o["error"]), whose.format(o["truth_id"])) for o in matched}, scores
@@ -200,26 +190,15 @@ def _json(file: Path) -> dict[str, Any]:
     return data
 
 
-def _settings(file: Path) -> Settings:
-    try:
-        return load_settings(file)
-    except ConfigError as error:
-        raise OutputError(error.message.splitlines()[0], where=error.where) from error
-
-
-def _dropped(summary: dict[str, Any]) -> list[tuple[str, int, str]]:
-    examples = summary.get("dropped_examples", {})
-    return [(why, count, ", ".join(examples.get(why, []))) for why, count in summary.get("dropped", {}).items()]
-
-
 def _changed(settings: Settings) -> list[tuple[str, str, str]]:
-    """The settings that are not at their default: name, value, default."""
+    """Return name, value and default of each setting that differs from its default."""
     now, default = _flat(settings.model_dump(mode="json")), _flat(Settings().model_dump(mode="json"))
     shown = partial(json.dumps, ensure_ascii=False)
     return [(key, shown(value), shown(default.get(key))) for key, value in now.items() if value != default.get(key)]
 
 
 def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
+    """Join the keys of nested mappings with dots."""
     flat: dict[str, Any] = {}
     for key, value in data.items():
         flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
@@ -227,10 +206,6 @@ def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def _natural(text: str) -> tuple[str, int]:
-    """The key to sort a text by, so that landmark_9 comes before landmark_10."""
+    """Return a sort key that places landmark_9 before landmark_10."""
     head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
     return head, int(number or -1)
-
-
-def _resource(name: str) -> str:
-    return resources.files("objslam.output.report").joinpath(name).read_text(encoding="utf-8")

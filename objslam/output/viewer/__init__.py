@@ -1,4 +1,4 @@
-"""What rerun shows: recordings of runs, the proximity field of an object. The only room that knows rerun.
+"""Recordings of runs and of the proximity field of an object, for the rerun viewer; no other folder imports rerun.
 
-A session that is still running is shown by `viewer.live`; colours and labels are those of `plot`.
+The view of a running session is in `viewer.live`, and colours and captions come from `plot`.
 """

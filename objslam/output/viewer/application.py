@@ -1,4 +1,4 @@
-"""The rerun viewer as a program of its own: on the screen, in a browser, or without either for a picture."""
+"""The rerun viewer as a separate process: in a window, in a browser, or headless for a screenshot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -22,20 +22,21 @@ from objslam.results.files import RECORDING, hint_below
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
 
+_T = TypeVar("_T")
 Viewer = subprocess.Popen[bytes]
-"""A viewer that runs as a process of its own."""
+"""The process of a viewer."""
 
-_LOOPBACK = "127.0.0.1"  # The address that viewers listen at: nobody outside this machine can reach it.
-_PATIENCE = 60.0  # The longest time, s, for a viewer to start and to load a recording.
-_SETTLE = 1.5  # The time, s, for a viewer to draw after its clock was set; a larger one suits slower machines.
+_LOOPBACK = "127.0.0.1"  # Viewers listen at this address. Other machines cannot reach it.
+_PATIENCE = 60.0  # A viewer has this time, s, to start and to load a recording.
+_SETTLE = 1.5  # A viewer has this time, s, to draw after its time is set. A larger value suits slower machines.
 _NO_DRIVER = ("render context", "No graphics adapter", "Failed to find a suitable", "NoSuitableAdapter", "adapter was found")
-"""What the viewer says, among other things, on a machine without a Vulkan driver."""
+"""On a machine without a Vulkan driver, the viewer's stderr contains one of these texts."""
 _NO_SCREEN = ("XOpenDisplay", "neither WAYLAND", "WAYLAND_DISPLAY", "WinitEventLoop", "Failed to open connection")
-"""What it says on a machine without a screen."""
+"""On a machine without a screen, the viewer's stderr contains one of these texts."""
 
 
 def program() -> Path:
-    """The viewer's executable; OutputError where rerun was installed without it."""
+    """Return the viewer's executable; OutputError if rerun was installed without it."""
     import rerun_cli
 
     found = Path(rerun_cli.__file__).parent / ("rerun.exe" if os.name == "nt" else "rerun")
@@ -46,24 +47,19 @@ def program() -> Path:
 
 
 def find_rrd(out: Path) -> Path:
-    """The recording of a result folder, or the file itself; OutputError where there is none, or it is damaged."""
+    """Return the recording of a result folder, or `out` if it is a file; OutputError if it is missing or damaged."""
+    from rerun.chunk import RrdReader
+
     file = out if out.is_file() else out / RECORDING
     if not out.exists():
         raise OutputError("there is no such result folder", where=str(out))
     if not file.is_file():
-        hint = hint_below(out) or "run with output.recording=true, and name its result"
+        hint = hint_below(out) or "run with output.recording=true, and name the new result"
         raise OutputError("no recording here", where=str(out), hint=hint)
-    _check_rrd(file)
-    return file
-
-
-def _check_rrd(file: Path) -> None:
-    """Read a recording through; OutputError where it is damaged, because the viewer would wait for the rest of it."""
-    from rerun.chunk import RrdReader
-
     try:
+        # The whole file is read, because the viewer waits for the rest of a damaged recording.
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a recording of a live session has no footer, yet can be shown
+            warnings.simplefilter("ignore")  # A recording of a live session has no footer, but the viewer can show it.
             reader = RrdReader(file)
             for store in [*reader.recordings(), *reader.blueprints()]:
                 for _ in reader.stream(store=store).to_chunks():
@@ -73,10 +69,11 @@ def _check_rrd(file: Path) -> None:
     except (RuntimeError, ValueError, OSError) as error:
         why = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {file}: ")
         raise OutputError(f"the recording is damaged or cut off ({why})", where=str(file), hint="run again") from error
+    return file
 
 
 def free_port() -> int:
-    """A port of the loopback interface that nobody listens on."""
+    """Return a free port of the loopback interface."""
     with socket.socket() as s:
         s.bind((_LOOPBACK, 0))
         port: int = s.getsockname()[1]
@@ -84,17 +81,17 @@ def free_port() -> int:
 
 
 def address(port: int) -> str:
-    """The address at which a viewer on this machine takes data."""
+    """Return the address at which a viewer on this machine receives data."""
     return f"rerun+http://{_LOOPBACK}:{port}/proxy"
 
 
 def web_address(web: int, port: int) -> str:
-    """The address to open in a browser: the page, and the port of its data."""
+    """Return the address for a browser, from the port of the page and the port of the data."""
     return f"http://{_LOOPBACK}:{web}?url={address(port).replace('+', '%2B')}"
 
 
 def start(*arguments: str) -> Viewer:
-    """Start the viewer, bound to the loopback interface; by itself it would listen to the whole network."""
+    """Start the viewer on the loopback interface; by default rerun listens on every network interface."""
     return subprocess.Popen(
         [str(program()), "--bind", _LOOPBACK, *arguments],
         env={**os.environ, "RUST_LOG": "error"},
@@ -105,22 +102,25 @@ def start(*arguments: str) -> Viewer:
 
 
 def show(files: list[Path]) -> None:
-    """Open recordings in the native viewer and wait until it is closed; OutputError where it cannot open."""
+    """Open recordings in the native viewer and wait until it is closed; OutputError if the viewer fails."""
     viewer = start("--port", str(free_port()), *map(str, files))
-    _, said = _until_closed(viewer)
+    try:
+        _, said = viewer.communicate()
+    finally:
+        stop(viewer)
     if viewer.returncode not in (0, -15, -2):
         raise _failure(viewer.returncode, said, "use --web, or --screenshot FILE.png")
 
 
 def serve(files: list[Path], say: Callable[[str], None]) -> None:
-    """Serve recordings to a browser on this machine until interrupted; say(text) gets the address."""
+    """Serve recordings to a browser on this machine until Ctrl+C; `say` receives the address."""
     web, data = free_port(), free_port()
     viewer = start("--serve-web", "--web-viewer-port", str(web), "--port", str(data), *map(str, files))
     try:
-        with suppress(KeyboardInterrupt):  # Ctrl+C is how serving ends
+        with suppress(KeyboardInterrupt):  # Ctrl+C ends the server.
             _wait_for(viewer, web)
             say(f"{web_address(web, data)} (Ctrl+C ends it)")
-            _, said = _until_closed(viewer)
+            _, said = viewer.communicate()
             raise _failure(viewer.returncode, said, None)
     finally:
         stop(viewer)
@@ -129,25 +129,36 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
 def screenshot(
     files: list[Path], picture: Path, size: tuple[int, int] = (1600, 900), at: float = 0.5, timeline: str = STAMP
 ) -> None:
-    """Write a picture of recordings as they look when first opened; no screen is needed.
+    """Write a picture of recordings in their first layout; the function needs no screen.
 
     Args:
-        size: width and height in points.
+        size: width and height of the picture, points.
         at: the time of the picture, as a share of the timeline's length.
     Raises:
         ConfigError: the picture's name does not end in .png.
         OutputError: there is no Vulkan driver, the viewer fails, or the picture cannot be written.
     """
+    from rerun.experimental import ViewerClient
+
     if picture.suffix.lower() != ".png":
-        raise ConfigError("a picture is a PNG", where=str(picture), hint="name it FILE.png")
+        raise ConfigError("a picture is a PNG", where=str(picture), hint="name the file FILE.png")
     if not picture.parent.is_dir():
         raise OutputError("no such folder for the picture", where=str(picture.parent))
     temporary = picture.with_name(f".{picture.stem}.{os.getpid()}.png")
     port = free_port()
     window = f"{size[0]}x{size[1]}"
     viewer = start("--headless", "--hide-welcome-screen", "--port", str(port), "--window-size", window, *map(str, files))
+
+    def attempt() -> ViewerClient | None:
+        client = ViewerClient.connect(address(port))
+        state = client.get_state()
+        return client if state.recordings and not state.loading and state.views else None
+
     try:
-        client = _connect(viewer, port, files)
+        client = _retry(viewer, attempt)
+        if client is None:
+            where = ", ".join(map(str, files))
+            raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
         _set_time(client, at, timeline)
         time.sleep(_SETTLE)
         client.save_screenshot(str(temporary.resolve()))
@@ -161,31 +172,26 @@ def screenshot(
         temporary.unlink(missing_ok=True)
 
 
-def _connect(viewer: Viewer, port: int, files: list[Path]) -> ViewerClient:
-    """A connection to a viewer, once it has loaded what it was given."""
-    from rerun.experimental import ViewerClient
-
+def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:
+    """Call `attempt` until it returns a value, at most for `_PATIENCE`; OutputError if the viewer ends."""
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
-        _check_running(viewer)
-        with suppress(RuntimeError, OSError):  # it does not answer yet
-            client = ViewerClient.connect(address(port))
-            state = client.get_state()
-            if state.recordings and not state.loading and state.views:
-                return client
+        if viewer.poll() is not None:
+            raise _failure(viewer.returncode, viewer.communicate()[1], None)
+        with suppress(RuntimeError, OSError):  # The viewer does not answer yet.
+            if (value := attempt()) is not None:
+                return value
         time.sleep(0.1)
-    where = ", ".join(map(str, files))
-    raise OutputError(f"the viewer has not loaded the recording in {_PATIENCE:g} s", where=where)
+    return None
 
 
 def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
-    """Stop the viewer's clock at a share of a timeline."""
+    """Pause the viewer at a share of a timeline."""
     state = client.get_state()
     recording = next((r for r in state.recordings if r.store_id == state.active_recording), state.recordings[0])
-    lines = [t for t in recording.timelines if t.name == timeline]
-    if not lines:
+    line = next((t for t in recording.timelines if t.name == timeline), None)
+    if line is None:
         return
-    line = lines[0]
     start, end = line.start or 0, line.end or 0
     moment = round(start + share * (end - start))
     if line.time_type == "sequence":
@@ -196,64 +202,45 @@ def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
         client.set_time(line.name, duration=np.timedelta64(moment, "ns"), play_state="paused")
 
 
-def _check_running(viewer: Viewer) -> None:
-    """OutputError where the viewer has ended by itself."""
-    if viewer.poll() is not None:
-        _, said = viewer.communicate()
-        raise _failure(viewer.returncode, said, None)
-
-
 def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputError:
-    """An error of one line for a viewer that ended by itself, from its exit code and what it said."""
+    """Make the error for a viewer that ended, from its exit code and its stderr."""
     text = (said or b"").decode(errors="replace")
     if any(sign in text for sign in _NO_DRIVER):
-        return OutputError(
-            "the viewer finds no Vulkan driver to draw with",
-            hint="Debian and Ubuntu: apt install libvulkan1 mesa-vulkan-drivers",
-        )
+        hint = "Debian and Ubuntu: apt install libvulkan1 mesa-vulkan-drivers"
+        return OutputError("the viewer finds no Vulkan driver to draw with", hint=hint)
     if any(sign in text for sign in _NO_SCREEN):
         return OutputError("the viewer finds no screen", hint=hint)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines = [line for line in lines if "XDG_RUNTIME_DIR" not in line]  # every machine without a desktop says that
+    lines = [line for line in lines if "XDG_RUNTIME_DIR" not in line]  # Every machine without a desktop prints this line.
     panic = next((" ".join(lines[i : i + 2]) for i, line in enumerate(lines) if "panicked" in line), None)
     reason = panic or next((line for line in lines if "error" in line.lower()), lines[0] if lines else "")
     return OutputError(f"the viewer ended with code {code}" + (f": {reason[:200]}" if reason else ""), hint=hint)
 
 
 def _wait_for(viewer: Viewer, port: int) -> None:
-    """Wait until a viewer listens on a port; OutputError where it ends instead."""
-    end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end:
-        _check_running(viewer)
-        try:
-            socket.create_connection((_LOOPBACK, port), timeout=0.5).close()
-            return
-        except OSError:
-            time.sleep(0.1)
-    stop(viewer)
-    raise OutputError("the viewer does not answer")
+    """Wait until a viewer listens on a port; OutputError if it ends or does not answer."""
+
+    def attempt() -> bool:
+        socket.create_connection((_LOOPBACK, port), timeout=0.5).close()
+        return True
+
+    if _retry(viewer, attempt) is None:
+        stop(viewer)
+        raise OutputError(f"the viewer does not answer at port {port} in {_PATIENCE:g} s")
 
 
 def start_listening(port: int, *arguments: str) -> Viewer:
-    """Start a viewer, and wait until it listens on a port; OutputError where it ends instead."""
+    """Start a viewer and wait until it listens on a port; OutputError if it ends or does not answer."""
     viewer = start(*arguments)
     _wait_for(viewer, port)
     assert viewer.stderr is not None
-    # what it says from now on is read and forgotten: it would stop at a full pipe
+    # A thread reads the viewer's stderr and ignores it, because the viewer would block at a full pipe.
     threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True).start()
     return viewer
 
 
-def _until_closed(viewer: Viewer) -> tuple[bytes, bytes]:
-    try:
-        return viewer.communicate()
-    except KeyboardInterrupt:
-        stop(viewer)
-        raise
-
-
 def stop(viewer: Viewer) -> None:
-    """End a viewer that `start` started."""
+    """End the process of a viewer."""
     if viewer.poll() is None:
         viewer.terminate()
         try:

@@ -1,6 +1,4 @@
-"""How the viewer lays a recording out when it is first opened."""
-
-from __future__ import annotations
+"""The layout of a recording when the viewer first opens it."""
 
 from typing import Any
 
@@ -11,26 +9,33 @@ from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind, Timeline
 from objslam.output.viewer.times import ITERATION, STAMP
 from objslam.output.viewer.view_point import ViewPoint
 
-_ITERATIONS = 4.0  # The solver's iterations that playing shows in a second.
+_ITERATIONS = 4.0  # Playback shows this many iterations of the solver per second.
 _HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before")
-"""Entities that are shown at a click: lines are opaque, and many would cover the map."""
+"""The entities that are hidden until a click, because many opaque lines would hide the map."""
 
 
 def blueprint(view_point: ViewPoint, cameras: list[tuple[str, str]], *, solver: bool = True, live: bool = False) -> Any:
-    """The layout: the map on the left, cameras and curves on the right, the decisions below.
+    """Make the layout: the map on the left, cameras and curves on the right, the log below.
 
     Args:
         cameras: the entity path and the name of each camera.
-        solver: whether there are iterations to step through.
-        live: whether the curves are those of a session at work.
+        solver: whether the recording has iterations.
+        live: whether to show the curves of a running session.
     """
-    right = [_cameras(cameras)] if cameras else []
+    views = [rrb.Spatial2DView(origin=path, name=name, background=[40, 44, 52]) for path, name in cameras]
+    right = [rrb.Tabs(*views) if len(views) > 1 else views[0]] if views else []
     right.append(_live_curves() if live else _curves(solver))
     column = rrb.Vertical(*right, row_shares=[3, 2][-len(right) :])
+    # The log hides the entity path, which all lines share, and the times, because each text begins with its time.
+    shown = {"LogLevel": True, "Body": True, "EntityPath": False}
+    columns = rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn(name, visible=False) for name in (STAMP, ITERATION)],
+        text_log_columns=[TextLogColumn(TextLogColumnKind[kind], visible=visible) for kind, visible in shown.items()],
+    )
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(map_view(view_point), column, column_shares=[3, 2]),
-            rrb.TextLogView(origin="log", name="what was decided", columns=_columns()),
+            rrb.TextLogView(origin="log", name="events", columns=columns),
             row_shares=[7, 2],
         ),
         rrb.TimePanel(timeline=STAMP, state="collapsed", fps=_ITERATIONS, play_state="following" if live else "playing"),
@@ -39,7 +44,7 @@ def blueprint(view_point: ViewPoint, cameras: list[tuple[str, str]], *, solver: 
 
 
 def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] = _HIDDEN) -> Any:
-    """The 3D view of the map; hidden: the entities that are not shown at first."""
+    """Make the 3D view of the map; the entities in `hidden` are invisible at first."""
     controls = rrb.EyeControls3D(position=view_point.position, look_target=view_point.target, eye_up=[0, 0, 1])
     return rrb.Spatial3DView(
         origin="map",
@@ -50,13 +55,8 @@ def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] =
     )
 
 
-def _cameras(cameras: list[tuple[str, str]]) -> Any:
-    views = [rrb.Spatial2DView(origin=path, name=name, background=[40, 44, 52]) for path, name in cameras]
-    return rrb.Tabs(*views) if len(views) > 1 else views[0]
-
-
 def _curves(solver: bool) -> Any:
-    # each view shows two curves, of which the chosen timeline has one: of the drive, or of the solver
+    # Each view has a curve of the drive and a curve of the solver. The chosen timeline selects one of them.
     pairs = {"residual": ("residual, deg", "cost"), "boxes": ("boxes", "rounds")}
     views = [
         _curve([f"plots/{drive}", *([f"plots/{step}"] if solver else [])], f"{name}; {step}" if solver else name)
@@ -75,12 +75,3 @@ def _live_curves() -> Any:
 def _curve(paths: list[str], name: str) -> Any:
     whole = rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
     return rrb.TimeSeriesView(contents=[f"{path}/**" for path in paths], name=name, axis_x=rrb.TimeAxis(view_range=whole))
-
-
-def _columns() -> Any:
-    """The columns of the log: level and text, because the text begins with the time and all lines have one entity path."""
-    kinds = {"LogLevel": True, "Body": True, "EntityPath": False}
-    return rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(name, visible=False) for name in (STAMP, ITERATION)],
-        text_log_columns=[TextLogColumn(TextLogColumnKind[kind], visible=shown) for kind, shown in kinds.items()],
-    )

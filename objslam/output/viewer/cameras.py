@@ -1,6 +1,4 @@
-"""Cameras: frusta that move with the robot, their images and boxes, and the map's objects as the camera should see them."""
-
-from __future__ import annotations
+"""Cameras in a recording: moving frusta, images, boxes, and the objects of the map projected into the images."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -12,37 +10,34 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera, in_view
 from objslam.core.geometry import inverse
+from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.output.plot.style import captions, ray_kinds
-from objslam.output.viewer.image_labels import label_rows
 from objslam.output.viewer.images import choose_images, jpegs
 from objslam.output.viewer.objects import colours
 from objslam.output.viewer.paths import send_poses
-from objslam.output.viewer.rays import RAY_COLOURS
+from objslam.output.viewer.rays import RAY_COLOURS, kind_colours
 from objslam.output.viewer.times import moments, stamp_column
+from objslam.output.viewer.view_point import label_rows
 
-_BLOCK = 500_000  # How many pairs of an object and a frame are tested at once; a larger value takes more memory.
-_NEAR = 0.2  # The distance, m, from which a camera is expected to see an object.
-_BEYOND = 1.2  # The distance up to which it is expected to, as a share of that of the object's farthest used ray.
-_LIGHTER = 0.35  # The share by which an object's colour, dark enough for a white page, is lightened for an image.
-_FRUSTUM = 0.05  # The depth of a camera's frustum, as a share of the map's size.
+_BLOCK = 500_000  # This many pairs of an object and a frame are tested at once. A larger value takes more memory.
+_NEAR = 0.2  # A camera is expected to see an object from this distance, m.
+_BEYOND = 1.2  # A camera is expected to see an object up to this multiple of the length of its longest used ray.
+_LIGHTER = 0.35  # Colours of objects suit a white page. For images, they are lightened by this share, in [0, 1].
+_FRUSTUM = 0.05  # The frustum of a camera has this depth, as a share of the map's size.
 
 
 def camera_path(camera: Camera) -> str:
-    """The entity path of a camera."""
+    """Return the entity path of a camera."""
     return str(rr.new_entity_path(["map", "camera", camera.name])).lstrip("/")
 
 
 def log_cameras(recording: Any, result: RunResult, size: float) -> int:
-    """Log each camera that moves with the robot: `map/camera/NAME`.
+    """Log each camera that moves with the robot, `map/camera/NAME`, and return the number of unreadable images.
 
-    Below it are `image`, `boxes` in the colours of their objects (grey unexplained, red rejected), and `map`, the objects
-    where they should be in the image. Images are scaled down as the settings say, and all pixels with them.
-
-    Args:
-        size: of the map, m.
-    Returns:
-        The number of images that could not be read.
+    `image` has the images. `boxes` has the boxes in the colours of their objects. `map` has the projected objects. The
+    setting `output.image_width` limits the width of the images. All pixel coordinates are scaled with the images.
+    The size of the map, `size`, m, sets the depth of the frusta.
     """
     unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
@@ -51,7 +46,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
         if len(mine) == 0:
             continue
         images = result.images[index] if index < len(result.images) else None
-        # a whole number is quick to scale by, and each pixel is the mean of whole pixels
+        # Scaling by a whole number is fast, and each pixel is the mean of whole pixels.
         scale = 1 / np.ceil(camera.width / result.settings.output.image_width) if images is not None else 1.0
         path = camera_path(camera)
         log_pinhole(recording, path, camera, scale, size)
@@ -67,7 +62,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
 
 
 def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
-    """The frustum of a camera, its pixels scaled by `scale`, for a map of `size`, m; static."""
+    """Log the static frustum of a camera, with pixels scaled by `scale`, for a map of `size`, m."""
     matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
     pinhole = rr.Pinhole(
         image_from_camera=matrix,
@@ -75,15 +70,15 @@ def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: f
         camera_xyz=rr.ViewCoordinates.RDF,
         image_plane_distance=_FRUSTUM * size,
         color=RAY_COLOURS["used"],
-        line_width=-1.5,  # a negative width is in points on the screen
+        line_width=-1.5,  # A negative width is in points on the screen.
     )
     recording.log(path, pinhole, static=True)
 
 
 def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
-    """Send the images of the stamps with the indices `shown` (n,); the number of images that could not be read.
+    """Send the images of the stamps with indices `shown` (n,), and return the number of unreadable images.
 
-    The other stamps get none, because boxes on the image of another moment would mislead.
+    The other stamps get no image, because boxes on the image of another stamp would mislead.
     """
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
     for place, blob in zip(shown.tolist(), images, strict=True):
@@ -103,43 +98,41 @@ def _send_boxes(recording: Any, path: str, result: RunResult, mine: Ints, scale:
     rays = np.flatnonzero(number[result.rays.keyframe] >= 0)
     stamps, counts, order = moments(result.keyframes.stamps[mine], number[result.rays.keyframe[rays]])
     rays = rays[order]
-    box = scale * result.rays.box[rays]
-    columns = rr.Boxes2D.columns(
-        centers=(box[:, :2] + box[:, 2:]) / 2, half_sizes=(box[:, 2:] - box[:, :2]) / 2, colors=box_colours(result)[rays]
-    ).partition(counts)
-    recording.send_columns(f"{path}/boxes", [stamp_column(stamps)], columns)
+    low, high = np.split(scale * result.rays.box[rays], 2, axis=1)
+    columns = rr.Boxes2D.columns(centers=(low + high) / 2, half_sizes=(high - low) / 2, colors=box_colours(result)[rays])
+    recording.send_columns(f"{path}/boxes", [stamp_column(stamps)], columns.partition(counts))
     recording.log(f"{path}/boxes", rr.Boxes2D.from_fields(radii=rr.Radius.ui_points(1.5)), static=True)
 
 
 def box_colours(result: RunResult) -> NDArray[np.uint8]:
-    """The RGB colours (R, 3) of the boxes: that of the object, grey without one, red where the robust loss rejects it."""
-    palette = np.array([lighter(c) for c in colours(result.map)], dtype=np.uint8).reshape(-1, 3)
-    kinds = ray_kinds(result)
-    colour = np.zeros((len(result.rays), 3), dtype=np.uint8)
-    colour[kinds["used"]] = palette[result.association.object[kinds["used"]]]
-    for kind in ("rejected", "unexplained"):
-        colour[kinds[kind]] = RAY_COLOURS[kind]
+    """Return the RGB colour (R, 3) of each box: its object's colour, red if rejected, grey if unexplained."""
+    colour, used = kind_colours(result), ray_kinds(result)["used"]
+    colour[used] = light_colours(result.map)[result.association.object[used]]
     return colour
 
 
-def lighter(colour: tuple[int, int, int]) -> tuple[int, int, int]:
-    """A colour that is seen on an image."""
-    r, g, b = (round(c + _LIGHTER * (255 - c)) for c in colour)
-    return r, g, b
+def light_colours(objects: ObjectMap) -> NDArray[np.uint8]:
+    """Return an RGB colour (N, 3) for each object that is visible on an image."""
+    light = [[round(c + _LIGHTER * (255 - c)) for c in colour] for colour in colours(objects)]
+    return np.array(light, dtype=np.uint8).reshape(-1, 3)
 
 
 def _send_objects(
     recording: Any, path: str, result: RunResult, camera: Camera, stamps: Floats, poses: Floats, scale: float
 ) -> None:
-    """The resolved objects in the image at each stamp, `.../map`, and their names below them, `.../map/labels`."""
+    """Send the resolved objects in the image at each stamp, `.../map`, and their labels, `.../map/labels`."""
     resolved = [i for i, o in enumerate(result.map.objects) if o.status == "ok"]
     if not resolved:
         return
-    positions = np.stack([result.map.objects[i].position for i in resolved])
-    frame, seen, pixels = points_in_frames(camera, poses, positions, _farthest(result, resolved))
+    used = np.flatnonzero(ray_kinds(result)["used"])
+    index = result.association.object[used]
+    positions = np.stack([o.position for o in result.map.objects])
+    reach = np.zeros(len(positions))
+    np.maximum.at(reach, index, np.linalg.norm(positions[index] - result.origins[used], axis=1))
+    frame, seen, pixels = points_in_frames(camera, poses, positions[resolved], _BEYOND * reach[resolved])
     pixels *= scale
     names = np.array(captions(result.map), dtype=object)[resolved]
-    palette = np.array([lighter(c) for c in colours(result.map)], dtype=np.uint8)[resolved]
+    palette = light_colours(result.map)[resolved]
     at = [stamp_column(stamps)]
     dots = rr.Points2D.columns(positions=pixels, colors=palette[seen])
     recording.send_columns(f"{path}/map", at, dots.partition(np.bincount(frame, minlength=len(stamps))))
@@ -154,9 +147,12 @@ def _send_objects(
 
 
 def points_in_frames(camera: Camera, map_T_camera: Floats, points: Floats, farthest: Floats) -> tuple[Ints, Ints, Floats]:
-    """Which points (N, 3) are in the images of which poses (K, 4, 4): pose and point (S,), indices, and raw pixels (S, 2).
+    """Project points (N, 3), m in map, into the images at poses (K, 4, 4), and keep the points in view.
 
-    farthest: (N,) m, the distance up to which a point is expected to be seen.
+    Args:
+        farthest: (N,) m, the distance up to which a camera is expected to see each point.
+    Returns:
+        Index of the pose (S,), index of the point (S,), and raw pixels (S, 2).
     """
     cos = np.cos(camera.view_angle)
     found: list[tuple[Ints, Ints, Floats]] = []
@@ -170,13 +166,3 @@ def points_in_frames(camera: Camera, map_T_camera: Floats, points: Floats, farth
         found.append((pose[inside] + begin, point[inside], pixels))
     pose, point, pixels = (np.concatenate(c) for c in zip(*found, strict=True))
     return pose, point, pixels
-
-
-def _farthest(result: RunResult, objects: list[int]) -> Floats:
-    """The distance (n,), m, up to which each object may be seen: a little more than its farthest used ray."""
-    used = np.flatnonzero(ray_kinds(result)["used"])
-    index = result.association.object[used]
-    every = np.stack([o.position for o in result.map.objects])
-    reach = np.zeros(len(every))
-    np.maximum.at(reach, index, np.linalg.norm(every[index] - result.origins[used], axis=1))
-    return _BEYOND * reach[objects]

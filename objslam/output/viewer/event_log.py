@@ -1,6 +1,4 @@
-"""The decisions of a run in words: when an object was seen, why it is unresolved, what each round changed."""
-
-from __future__ import annotations
+"""The texts of a recording: events of the drive, changes of each round, changes of a live map, a table of the run."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,15 +12,25 @@ from objslam.core.trace import Round
 from objslam.output.plot.style import captions, ray_kinds
 
 Level = Literal["INFO", "WARN"]
-_MAX_CHANGES = 40  # The largest number of changes of objects that are told of one round.
-_MERGED = 0.5  # An object that vanishes within this distance, m, of another of its label has become that one.
+_MAX_CHANGES = 40  # The log lists at most this many changes of objects per round.
+_MERGED = 0.5  # A deleted object counts as merged if another object of its label lies within this distance, m.
 _WHY = {
-    "fixed": "association at the poses as they are",
+    "fixed": "association at the fixed poses",
     "labels": "every label taken for one object",
     "association": "association at the poses so far",
-    "merge": "objects that the poses brought together are one",
+    "merge": "merge of objects that the new poses place together",
 }
-"""What the reasons for a round are called."""
+"""The words in the log for the reason of a round."""
+_COUNTS = {
+    "keyframes": "keyframes",
+    "detections": "boxes",
+    "rays": "rays",
+    "rays_rejected": "rejected by the robust loss (red)",
+    "rays_unexplained": "explained by no object (grey)",
+    "objects": "objects",
+    "unresolved": "unresolved objects",
+}
+"""The words in the table for the counts of summary.json."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +43,14 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """The events of a drive in the order of time: first the whole, then each object."""
+    """Return the events of a drive: the whole run first, then the events of the objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
     events = [Event(start, "INFO", f"{objects}, {len(result.rays)} rays, {len(result.keyframes)} keyframes")]
     events += [Event(start, "WARN", str(text)) for text in result.summary.get("warnings", [])]
-    for reason, count in result.summary.get("dropped", {}).items():
-        events.append(Event(start, "WARN", f"dropped {count}: {reason}"))
+    dropped = result.summary.get("dropped", {})
+    events += [Event(start, "WARN", f"dropped {count}: {reason}") for reason, count in dropped.items()]
     enough = _enough_parallax(result)
     rejected = np.bincount(result.association.object[ray_kinds(result)["rejected"]], minlength=max(len(result.map), 1))
     later: list[Event] = []
@@ -57,7 +65,7 @@ def drive_events(result: RunResult) -> list[Event]:
             continue
         if np.isfinite(enough[j]):
             limit = result.settings.triangulation.min_parallax_deg
-            add(float(enough[j]), "INFO", f"{name}: its rays now span {limit:g} deg, enough for a place")
+            add(float(enough[j]), "INFO", f"{name}: its rays now span {limit:g} deg, enough for a position")
         out = f", {rejected[j]} rejected" if rejected[j] else ""
         sigma = "" if o.sigma is None else f", sigma {100 * o.sigma:.1f} cm"
         text = f"{name}: {o.rays} rays{out}, parallax {o.parallax_deg:.0f} deg, rms {o.rms_deg:.2f} deg{sigma}"
@@ -66,22 +74,19 @@ def drive_events(result: RunResult) -> list[Event]:
 
 
 def _why_unresolved(o: MapObject, result: RunResult) -> str:
-    """Why an object has no position to rely on, by the limits of the settings."""
+    """Return the limit of the settings that makes an object unresolved, as text."""
     limits = result.settings.triangulation
     if o.rays < 2:
-        return "a single ray says where to look, not how far"
+        return "a single ray gives a direction and no distance"
     if o.parallax_deg < limits.min_parallax_deg:
-        return (
-            f"its {o.rays} rays span {o.parallax_deg:.1f} deg (triangulation.min_parallax_deg {limits.min_parallax_deg:g})"
-        )
-    return (
-        f"its {o.rays} rays leave it less certain than {limits.max_rel_sigma:g} of its distance "
-        "(triangulation.max_rel_sigma), or do not agree"
-    )
+        least = f"triangulation.min_parallax_deg {limits.min_parallax_deg:g}"
+        return f"its {o.rays} rays span {o.parallax_deg:.1f} deg ({least})"
+    most = f"{limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
+    return f"its {o.rays} rays disagree, or its sigma exceeds {most}"
 
 
 def _enough_parallax(result: RunResult) -> Floats:
-    """The stamp (N,), s, at which each object's used rays first spanned enough parallax, seen from the first; else NaN."""
+    """Return the stamp (N,), s, of each object's first used ray with enough parallax to its first used ray; else NaN."""
     stamps = np.full(len(result.map), np.nan)
     used = np.flatnonzero(ray_kinds(result)["used"])
     order = used[np.lexsort((result.rays.keyframe[used], result.association.object[used]))]
@@ -99,18 +104,17 @@ def _enough_parallax(result: RunResult) -> Floats:
 
 
 def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list[Event]:
-    """What each round changed, at its first iteration, and the outcome of its solve, at its last."""
+    """Return the changes of each round at its first iteration, and the result of its solve at its last iteration."""
     events: list[Event] = []
     at, before = 0, None
     for number, r in enumerate(trace):
-        names = [f"{label_names[k]} #{j}" for j, k in enumerate(r.association.label.tolist())]
         free = int((r.association.object < 0).sum())
-        head = f"round {number + 1}, {_WHY[r.why]}: {r.association.count} objects, {free} rays that none explains"
+        head = f"round {number + 1}, {_WHY[r.why]}: {r.association.count} objects, {free} unexplained rays"
         events.append(Event(at, "INFO", head))
         if before is not None and before.why == "labels":
-            text = "labels are no identities: too many rays disagreed with the one object of theirs"
+            text = "a label is not one object: too many rays disagreed with the only object of their label"
             events.append(Event(at, "WARN", text))
-        changes = _changes(before, r, names, label_names)
+        changes = _changes(before, r, label_names)
         events += [Event(at, "INFO", text) for text in changes[:_MAX_CHANGES]]
         if len(changes) > _MAX_CHANGES:
             events.append(Event(at, "INFO", f"... and {len(changes) - _MAX_CHANGES} more"))
@@ -124,23 +128,24 @@ def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list
     return events
 
 
-def _changes(before: Round | None, now: Round, names: list[str], label_names: tuple[str, ...]) -> list[str]:
-    """Objects born, merged and dropped between two rounds, by where the rays went."""
+def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> list[str]:
+    """Return the new, merged and dropped objects between two rounds, by the objects of their rays."""
+    names = [f"{label_names[k]} #{j}" for j, k in enumerate(now.association.label.tolist())]
     rays = np.bincount(now.association.object[now.association.object >= 0], minlength=now.association.count)
     if before is None:
-        return [f"born: {name}, {n} rays" for name, n in zip(names, rays.tolist(), strict=True)]
+        return [f"new: {name}, {n} rays" for name, n in zip(names, rays.tolist(), strict=True)]
     old = before.association
     old_names = [f"{label_names[k]} #{i}" for i, k in enumerate(old.label.tolist())]
     held, news = old.object >= 0, now.association.count
     to = np.where(now.association.object[held] < 0, news, now.association.object[held])
     went = np.bincount(old.object[held] * (news + 1) + to, minlength=old.count * (news + 1)).reshape(old.count, news + 1)
     heir = np.where(went.sum(axis=1) > 0, went.argmax(axis=1), -1)
-    heir[heir == news] = -1  # the last column of `went`: no object explains the rays any more
+    heir[heir == news] = -1  # The last column of `went` counts the rays that are now unexplained.
     texts = []
     for j in range(news):
         parents = np.flatnonzero(heir == j)
         if len(parents) == 0:
-            texts.append(f"born: {names[j]}, {rays[j]} rays that were others' or nobody's")
+            texts.append(f"new: {names[j]}, {rays[j]} rays of other objects or unexplained")
         elif len(parents) > 1:
             merged = ", ".join(f"{old_names[i]} ({int(went[i].sum())} rays)" for i in parents)
             gap = float(np.linalg.norm(before.positions[parents[0]] - before.positions[parents[1]]))
@@ -148,27 +153,51 @@ def _changes(before: Round | None, now: Round, names: list[str], label_names: tu
             texts.append(f"merged: {merged} are {names[j]}{apart}")
     for i in np.flatnonzero(heir < 0):
         lost, total = int(went[i, -1]), int(went[i].sum())
-        texts.append(f"dropped: {old_names[i]}, {lost} of its {total} rays are explained by nothing now")
+        texts.append(f"dropped: {old_names[i]}, {lost} of its {total} rays are now unexplained")
     return texts
 
 
 def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
-    """What changed in a live map, by the objects' ids: born, placed, no longer sure, renamed, dropped."""
+    """Return the changes of a live map by object id: new, resolved, unresolved, renamed, dropped."""
     old, new = ({o.id: o for o in m.objects} for m in (before, now))
     lines: list[tuple[Level, str]] = []
     for j, o in new.items():
-        name, was = f"{o.label} #{j}", old.get(j)
+        was, text = old.get(j), f"{o.label} #{j}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"
         if was is None:
-            lines.append(("INFO", f"born: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+            lines.append(("INFO", f"new: {text}"))
         if o.status == "ok" and (was is None or was.status != "ok"):
             sigma = "" if o.sigma is None else f", sigma {100 * o.sigma:.0f} cm"
-            lines.append(("INFO", f"placed: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg{sigma}"))
+            lines.append(("INFO", f"resolved: {text}{sigma}"))
         if o.status != "ok" and was is not None and was.status == "ok":
-            lines.append(("WARN", f"no longer sure: {name}, {o.rays} rays, parallax {o.parallax_deg:.0f} deg"))
+            lines.append(("WARN", f"no longer resolved: {text}"))
         if was is not None and was.label != o.label:
             lines.append(("INFO", f"renamed: {was.label} #{j} is a {o.label}"))
     for o in (o for j, o in old.items() if j not in new):
         near = [n for n in new.values() if n.label == o.label and np.linalg.norm(n.position - o.position) < _MERGED]
-        into = f"merged into {near[0].label} #{near[0].id}" if near else "nothing explains it any more"
+        into = f"merged into {near[0].label} #{near[0].id}" if near else "its rays are now unexplained"
         lines.append(("INFO", f"dropped: {o.label} #{o.id}, {o.rays} rays, {into}"))
     return lines
+
+
+def summary_text(result: RunResult) -> str:
+    """Return the table of a run as Markdown: counts, cost, the time of each stage, and the rounds."""
+    summary = result.summary
+    counts, seconds = summary.get("counts", {}), summary.get("seconds", {})
+    rows = [(name, str(counts[key])) for key, name in _COUNTS.items() if key in counts]
+    if "cost_before" in summary:
+        rows.append(("cost", f"{summary['cost_before']:.4g} to {summary['cost_after']:.4g}"))
+    rows += [(f"seconds: {name}", f"{value:.2f}") for name, value in seconds.items()]
+    lines = [f"**{summary.get('log', 'run')}**, {summary.get('mode', result.settings.mode)} mode", "", *table(rows)]
+    if result.trace:
+        lines += ["", "| round | objects | unexplained | cost |", "|---|---:|---:|---:|"]
+        for number, r in enumerate(result.trace):
+            cost = next((f"{i.cost:.4g}" for i in reversed(r.iterations)), "")
+            free = int((r.association.object < 0).sum())
+            lines.append(f"| {number + 1} {r.why} | {r.association.count} | {free} | {cost} |")
+        lines += ["", "The timeline `iteration` steps through the solver."]
+    return "\n".join(lines)
+
+
+def table(rows: list[tuple[str, str]]) -> list[str]:
+    """Return the lines of a Markdown table of names and values."""
+    return ["| | |", "|---|---:|", *(f"| {name} | {value} |" for name, value in rows)]

@@ -1,4 +1,4 @@
-"""The proximity field of one object: Eq. 1's cost on two slices of the map, its minimum, and the rays that pull on it."""
+"""A recording of the proximity field of one object: the cost of Eq. 1 on two slices, its minimum, and the rays."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
 from objslam.output.plot.style import RayKind, captions, evenly
+from objslam.output.viewer.event_log import table
 from objslam.output.viewer.objects import log_objects
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.view_point import ViewPoint, first_view_point, look_at
@@ -25,18 +26,18 @@ from objslam.triangulation.proximity_field import ProximityField, main_heading, 
 if TYPE_CHECKING:
     from objslam.io.rays_parquet import RaysTable
 
-_MAX_RAYS = 160  # The largest number of rays of a kind that are drawn, evenly chosen.
-_FROM = np.array([0.62, -0.62, 0.55])  # The direction of the view, in the slices' own axes: ahead, aside, up.
-_DISTANCE = 4.2  # The distance of the view point, in half edges of a slice.
-_TEXT, _ESTIMATE, _MINIMUM = (255, 255, 255), (40, 44, 52), (90, 255, 120)  # RGB: white, nearly black, green.
+_MAX_RAYS = 160  # The recording shows at most this many rays of each kind, evenly chosen.
+_FROM = np.array([0.62, -0.62, 0.55])  # The view point lies in this direction, in the axes of the slices: ahead, left, up.
+_DISTANCE = 4.2  # The view point lies at this distance, in half edges of a slice.
+_TEXT, _ESTIMATE, _MINIMUM = (255, 255, 255), (40, 44, 52), (90, 255, 120)  # The RGB colours: white, nearly black, green.
 _HIDDEN = ("map/objects/labels", "map/objects/extent", "map/rays", "map/reconstruction")
-"""Entities of the run's own recording that would cover the field and are shown at a click."""
+"""The entities of the run's recording that are hidden until a click, because they would hide the field."""
 
 
 def write_field(out: Path, number: int, file: Path) -> ProximityField:
-    """Write a recording that shows the field of one object in the map.
+    """Write a recording of the run with the proximity field of one object, and return the field.
 
-    It is the run's own recording with the field added, or, where the run wrote none, the map and the field alone.
+    If the run wrote no recording, the new recording has the map and the field only.
 
     Args:
         out: the result folder.
@@ -54,17 +55,22 @@ def write_field(out: Path, number: int, file: Path) -> ProximityField:
     mine = rays.object == number
     pull = supporting_rays(rays.weight, mine)
     if pull.sum() < 2:
-        raise OutputError(f"object {number} has {pull.sum()} rays: Eq. 1 has no single minimum", where=str(out))
+        raise OutputError(f"object {number} has {pull.sum()} rays: Eq. 1 has no minimum below 2 rays", where=str(out))
     f = proximity_field(rays.origin[pull], rays.direction[pull])
-    view_point = _view_point(f, rays.direction[pull])
+    ahead = main_heading(rays.direction[pull])
+    back = _FROM @ np.stack([ahead, [-ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+    view_point = look_at(f.minimum, back, _DISTANCE * float(np.ptp(f.vertical.points[..., 2])) / 2)
     name = captions(objects)[objects.objects.index(o)]
-
     recording = rr.RecordingStream("objslam")
     memory = recording.memory_recording()
     recording.send_recording_name(f"proximity field of {name}")
     recording.send_blueprint(_blueprint(view_point))
-    if (out / RECORDING).is_file():
-        _send_recording(recording, out / RECORDING)
+    if (own := out / RECORDING).is_file():
+        try:
+            recording.send_chunks(RrdReader(own).stream())
+        except (ValueError, RuntimeError, OSError) as error:
+            why = str(error).splitlines()[0]
+            raise OutputError(f"the recording is damaged: {why}", where=str(own), hint="run again") from error
     else:
         recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         path = load_trajectory(out).poses[:, :3, 3]
@@ -78,23 +84,16 @@ def write_field(out: Path, number: int, file: Path) -> ProximityField:
 
 
 def heat(cost: Floats, low: float, high: float) -> NDArray[np.uint8]:
-    """RGB colours (..., 3) of costs (...), m: bright at the lowest cost, dark at the highest."""
+    """Return RGB colours (..., 3) for costs (...), m: bright at the lowest cost `low`, dark at the highest cost `high`."""
     from matplotlib import colormaps
 
-    # the cost rises like a cone: the square root gives more colours to the part around the minimum
+    # The cost rises from the minimum like a cone, so the square root gives more colours to the part near the minimum.
     share = np.sqrt(np.clip((cost - low) / max(high - low, 1e-12), 0.0, 1.0))
     return (255 * colormaps["inferno"](0.97 * (1 - share))[..., :3]).round().astype(np.uint8)
 
 
-def _send_recording(recording: Any, file: Path) -> None:
-    try:
-        recording.send_chunks(RrdReader(file).stream())
-    except (ValueError, RuntimeError, OSError) as error:
-        raise OutputError(f"damaged: {str(error).splitlines()[0]}", where=str(file), hint="run again") from error
-
-
 def _log_field(recording: Any, f: ProximityField) -> None:
-    """`map/field/horizontal` and `map/field/vertical`: the slices as points in the colours of their costs."""
+    """Log the slices as points in the colours of their costs, `map/field/horizontal` and `map/field/vertical`."""
     high = float(max(f.horizontal.cost.max(), f.vertical.cost.max()))
     for name, s in (("horizontal", f.horizontal), ("vertical", f.vertical)):
         spacing = float(np.linalg.norm(s.points[0, 1] - s.points[0, 0]))
@@ -103,7 +102,7 @@ def _log_field(recording: Any, f: ProximityField) -> None:
 
 
 def _log_rays(recording: Any, rays: RaysTable, pull: Bools, rejected: Bools, f: ProximityField) -> None:
-    """`map/field/rays`, blue, pull on the object; `map/field/rejected`, red, do not. Both reach through the slices."""
+    """Log the used rays, `map/field/rays`, blue, and the rejected rays, `map/field/rejected`, red."""
     reach = float(np.linalg.norm(f.horizontal.points[0, 0] - f.minimum))
     drawn: tuple[tuple[str, Bools, RayKind], ...] = (("rays", pull, "used"), ("rejected", rejected, "rejected"))
     for name, mask, kind in drawn:
@@ -118,9 +117,9 @@ def _log_rays(recording: Any, rays: RaysTable, pull: Bools, rejected: Bools, f: 
 
 
 def _log_marks(recording: Any, f: ProximityField, o: MapObject, name: str, view_point: ViewPoint) -> None:
-    """`map/field/minimum`, and `map/field/estimate`, the run's position of the object; each has its name on a pole."""
+    """Log the minimum of Eq. 1, `map/field/minimum`, and the run's estimate, `map/field/estimate`, with labels."""
     size = float(np.ptp(f.vertical.points[..., 2]))
-    nearer = -0.03 * size * view_point.axes[2]  # in front of the slice that both lie in
+    nearer = -0.03 * size * view_point.axes[2]  # The marks lie in front of the vertical slice.
     for path, place, label, colour, lift in (
         ("minimum", f.minimum, f"minimum of Eq. 1, {_metres(f.cost)} in the mean", _MINIMUM, 0.26),
         ("estimate", o.position, name, _ESTIMATE, 0.42),
@@ -135,18 +134,10 @@ def _log_marks(recording: Any, f: ProximityField, o: MapObject, name: str, view_
         recording.log(f"map/field/{path}/pole", pole, static=True)
 
 
-def _view_point(f: ProximityField, directions: Floats) -> ViewPoint:
-    ahead = main_heading(directions)
-    aside = np.array([-ahead[1], ahead[0], 0.0])
-    back = _FROM @ np.stack([ahead, aside, [0.0, 0.0, 1.0]])
-    reach = float(np.ptp(f.vertical.points[..., 2])) / 2
-    return look_at(f.minimum, back, _DISTANCE * reach)
-
-
 def _blueprint(view_point: ViewPoint) -> Any:
     from objslam.output.viewer.blueprint import map_view
 
-    text = rrb.TextDocumentView(origin="field", name="what pulls on it")
+    text = rrb.TextDocumentView(origin="field", name="rays")
     return rrb.Blueprint(
         rrb.Horizontal(map_view(view_point, "proximity field", hidden=_HIDDEN), text, column_shares=[3, 1]),
         rrb.TimePanel(state="collapsed"),
@@ -158,24 +149,19 @@ def _text(f: ProximityField, objects: ObjectMap, o: MapObject, name: str, rays: 
     gap = float(np.linalg.norm(f.minimum - o.position))
     off = np.linalg.norm(np.cross(f.minimum - rays.origin[pull], rays.direction[pull]), axis=1)
     x, y, z = f.minimum
-    return "\n".join(
-        [
-            f"**{name}**, {o.status}, in a map of {len(objects)} objects",
-            "",
-            "| | |",
-            "|---|---:|",
-            f"| rays that pull (blue) | {pull.sum()} |",
-            f"| rejected (red) | {(rays.object == o.id).sum() - pull.sum()} |",
-            f"| parallax | {o.parallax_deg:.1f} deg |",
-            f"| minimum of Eq. 1 | {x:.3f}, {y:.3f}, {z:.3f} m |",
-            f"| its rays' distance, mean | {_metres(f.cost)} |",
-            f"| median, worst | {_metres(float(np.median(off)))}, {_metres(float(off.max()))} |",
-            f"| from the run's estimate | {_metres(gap)} |",
-            "",
-            "The colours are the mean distance of its rays to each point, Eq. 1's cost over their number: bright is close. "
-            "A valley along the view means that the rays say little about the distance.",
-        ]
-    )
+    rows = [
+        ("used rays (blue)", str(pull.sum())),
+        ("rejected rays (red)", str((rays.object == o.id).sum() - pull.sum())),
+        ("parallax", f"{o.parallax_deg:.1f} deg"),
+        ("minimum of Eq. 1", f"{x:.3f}, {y:.3f}, {z:.3f} m"),
+        ("mean distance of its used rays", _metres(f.cost)),
+        ("median distance, largest distance", f"{_metres(float(np.median(off)))}, {_metres(float(off.max()))}"),
+        ("distance from the run's estimate", _metres(gap)),
+    ]
+    head = f"**{name}**, {o.status}, in a map of {len(objects)} objects"
+    colour = "The colour of a point is its mean distance from the used rays: Eq. 1's cost divided by the number of rays."
+    valley = "Bright points are close. A valley along the rays means that the distance of the object is uncertain."
+    return "\n".join([head, "", *table(rows), "", f"{colour} {valley}"])
 
 
 def _metres(value: float) -> str:

@@ -1,6 +1,4 @@
-"""Camera images for a recording: few, small and as JPEG, read ahead in threads."""
-
-from __future__ import annotations
+"""Camera images for a recording: a limited number of small JPEGs, which threads read ahead."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,31 +9,29 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats, Ints
 from objslam.core.types import Images, Log
 from objslam.errors import LogError
+from objslam.frontend.box_depths import nearest_stamps
 from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 from objslam.output.plot.style import evenly
 
-_MAX_LAG = 0.05  # The longest time, s, between a keyframe and the image that is shown for it.
-_QUALITY = 70  # The quality of JPEGs, 0 to 100; larger values make larger recordings.
-_AHEAD = 8  # The number of images that are read ahead; larger values take more memory.
+_MAX_LAG = 0.05  # A keyframe and its image differ by at most this time, s.
+_QUALITY = 70  # JPEGs have this quality, 0 to 100. A larger value makes larger recordings.
+_AHEAD = 8  # Threads read this many images ahead. A larger value takes more memory.
 
 
 def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
-    """Which of the stamps (N,), s, get an image, at most `most` and evenly spread, and the index of each one's image."""
+    """Choose at most `most` of the stamps (N,), s, evenly, and return their indices and the indices of their images."""
     if most == 0 or len(stamps) == 0 or len(images.paths) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    after = np.clip(np.searchsorted(images.stamps, stamps), 1, max(len(images.stamps) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(images.stamps) - 1)
-    near = np.where(np.abs(images.stamps[before] - stamps) <= np.abs(images.stamps[after] - stamps), before, after)
-    there = np.flatnonzero(np.abs(images.stamps[near] - stamps) <= _MAX_LAG)
-    there = there[evenly(len(there), most)]
-    return there, near[there]
+    near = nearest_stamps(images.stamps, stamps)
+    shown = np.flatnonzero(np.abs(images.stamps[near] - stamps) <= _MAX_LAG)
+    shown = shown[evenly(len(shown), most)]
+    return shown, near[shown]
 
 
 def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
-    """A function that finds a log's image (H, W, 3), uint8 BGR, by the camera's name and a stamp, s; None without one."""
+    """Return a function from a camera's name and a stamp, s, to the log's image (H, W, 3), uint8 BGR, or None."""
     streams = {c.camera.name: c.rgb for c in log.cameras if c.rgb is not None}
 
     def find(camera: str, stamp: float) -> NDArray[np.uint8] | None:
@@ -49,13 +45,13 @@ def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
 
 
 def jpegs(images: Images, which: Ints, width: int, height: int) -> Iterator[bytes | None]:
-    """The chosen images as JPEG of a size, px, one after the other; None for an image that cannot be read."""
-    return ahead(lambda i: _jpeg(images, int(i), (width, height)), which.tolist(), _AHEAD)
+    """Yield the chosen images as JPEGs of a size, px; None for an image that cannot be read."""
 
+    def jpeg(index: int) -> bytes | None:
+        pixels = _read(images.paths[index])
+        return None if pixels is None else pack(pixels, (width, height))
 
-def _jpeg(images: Images, index: int, size: tuple[int, int]) -> bytes | None:
-    pixels = _read(images.paths[index])
-    return None if pixels is None else pack(pixels, size)
+    return ahead(jpeg, which.tolist(), _AHEAD)
 
 
 def _read(path: Path) -> NDArray[np.uint8] | None:
@@ -65,11 +61,11 @@ def _read(path: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def pack(pixels: np.ndarray, size: tuple[int, int]) -> bytes:
-    """Pixels (H, W, 3) uint8 BGR, or (H, W), as JPEG of a size (width, height)."""
+def pack(pixels: np.ndarray, size: tuple[int, int] | None = None) -> bytes:
+    """Encode pixels (H, W, 3) uint8 BGR, or (H, W), as a JPEG; `size` is (width, height), px, if it differs."""
     import cv2
 
-    if (pixels.shape[1], pixels.shape[0]) != size:
+    if size is not None and (pixels.shape[1], pixels.shape[0]) != size:
         pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     _, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     return data.tobytes()

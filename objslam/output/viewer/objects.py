@@ -1,6 +1,4 @@
-"""Objects: points with labels, covariance ellipsoids, boxes of their size, and a ray for each unresolved one."""
-
-from __future__ import annotations
+"""Objects in a recording: points, labels, covariance ellipsoids, boxes, and a line for each unresolved object."""
 
 from typing import Any
 
@@ -14,25 +12,25 @@ from objslam.core.types import Truth
 from objslam.output.plot.style import captions, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
-_MAX_LABELS = 60  # The largest number of objects whose labels are shown at first: more cannot keep clear of each other.
-_TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # RGB: black, white, grey.
+_MAX_LABELS = 60  # Labels are hidden at first if the map has more objects than this. More labels would overlap.
+_TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # The RGB colours are black, white, grey.
 
 
 def colours(objects: ObjectMap) -> list[tuple[int, int, int]]:
-    """Each object's RGB colour, 0 to 255."""
+    """Return the RGB colour, 0 to 255, of each object."""
     return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in object_colours(objects)]
 
 
 def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path: Floats, *, static: bool = True) -> None:
-    """Log the objects: `map/objects` are the resolved ones as points.
+    """Log the resolved objects as points, `map/objects`, and four entities below it.
 
-    Below it, `uncertainty` are their 2-sigma ellipsoids, `extent` boxes of their size, `unresolved` the rays on which the
-    unresolved ones lie, and `labels` all names.
+    `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `unresolved` has the
+    ray of each unresolved object. `labels` has the captions of all objects.
 
     Args:
-        path: (K, 3) points that labels try not to cover.
-        static: whether the objects are there for the whole recording. Otherwise they are logged at the recording's current
-            time, and what is empty is logged too, so that what was shown before goes.
+        path: (K, 3) points, m in map, that labels should not cover.
+        static: whether the objects are static. If not, they are logged at the current time of the recording, and an empty
+            entity is logged too, because it clears the earlier objects.
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 
@@ -41,13 +39,9 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
             recording.log(f"map/objects{name}", archetype, static=static)
 
     resolved = [i for i, o in enumerate(every) if o.status == "ok"]
-    points = rr.Points3D(
-        [every[i].position for i in resolved],
-        colors=[colour[i] for i in resolved],
-        radii=rr.Radius.ui_points(5),
-        labels=[texts[i] for i in resolved],
-        show_labels=False,
-    )
+    dots, shades = [every[i].position for i in resolved], [colour[i] for i in resolved]
+    known = [texts[i] for i in resolved]
+    points = rr.Points3D(dots, colors=shades, labels=known, radii=rr.Radius.ui_points(5), show_labels=False)
     log("", points, bool(resolved))
     shapes = [(i, shape) for i in resolved if (shape := ellipsoid(every[i])) is not None]
     bodies = rr.Ellipsoids3D(
@@ -68,15 +62,14 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     log("/extent", boxes, bool(sized))
     named = [i for i, o in enumerate(every) if np.isfinite(o.position).all()]
     unresolved = [(i, (ray[0], every[i].position)) for i in named if (ray := every[i].ray) is not None]
-    strips = rr.LineStrips3D(
-        [way for _, way in unresolved], colors=[colour[i] for i, _ in unresolved], radii=rr.Radius.ui_points(1)
-    )
+    ways = [way for _, way in unresolved]
+    strips = rr.LineStrips3D(ways, colors=[colour[i] for i, _ in unresolved], radii=rr.Radius.ui_points(1))
     log("/unresolved", strips, bool(unresolved))
     words = [texts[i] if every[i].status == "ok" else f"{texts[i]}, unresolved" for i in named]
     places = np.array([every[i].position for i in named]).reshape(-1, 3)
     shown = len(named) <= _MAX_LABELS
     hung, ends = label_places(view_point, places, words, path) if shown else (places, places)
-    # the viewer writes a label into a dark box, in its point's colour: only white can be read there
+    # The viewer writes a label in the colour of its point on a dark box, so only white is legible.
     names = rr.Points3D(hung, colors=[_TEXT], radii=0.0, labels=words, show_labels=shown)
     log("/labels", names, bool(named))
     lines = rr.LineStrips3D(np.stack([places, ends], axis=1), colors=[_LEADER], radii=rr.Radius.ui_points(0.4))
@@ -84,12 +77,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 
 def log_truth(recording: Any, truth: Truth) -> None:
-    """The true objects as black dots: `map/truth`, static."""
-    points = rr.Points3D(
-        [o.position for o in truth.objects],
-        colors=[_TRUTH],
-        radii=rr.Radius.ui_points(3),
-        labels=[o.label for o in truth.objects],
-        show_labels=False,
-    )
+    """Log the true objects as static black dots, `map/truth`."""
+    places, labels = [o.position for o in truth.objects], [o.label for o in truth.objects]
+    points = rr.Points3D(places, colors=[_TRUTH], labels=labels, radii=rr.Radius.ui_points(3), show_labels=False)
     recording.log("map/truth", points, static=True)

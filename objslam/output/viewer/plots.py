@@ -1,49 +1,47 @@
-"""Curves: the residuals and kinds of a frame's rays by stamp, cost and objects by iteration."""
-
-from __future__ import annotations
+"""Curves: residuals and ray counts by stamp, cost and object counts by iteration, and the time of each stage."""
 
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from objslam.core.arrays import Floats
 from objslam.core.result import RunResult
 from objslam.core.statistics import grouped_quantile
 from objslam.output.plot.style import ray_kinds
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
-_GAP = 1.0  # The shortest pause between stamps, s, that breaks a curve.
-_GAP_STEPS = 5.0  # The shortest pause that breaks a curve, in usual steps between stamps; the longer of both counts.
-_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # RGB colours of curves.
+_GAP, _GAP_STEPS = 1.0, 5.0
+"""A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 median steps."""
+_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # Curves have these colours.
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
-    """`plots/residual/median` and `worst` of the used rays of a stamp, deg; `plots/boxes/KIND`, the number of its rays."""
+    """Log the residuals of the used rays by stamp, `plots/residual`, deg, and the ray counts, `plots/boxes/KIND`."""
     stamps, moment = np.unique(result.keyframes.stamps, return_inverse=True)
     of = moment[result.rays.keyframe]
     kinds = ray_kinds(result)
     used = kinds["used"]
     degrees = np.degrees(result.residual[used])
+    step = np.diff(stamps)
+    gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
+    at = stamp_column(np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2))  # No line crosses a gap.
     for name, share, colour in (("median", 0.5, _BLUE), ("worst", 1.0, _ORANGE)):
-        at, curve = broken(stamps, grouped_quantile(degrees, of[used], len(stamps), share))
+        curve = np.insert(grouped_quantile(degrees, of[used], len(stamps), share), gap + 1, np.nan)
         if np.isfinite(curve).any():
-            _send(recording, f"plots/residual/{name}", stamp_column(at), curve, colour, f"{name} residual, deg")
+            _send(recording, f"plots/residual/{name}", at, curve, colour, f"{name} residual, deg")
     for kind, mask in kinds.items():
         counts = np.bincount(of[mask], minlength=len(stamps)).astype(np.float64)
         _send(recording, f"plots/boxes/{kind}", stamp_column(stamps), counts, RAY_COLOURS[kind], kind)
 
 
-def broken(stamps: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """A curve (N,) at ascending stamps (N,), s, with a NaN in the middle of each gap, so that no line crosses the gap."""
-    step = np.diff(stamps)
-    gap = np.flatnonzero(step > max(_GAP, _GAP_STEPS * float(np.median(step)))) if len(step) else np.zeros(0, dtype=np.int64)
-    return np.insert(stamps, gap + 1, stamps[gap] + step[gap] / 2), np.insert(values, gap + 1, np.nan)
-
-
 def log_costs(recording: Any, result: RunResult) -> None:
-    """`plots/cost/solve` and `plots/cost/grow` by iteration; `plots/rounds`, the objects and unexplained rays by then."""
+    """Log curves by iteration: the cost, `plots/cost`, and the counts of objects and unexplained rays, `plots/rounds`.
+
+    `plots/seconds` has a bar for the time of each stage, in the order of the table in `summary`.
+    """
+    if seconds := result.summary.get("seconds", {}):
+        recording.log("plots/seconds", rr.BarChart(list(seconds.values()), color=_BLUE), static=True)
     steps = [(i.stage, i.cost, r.association) for r in result.trace for i in r.iterations]
     numbers = np.arange(len(steps))
     stage, cost = np.array([stage for stage, _, _ in steps]), np.array([cost for _, cost, _ in steps])
@@ -56,15 +54,9 @@ def log_costs(recording: Any, result: RunResult) -> None:
         objects = np.array([float(found.count) for _, _, found in steps])
         unexplained = np.array([float((found.object < 0).sum()) for _, _, found in steps])
         _send(recording, "plots/rounds/objects", at, objects, _GREEN, "objects")
-        _send(recording, "plots/rounds/unexplained", at, unexplained, _GREY, "rays that none explains")
+        _send(recording, "plots/rounds/unexplained", at, unexplained, _GREY, "rays that no object explains")
 
 
 def _send(recording: Any, path: str, at: Any, values: Any, colour: tuple[int, int, int], name: str) -> None:
     recording.send_columns(path, [at], rr.Scalars.columns(scalars=values))
     recording.log(path, rr.SeriesLines(colors=[colour], names=[name], widths=[1.5]), static=True)
-
-
-def log_seconds(recording: Any, seconds: dict[str, float]) -> None:
-    """`plots/seconds`: a bar for each stage of the run, in the order in which `summary` names them."""
-    if seconds:
-        recording.log("plots/seconds", rr.BarChart(list(seconds.values()), color=_BLUE), static=True)

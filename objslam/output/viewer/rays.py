@@ -1,6 +1,4 @@
-"""Rays: blue where they hold an object, red where the robust loss rejects them, grey where no object explains them."""
-
-from __future__ import annotations
+"""Rays: used rays are blue, rejected rays are red, and unexplained rays are grey."""
 
 from typing import Any
 
@@ -12,23 +10,17 @@ from objslam.core.result import RunResult
 from objslam.output.plot.style import RayKind, ray_ends, ray_kinds, sample
 from objslam.output.viewer.times import moments, stamp_column
 
-RAY_COLOURS: dict[RayKind, tuple[int, int, int]] = {
-    "used": (62, 128, 214),
-    "rejected": (224, 62, 50),
-    "unexplained": (150, 150, 150),
-}
+_Palette = dict[RayKind, tuple[int, int, int]]
+
+RAY_COLOURS: _Palette = {"used": (62, 128, 214), "rejected": (224, 62, 50), "unexplained": (150, 150, 150)}
 """The RGB colour of each kind of ray."""
-_FAINT: dict[RayKind, tuple[int, int, int]] = {
-    "used": (186, 212, 243),
-    "rejected": (246, 205, 200),
-    "unexplained": (222, 222, 222),
-}
-"""The same on white at about a third of their strength, for the rays that stay on the map."""
-_MAX_RAYS = 240  # The largest number of rays of a kind that stay on the map: lines are opaque, and many would cover it.
+_FAINT: _Palette = {"used": (186, 212, 243), "rejected": (246, 205, 200), "unexplained": (222, 222, 222)}
+"""The RGB colour of each kind of static ray: about a third of the strength of `RAY_COLOURS`, on white."""
+_MAX_RAYS = 240  # The map shows at most this many static rays of each kind. Lines are opaque, so more would hide the map.
 
 
 def log_rays(recording: Any, result: RunResult) -> None:
-    """The rays of the moment in `map/rays/now`; a sample of all rays in `map/rays/used`, `rejected` and `unexplained`."""
+    """Log the rays at each stamp, `map/rays/now`, and a static sample of each kind, `map/rays/KIND`."""
     strips = np.stack([result.origins, ray_ends(result)], axis=1).astype(np.float32)
     for kind, mask in ray_kinds(result).items():
         index = sample(mask, _MAX_RAYS)
@@ -42,7 +34,7 @@ def log_rays(recording: Any, result: RunResult) -> None:
 
 
 def kind_colours(result: RunResult) -> NDArray[np.uint8]:
-    """(R, 3) the colour of each ray's kind."""
+    """Return the RGB colour (R, 3) of each ray by its kind."""
     colours = np.zeros((len(result.rays), 3), dtype=np.uint8)
     for kind, mask in ray_kinds(result).items():
         colours[mask] = RAY_COLOURS[kind]

@@ -1,6 +1,4 @@
-"""recording.rrd: a run to look at and to play back with the rerun viewer."""
-
-from __future__ import annotations
+"""The recording of a run, recording.rrd, for the rerun viewer."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,33 +12,28 @@ from objslam.core.result import RunResult
 from objslam.core.types import Truth
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, log_cameras
-from objslam.output.viewer.event_log import Event, drive_events, round_events
+from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
 from objslam.output.viewer.objects import log_objects, log_truth
-from objslam.output.viewer.paths import log_base, log_paths, thinned
-from objslam.output.viewer.plots import log_costs, log_residuals, log_seconds
+from objslam.output.viewer.paths import log_base, log_paths, log_steps, thinned
+from objslam.output.viewer.plots import log_costs, log_residuals
 from objslam.output.viewer.rays import log_rays
-from objslam.output.viewer.steps import log_steps
-from objslam.output.viewer.summary import summary_text
 from objslam.output.viewer.surface import log_surfaces
 from objslam.output.viewer.times import iteration_column, stamp_column
 from objslam.output.viewer.view_point import first_view_point
 
-_AVOIDED = 500  # The largest number of points of the path that labels try not to cover.
+_AVOIDED = 500  # Labels avoid at most this many points of the path.
 
 
 def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -> None:
     """Write a run as a rerun recording (.rrd) with its blueprint.
 
-    `map` (z up, m) holds what does not move: the paths, the objects, the truth, a sample of all rays, the reconstruction. On
-    the timeline `stamp` it also holds the robot, its cameras with their images, boxes and objects, and the rays of the
-    moment; on the timeline `iteration`, the path and the objects after each step of the solver. `plots` holds the curves,
-    `log` the decisions on both timelines, `summary` the run as a table.
-
-    Raises:
-        OSError: the file cannot be written.
+    `map` (z up, m) has the static data: paths, objects, ground truth, a sample of the rays, surfaces. On the timeline
+    `stamp`, `map` also has the robot, its cameras with images, boxes and objects, and the rays of each stamp. On the
+    timeline `iteration`, `map` has the path and the objects after each iteration of the solver. `plots` has curves, `log`
+    has the events on both timelines, and `summary` has a table. OSError if the file cannot be written.
     """
     recording = rr.RecordingStream("objslam")
-    # in memory: a file sink writes in a thread of its own, where a full disk is no error but a line on stderr
+    # The recording stays in memory until the end. A file sink would write a full disk to stderr and raise no error.
     memory = recording.memory_recording()
     recording.send_recording_name(str(result.summary.get("log", "objslam")))
     view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])
@@ -64,7 +57,6 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
         _log_events(recording, events, stamp_column)
     log_steps(recording, result)
     log_costs(recording, result)
-    log_seconds(recording, result.summary.get("seconds", {}))
     rounds = round_events(result.trace, result.rays.label_names)
     _log_events(recording, rounds, lambda at: iteration_column(at.astype(np.int64)))
     recording.log("summary", rr.TextDocument(summary_text(result), media_type="text/markdown"), static=True)

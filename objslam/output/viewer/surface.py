@@ -1,8 +1,5 @@
-"""The reconstructed room around the objects."""
+"""The reconstructed surface of the room."""
 
-from __future__ import annotations
-
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +8,15 @@ import rerun as rr
 from objslam.core.result import RunResult
 from objslam.core.types import Surface
 
-_MAX_VERTICES = 100_000  # The largest number of vertices in a recording, 5 MB; the whole surface has a file of its own.
-_CELL = 0.02  # The edge, m, of the grid's cells before they grow.
-_GROWTH = 1.25  # The factor by which the cells grow until few enough vertices remain.
+_MAX_VERTICES = 100_000  # A recording has at most this many vertices, 5 MB. reconstruction.ply has the whole surface.
+_CELL = 0.02  # The grid cells have this edge length, m, before they first grow.
+_GROWTH = 1.25  # The cells grow by this factor until at most `_MAX_VERTICES` vertices remain.
 
 
 def log_surfaces(recording: Any, result: RunResult) -> None:
-    """`map/reconstruction/after`, and `before` where there is one; static.
+    """Log the static surfaces `map/reconstruction/after` and `before`, if they exist.
 
-    Only the front of a wall is drawn, so that the walls between the view point and the room hide nothing.
+    Only the front of a wall is drawn, so that walls near the view point do not hide the room.
     """
     for name, surface in (("after", result.surface), ("before", result.surface_before)):
         if surface is None:
@@ -36,41 +33,33 @@ def log_surfaces(recording: Any, result: RunResult) -> None:
 
 
 def coarser(surface: Surface, most: int) -> Surface:
-    """A surface of at most `most` vertices: those in one cell of a grid become their mean (Rossignac & Borrel 1993)."""
+    """Simplify a surface to at most `most` vertices: each grid cell keeps their mean (Rossignac & Borrel 1993)."""
     cell = _CELL
     while len(surface.vertices) > most:
         cell *= _GROWTH
         at = np.floor(surface.vertices / cell).astype(np.int64)
         at -= at.min(axis=0)
         extent = at.max(axis=0) + 1
-        _, into, counts = np.unique(
-            (at[:, 0] * extent[1] + at[:, 1]) * extent[2] + at[:, 2], return_inverse=True, return_counts=True
-        )
+        cells = (at[:, 0] * extent[1] + at[:, 1]) * extent[2] + at[:, 2]
+        _, into, counts = np.unique(cells, return_inverse=True, return_counts=True)
         if len(counts) > most:
             continue
         triangles = into[surface.triangles].astype(np.int32)
         a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        vertices = (_sums(surface.vertices, into, len(counts)) / counts[:, None]).astype(np.float32)
         normals = _sums(surface.normals, into, len(counts))
+        normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)).astype(np.float32)
         colours = surface.colours
         if colours is not None:
             colours = (_sums(colours, into, len(counts)) / counts[:, None]).round().astype(np.uint8)
-        few = Surface(
-            vertices=(_sums(surface.vertices, into, len(counts)) / counts[:, None]).astype(np.float32),
-            normals=(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)).astype(np.float32),
-            colours=colours,
-            triangles=triangles[(a != b) & (b != c) & (c != a)],
-        )
-        return _not_turned(few)
+        # Triangles of a thin part flip if the part falls into one cell. Flipped triangles are removed.
+        a, b, c = (vertices[corner] for corner in triangles.T)
+        upright = np.einsum("ti,ti->t", np.cross(b - a, c - a), normals[triangles].sum(axis=1)) > 0
+        return Surface(vertices=vertices, normals=normals, colours=colours, triangles=triangles[upright])
     return surface
 
 
-def _not_turned(surface: Surface) -> Surface:
-    """The surface without triangles that were turned over, which happens where something thin fell into one cell."""
-    a, b, c = (surface.vertices[corner] for corner in surface.triangles.T)
-    normal = surface.normals[surface.triangles].sum(axis=1)
-    right = np.einsum("ti,ti->t", np.cross(b - a, c - a), normal) > 0
-    return replace(surface, triangles=surface.triangles[right])
-
-
 def _sums(values: Any, into: Any, count: int) -> Any:
+    """Sum the rows of values (N, C) into `count` rows; `into` (N,) is the row of each."""
     return np.stack([np.bincount(into, column, count) for column in np.asarray(values, dtype=np.float64).T], axis=1)

@@ -1,6 +1,4 @@
-"""The timelines of a recording: the drive's stamps, and the solver's iterations."""
-
-from __future__ import annotations
+"""The timelines of a recording: the stamps of the drive and the iterations of the solver."""
 
 from typing import Any
 
@@ -9,12 +7,11 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.output.plot.style import is_date
 
-STAMP = "stamp"  # The timeline of the drive.
-ITERATION = "iteration"  # The timeline of the solver.
+STAMP, ITERATION = "stamp", "iteration"  # These are the timelines of the drive and of the solver.
 
 
 def stamp_column(stamps: Floats) -> Any:
-    """The timeline `stamp` for stamps (N,), s: dates where they are Unix time, else durations."""
+    """Make a column of the timeline `stamp` from stamps (N,), s: dates if they are Unix time, else durations."""
     import rerun as rr
 
     if len(stamps) and is_date(float(stamps[0])):
@@ -23,22 +20,20 @@ def stamp_column(stamps: Floats) -> Any:
 
 
 def iteration_column(numbers: Ints) -> Any:
-    """The timeline `iteration` for numbers (N,)."""
+    """Make a column of the timeline `iteration` from numbers (N,)."""
     import rerun as rr
 
     return rr.TimeColumn(ITERATION, sequence=numbers)
 
 
 def moments(stamps: Floats, of: Ints) -> tuple[Floats, Ints, Ints]:
-    """Things sorted into the moments at which they are shown.
-
-    Every stamp gets a row, even without a thing: what the moment before showed must go.
+    """Group items by their stamp; a stamp without items gets a row too, because the row clears the earlier items.
 
     Args:
         stamps: (K,) s, ascending.
-        of: (R,) the index of each thing's stamp.
+        of: (R,) the index into `stamps` of each item.
     Returns:
-        The distinct stamps (M,), the number of things at each (M,), and the order (R,) of the things by stamp.
+        The distinct stamps (M,), the number of items at each stamp (M,), and the order (R,) of the items by stamp.
     """
     distinct, moment = np.unique(stamps, return_inverse=True)
     mine = moment[of]

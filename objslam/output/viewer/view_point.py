@@ -1,63 +1,64 @@
-"""The first view of a map: where it is seen from, and where the labels hang so that none covers another."""
-
-from __future__ import annotations
+"""The first view of a map, and the placement of labels on the map and in camera images."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import ObjectMap
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
-from objslam.output.viewer.image_labels import LETTER, PADDING
 
-_FOV = np.radians(55.0)  # The viewer's own field of view, rad, from the lower to the upper edge.
-_VIEW = np.array([900.0, 620.0])  # Width and height, px, of the map's view in a window of 1600 x 900.
-_FILLED = 0.86  # The share of the view that the map fills.
-_FROM = np.array([-0.28, -0.80, 0.78])  # The direction of the first view: from the south, a little west, half from above.
-_LINE = 24.0  # The height, px, of a label on the map.
+_FOV = np.radians(55.0)  # The viewer has this field of view, rad, from the lower to the upper edge.
+_VIEW = np.array([900.0, 620.0])  # The view of the map has this width and height, px, in a window of 1600 x 900.
+_FILLED = 0.86  # The map fills this share of the view.
+_FROM = np.array([-0.28, -0.80, 0.78])  # The first view point lies in this direction: south, slightly west, 43 deg up.
+_LINE = 24.0  # A label on the map has this height, px.
+_LETTER, _PADDING = 7.3, 12.0  # A letter, and both margins of a label together, have these widths, px on the screen.
+_IMAGE_LINE = 21.0  # A label in an image has this height, px on the screen.
+_IMAGE_VIEW = (580.0, 350.0)  # The view of a camera has this width and height, px, in a window of 1600 x 900.
+_ROWS = 6  # A label hangs at most this many rows below its dot.
 
 
 @dataclass(frozen=True)
 class ViewPoint:
-    """Where the map is seen from."""
+    """A view point with its camera axes and focal length."""
 
     position: Floats  # (3,) m in map.
-    target: Floats  # (3,) m in map, the middle of the view.
-    axes: Floats  # (3, 3), rows right, up and towards the target.
-    focal: float  # px.
+    target: Floats  # (3,) m in map, at the centre of the view.
+    axes: Floats  # (3, 3); the rows point right, up and towards the target.
+    focal: float  # The focal length, px.
 
     @property
     def distance(self) -> float:
-        """From the view point to its target, m."""
+        """The distance of the view point from its target, m."""
         return float(np.linalg.norm(self.position - self.target))
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
-        """Pixels (N, 2), x right, y down, of points (N, 3), and their depths (N,) m."""
+        """Return pixels (N, 2), x right, y down, and depths (N,), m, of points (N, 3), m in map."""
         x, y, depth = ((points - self.position) @ self.axes.T).T
         safe = np.maximum(depth, 1e-6)
         return np.column_stack([x, -y]) * self.focal / safe[:, None] + _VIEW / 2, depth
 
     def has_in_view(self, points: Floats) -> Bools:
-        """Which points (N, 3) are in the view."""
+        """Return a mask (N,) of the points (N, 3), m in map, that lie in the view."""
         pixels, depth = self.project(points)
         return ((pixels >= 0) & (pixels <= _VIEW)).all(axis=1) & (depth > 0)
 
     def offset(self, pixels: Floats, depth: Floats) -> Floats:
-        """The distance (N, 3), m in map, that pixels (N, 2) span in the plane of the view at depths (N,), m."""
+        """Convert offsets in the view (N, 2), px, at depths (N,), m, to offsets (N, 3), m in map."""
         return (pixels * [1.0, -1.0] * depth[:, None] / self.focal) @ self.axes[:2]
 
 
 def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
-    """The view point from which the objects and the path (K, 3) fill the view; objects far away are left out."""
+    """Return the view point from which the objects and the path (K, 3) fill the view; far objects are left out."""
     positions = np.array([o.position for o in objects.objects]).reshape(-1, 3)
     inside, low, high = frame_objects(positions, path)
     points = np.concatenate([positions[inside], path[((path >= low) & (path <= high)).all(axis=1)], [low, high]])
     centre = (low + high) / 2
     axes = _axes(_FROM)
     tangent = _FILLED * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
-    for _ in range(4):  # perspective makes the near half larger, so the middle of the view is found step by step
+    for _ in range(4):  # Perspective enlarges the near half, so the centre takes iterations.
         x, y, ahead = ((points - centre) @ axes.T).T
         distance = max(float(np.max(np.abs(x) / tangent[0] - ahead)), float(np.max(np.abs(y) / tangent[1] - ahead)), 1.0)
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
@@ -67,7 +68,7 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
 
 
 def look_at(target: Floats, back: Floats, distance: float) -> ViewPoint:
-    """The view point at a distance, m, from a target (3,), in a direction (3,)."""
+    """Return the view point at a distance, m, from a target (3,), m in map, in the direction `back` (3,)."""
     axes = _axes(back)
     return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
 
@@ -80,23 +81,57 @@ def _axes(back: Floats) -> Floats:
 
 
 def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid: Floats) -> tuple[Floats, Floats]:
-    """Hang labels so that from the view point none covers another or a dot.
+    """Place labels so that, from the view point, no label covers another label or a dot.
 
-    A label without room hangs straight below its object.
+    A label that finds no free place hangs below its object.
 
     Args:
-        anchors: (N, 3) m in map, the objects; a label is as far away as its object.
-        avoid: (P, 3) points that are better not covered.
+        anchors: (N, 3) the objects, m in map; a label has the depth of its object.
+        avoid: (P, 3) points, m in map, that the labels should not cover.
     Returns:
-        Where labels hang (N, 3), the middle of their upper edges, and where the lines to them end (N, 3); m in map.
+        The centres of the labels' upper edges (N, 3), and the ends of their leader lines (N, 3); m in map.
     """
     if len(anchors) == 0:
         return anchors, anchors
     dots, depth = view_point.project(anchors)
     crowd, ahead = view_point.project(avoid)
-    sizes = np.column_stack([np.array([len(text) for text in texts]) * LETTER + PADDING, np.full(len(texts), _LINE)])
+    sizes = np.column_stack([np.array([len(text) for text in texts]) * _LETTER + _PADDING, np.full(len(texts), _LINE)])
     corners, found = place_labels(dots, sizes, np.stack([np.zeros(2), _VIEW]), crowd[ahead > 0])
     corners = np.where((found & (depth > 0))[:, None], corners, dots - [0.5, 0.0] * sizes)
     hung = corners + [0.5, 0.0] * sizes
     near = np.clip(dots, corners, corners + sizes)
     return anchors + view_point.offset(hung - dots, depth), anchors + view_point.offset(near - dots, depth)
+
+
+def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, float]) -> tuple[Floats, Bools]:
+    """Place labels in rows, from left to right; each label gets the first free row below its dot.
+
+    Args:
+        frame: (S,) the image of each dot.
+        dots: (S, 2) px of the image.
+        letters: (S,) the length of each label.
+        size: width and height of the images, px; the viewer scales an image to its view.
+    Returns:
+        The places (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
+    """
+    scale = min(_IMAGE_VIEW[0] / size[0], _IMAGE_VIEW[1] / size[1])  # px on the screen per px of the image
+    half = (letters * _LETTER + _PADDING) / 2 / scale
+    line = _IMAGE_LINE / scale
+    order = np.lexsort((dots[:, 0] - half, frame))
+    first = np.searchsorted(frame[order], frame[order])
+    rank = np.arange(len(order)) - first
+    row = np.ceil(dots[:, 1] / line).astype(np.int64)
+    frames = int(frame.max()) + 1 if len(frame) else 0
+    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Each row is occupied up to this px.
+    hung, found = dots.copy(), np.zeros(len(dots), dtype=bool)
+    for k in range(int(rank.max()) + 1 if len(rank) else 0):
+        mine = order[rank == k]  # the k-th label of each frame
+        for below in range(_ROWS):
+            at = row[mine] + below
+            free = until[frame[mine], at] <= dots[mine, 0] - half[mine]
+            take = mine[free]
+            until[frame[take], at[free]] = dots[take, 0] + half[take]
+            hung[take, 1] = at[free] * line
+            found[take] = True
+            mine = mine[~free]
+    return hung, found

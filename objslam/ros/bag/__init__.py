@@ -1,4 +1,1 @@
-"""Containers of recorded messages: ROS 1 bags, sqlite3 and mcap, whole or damaged, as bytes with topic and stamp.
-
-What the bytes mean is in `ros.messages`.
-"""
+"""Read ROS 1 bags, sqlite3 bags and MCAP files, whole or damaged. `ros.messages` decodes their serialised messages."""

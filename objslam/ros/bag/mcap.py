@@ -1,126 +1,101 @@
-"""MCAP files, read record by record from the front: no index and no footer is needed, and each chunk is checked by its CRC.
+"""MCAP files, read record by record from the front, so that neither index nor footer is needed.
 
-https://mcap.dev/spec. The summary at the end is used for what it is good at: channels whose first description is lost, and
-the number of messages that there should be.
+See https://mcap.dev/spec. The summary only supplies the message count and channels whose first description is lost.
 """
-
-from __future__ import annotations
 
 import os
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
 from objslam.ros.bag.decompress import CorruptDataError, unpack
-from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, plain, type_name
+from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, FileReport, Messages, Reading, Wanted, make_connection
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _STATISTICS, _DATA_END, _FOOTER = 3, 4, 5, 6, 7, 11, 15, 2
-_KNOWN = range(1, 16)  # The operations that the format defines.
-_PRIVATE = 0x80  # The first operation that the format leaves to applications.
+_KNOWN = range(1, 16)  # The operation codes that the format defines.
+_PRIVATE = 0x80  # The first operation code that the format reserves for applications.
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _CHUNK_START = re.compile(rb"\x06.{5}\0\0\0.{21}\0\0\0.{4}(\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd).{5}\0\0\0", re.DOTALL)
-"""A chunk record: its length, two times, the size unpacked (sizes below 2^40), CRC, compression, the size packed."""
-
-_BLOCK = 1 << 20  # The bytes that are read at once; chosen for few reads and little memory.
-_LATEST = 2**63 - 1  # The latest time of recording, ns, that 64 bits with a sign hold.
-_Wanted = Callable[[Connection], bool]
+"""A chunk record has length, two timestamps, unpacked size, CRC, compression and packed size. Sizes are below 2^40."""
+_BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
+_LATEST = 2**63 - 1  # The largest recording time that a signed 64-bit integer holds, ns.
 
 
 @dataclass
-class _Reading:
-    """What is known while a file is read: schemas, channels, and how the chunk at hand compares with its index."""
-
-    report: FileReport
-    wanted: _Wanted
-    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)
-    channels: dict[int, Connection] = field(default_factory=dict)
-    chunk_read: int = 0
-    chunk_indexed: int = 0
-    chunk_problem: str = ""
-
-    def next_chunk(self) -> None:
-        """Settle the chunk before: its index has come after it, if it came at all."""
-        if self.chunk_problem:
-            lost = self.chunk_indexed - self.chunk_read if self.chunk_indexed else None
-            self.report.damage(self.chunk_problem, lost)
-        self.chunk_read, self.chunk_indexed, self.chunk_problem = 0, 0, ""
+class _Reading(Reading):
+    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)  # Name, language and definition by number.
 
 
-def read_mcap(path: Path, report: FileReport, wanted: _Wanted) -> Messages:
-    """The messages of the wanted channels of an MCAP file, in the order of the file.
+def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
+    """Yield the wanted messages of an MCAP file, even damaged or unclosed, in file order. `report` lists missing parts.
 
-    Also of a file that was never closed, is cut off or broken in places; of the last chunk of a file cut off, what can be
-    unpacked is read. A chunk that fails its CRC is left out. `report` says what is missing.
+    A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC is skipped.
     """
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
         reading = _Reading(report, wanted)
         _read_summary(file, end, reading)
         yield from _walk(file, len(MAGIC), end, reading)
-        reading.next_chunk()
+        reading.end_chunk()
 
 
 def _walk(file: BinaryIO, at: int, end: int, reading: _Reading) -> Messages:
     report = reading.report
-    closed = False
-    file.seek(at)
     while at + _RECORD.size <= end:
+        file.seek(at)
         op, size = _RECORD.unpack(file.read(_RECORD.size))
         start = at + _RECORD.size
-        if op in (_DATA_END, _FOOTER) and start + size <= end:  # what follows is the summary
-            closed = True
-            break
+        if op in (_DATA_END, _FOOTER) and start + size <= end:  # The summary follows.
+            return
         known = op in _KNOWN or op >= _PRIVATE
         if not known or start + size > end:
             found = _find_chunk(file, at + 1, end)
             if found is not None:
                 report.damage(f"no records from byte {at} to byte {found}")
                 at = found
-                file.seek(at)
                 continue
             if op == _CHUNK:
-                reading.next_chunk()
+                reading.end_chunk()
                 report.damage(f"cut off in the chunk at byte {at}")
                 file.seek(start)
-                yield from _cut_chunk(file.read(min(end - start, MAX_RECORD)), reading)
+                try:
+                    records = _unpack_chunk(file.read(min(end - start, MAX_RECORD)), cut=True)
+                    yield from _records(records, reading)
+                except CorruptDataError as damaged:
+                    report.damage(f"nothing of the last chunk can be read: {damaged}")
                 return
             break
         at = start + size
-        if op in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX):
-            if size > MAX_RECORD:
-                report.damage(f"the record at byte {start} is larger than {MAX_RECORD >> 20} MiB")
-                file.seek(at)
+        if op not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX):
+            continue
+        if size > MAX_RECORD:
+            report.damage(f"the record at byte {start} is larger than {MAX_RECORD >> 20} MiB")
+        elif op == _CHUNK:
+            reading.end_chunk()
+            try:
+                records = _unpack_chunk(file.read(size))
+            except CorruptDataError as damaged:
+                reading.chunk_problem = f"the chunk at byte {start} is broken: {damaged}"
                 continue
-            data = file.read(size)
-            if op == _CHUNK:
-                reading.next_chunk()
-                try:
-                    records = _unpack_chunk(data)
-                except CorruptDataError as damaged:
-                    reading.chunk_problem = f"the chunk at byte {start} is broken: {damaged}"
-                    continue
-                yield from _records(records, reading)
-            elif op == _MESSAGE_INDEX:
-                reading.chunk_indexed += max(size - 6, 0) // 16
-            else:
-                yield from _record(op, data, reading)
+            yield from _records(records, reading)
+        elif op == _MESSAGE_INDEX:
+            reading.chunk_indexed += max(size - 6, 0) // 16
         else:
-            file.seek(at)
-    if not closed:
-        rest = f", the last {end - at} bytes hold no whole record" if end > at else ""
-        report.damage(f"cut off or never closed at byte {at}{rest}")
+            yield from _record(op, file.read(size), reading)
+    rest = f", the last {end - at} bytes hold no whole record" if end > at else ""
+    report.damage(f"cut off or never closed at byte {at}{rest}")
 
 
 def _records(data: bytes, reading: _Reading) -> Messages:
-    """The messages of an unpacked chunk; what follows the last whole record is left."""
+    """Yield the messages of an unpacked chunk, up to the last whole record."""
     at, end = 0, len(data)
     while at + _RECORD.size <= end:
         op, size = _RECORD.unpack_from(data, at)
@@ -131,9 +106,9 @@ def _records(data: bytes, reading: _Reading) -> Messages:
         if op == _MESSAGE and size >= _MESSAGE_HEAD.size:
             reading.chunk_read += 1
             channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(data, start)
-            connection = reading.channels.get(channel)
+            connection = reading.connections.get(channel)
             if connection is None:
-                reading.report.damage("messages of a channel of which nothing is known", 1)
+                reading.report.damage("messages of an undescribed channel", 1)
                 continue
             reading.report.messages += 1
             if reading.wanted(connection):
@@ -143,7 +118,7 @@ def _records(data: bytes, reading: _Reading) -> Messages:
 
 
 def _record(op: int, data: bytes, reading: _Reading) -> Messages:
-    """A schema or channel is remembered; a message outside of any chunk is passed on."""
+    """Store a schema or channel, or yield a message that is outside of all chunks."""
     try:
         if op == _SCHEMA:
             (key,) = _U16.unpack_from(data)
@@ -153,15 +128,15 @@ def _record(op: int, data: bytes, reading: _Reading) -> Messages:
             key, schema = struct.unpack_from("<HH", data)
             topic, encoding = _strings(data, 4, 2)
             name, language, text = reading.schemas.get(schema, ("", "", ""))
-            channel = Connection(plain(topic), type_name(name), encoding, text if language else "", language)
-            if key not in reading.channels or (name and reading.channels[key] != channel):
-                reading.channels[key] = channel
+            channel = make_connection(topic, name, encoding, text, language)
+            if key not in reading.connections or (name and reading.connections[key] != channel):
+                reading.connections[key] = channel
         elif op == _MESSAGE:
             if len(data) < _MESSAGE_HEAD.size:
                 raise CorruptDataError("a message without its head")
             yield from _records(_RECORD.pack(op, len(data)) + data, reading)
     except (struct.error, CorruptDataError):
-        reading.report.damage("a schema, channel or message that is broken")
+        reading.report.damage("a broken schema, channel or message")
 
 
 def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
@@ -174,40 +149,29 @@ def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
         at += size
 
 
-def _chunk_parts(data: bytes) -> tuple[int, int, str, int]:
-    """Size unpacked, CRC and compression of a chunk, and where its records start."""
+def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
+    """Return the records of a chunk, or with `cut` the readable part of the records."""
     try:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)
-        return size, crc, method, _CHUNK_HEAD.size + 4 + len(method.encode()) + 8
     except struct.error as error:
         raise CorruptDataError("it has no head") from error
-
-
-def _unpack_chunk(data: bytes) -> bytes:
-    size, crc, method, start = _chunk_parts(data)
-    if start > len(data) or start + _U64.unpack_from(data, start - 8)[0] > len(data):
-        raise CorruptDataError("its records are longer than it is")
-    records = unpack(data[start : start + _U64.unpack_from(data, start - 8)[0]], method)
+    start = _CHUNK_HEAD.size + 4 + len(method.encode()) + 8
+    if cut:
+        return unpack(data[start:], method, cut=True)
+    end = start + int.from_bytes(data[start - 8 : start], "little")
+    if end > len(data):
+        raise CorruptDataError("its records are longer than the chunk")
+    records = unpack(data[start:end], method)
     if len(records) != size:
-        raise CorruptDataError("it unpacks to another size than it says")
+        raise CorruptDataError("its unpacked size is not the stated size")
     if crc and zlib.crc32(records) != crc:
-        raise CorruptDataError("it fails its CRC")
+        raise CorruptDataError("its CRC is wrong")
     return records
 
 
-def _cut_chunk(data: bytes, reading: _Reading) -> Messages:
-    try:
-        _, _, method, start = _chunk_parts(data)
-        records = unpack(data[start:], method, cut=True)
-    except CorruptDataError as damaged:
-        reading.report.damage(f"nothing of the last chunk can be read: {damaged}")
-        return
-    yield from _records(records, reading)
-
-
 def _find_chunk(file: BinaryIO, at: int, end: int) -> int | None:
-    """The byte where the next chunk begins, whole and with sizes that agree."""
+    """Return the byte of the next whole chunk with consistent sizes, None without one."""
     while at < end:
         file.seek(at)
         block = file.read(_BLOCK + 64)
@@ -223,14 +187,13 @@ def _find_chunk(file: BinaryIO, at: int, end: int) -> int | None:
 
 
 def _read_summary(file: BinaryIO, end: int, reading: _Reading) -> None:
-    """Channels and the number of messages, from the summary that closes a whole file; nothing where it is missing."""
+    """Read the channels and the expected number of messages from the summary at the end of a closed file."""
     footer = end - len(MAGIC) - 20 - _RECORD.size
     if footer < len(MAGIC):
         return
     file.seek(footer)
     tail = file.read()
-    op, size = _RECORD.unpack_from(tail)
-    if tail[-len(MAGIC) :] != MAGIC or (op, size) != (_FOOTER, 20):
+    if tail[-len(MAGIC) :] != MAGIC or _RECORD.unpack_from(tail) != (_FOOTER, 20):
         return
     (at,) = _U64.unpack_from(tail, _RECORD.size)
     if not len(MAGIC) <= at < footer or footer - at > MAX_RECORD:
@@ -243,7 +206,6 @@ def _read_summary(file: BinaryIO, end: int, reading: _Reading) -> None:
         data = summary[at + _RECORD.size : at + _RECORD.size + size]
         at += _RECORD.size + size
         if op in (_SCHEMA, _CHANNEL):
-            for _ in _record(op, data, reading):
-                pass
+            list(_record(op, data, reading))
         elif op == _STATISTICS and len(data) >= 8:
             (reading.report.expected,) = _U64.unpack_from(data)

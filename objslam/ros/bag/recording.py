@@ -1,11 +1,9 @@
-"""The files of one recording, found, put in order, and read one after the other."""
-
-from __future__ import annotations
+"""Find the files of one recording, sort them, and read their messages in sequence."""
 
 import re
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -18,21 +16,23 @@ from objslam.io.safe_paths import Inside
 from objslam.io.text import read_bytes, reading
 from objslam.ros.bag import bag1, mcap, sqlite
 from objslam.ros.bag.decompress import ZSTD_MAGIC, CorruptDataError, unpack, unpack_file
-from objslam.ros.bag.records import Connection, FileReport, Messages
+from objslam.ros.bag.records import FileReport, Messages, Wanted
 
-_READERS = {".bag": bag1.read_bag1, ".mcap": mcap.read_mcap, ".db3": sqlite.read_sqlite}
-_MAGIC = {bag1.MAGIC: ".bag", mcap.MAGIC: ".mcap", sqlite.MAGIC: ".db3"}
-_FORMATS = {".bag": "ROS 1 bag", ".mcap": "MCAP", ".db3": "ROS 2 sqlite3"}
+_FORMATS = {
+    ".bag": ("ROS 1 bag", bag1.MAGIC, bag1.read_bag1),
+    ".mcap": ("MCAP", mcap.MAGIC, mcap.read_mcap),
+    ".db3": ("ROS 2 sqlite3", sqlite.MAGIC, sqlite.read_sqlite),
+}
 _METADATA = "metadata.yaml"
-_MAX_METADATA = 16 << 20  # The largest metadata.yaml that is read, bytes; chosen to bound the memory.
-_MAX_FILE = 256 << 30  # The most bytes that a packed file may unpack to; chosen to bound the disk that it takes.
-_MAX_RATIO = 1000  # The most times its own size that a packed file may unpack to; more is no recording.
+_MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
+_MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
+_MAX_RATIO = 1000  # The limit of the ratio of unpacked to packed file size. No recording compresses further.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 
 @dataclass(frozen=True)
 class BagFile:
-    """One file of a recording: where it lies, its kind (".bag", ".mcap", ".db3"), and whether it is packed as a whole."""
+    """One file of a recording. kind: ".bag", ".mcap" or ".db3". packed: whether the whole file is compressed."""
 
     path: Path
     kind: str
@@ -41,7 +41,7 @@ class BagFile:
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of one recording in their order; expected: the messages that metadata.yaml counts, None without it."""
+    """The files of one recording in order. expected: the message count of metadata.yaml, None if unknown."""
 
     name: str
     files: tuple[BagFile, ...]
@@ -49,23 +49,21 @@ class Recording:
 
     @property
     def format(self) -> str:
-        """What kind of files these are, in words."""
-        return ", ".join(dict.fromkeys(_FORMATS[file.kind] for file in self.files))
+        """The names of the file formats."""
+        return ", ".join(dict.fromkeys(_FORMATS[file.kind][0] for file in self.files))
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path is a bag file, or a folder that holds one."""
-    if path.is_dir():
-        return any(_kind(file)[0] for file in path.iterdir())
-    return path.is_file() and bool(_kind(path)[0])
+    """Return whether the path is a bag file, or a folder that contains a bag file."""
+    return any(_bag_file(file) for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
-    """The recording that one or several paths (files, or one folder) name.
+    """Find the recording that one or several files, or one folder, contain.
 
-    A folder's metadata.yaml, if there is one, says which files belong to it; files that it names outside the folder are
-    refused, those that are missing are counted. Without it (a recorder that was killed writes none) all files of the folder
-    that differ only in their number are taken. LogError where there is none, or several recordings.
+    The metadata.yaml of a folder lists its files. Listed files that are missing or outside the folder are counted as drops.
+    Without metadata.yaml, which a killed recorder does not write, the files of the folder may only differ in their number.
+    Raises LogError for no recording or several recordings.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -78,17 +76,17 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
             return _read_folder(paths[0], ledger)
     files = []
     for path in paths:
-        kind, packed = _kind(path)
-        if not kind:
+        file = _bag_file(path)
+        if file is None:
             raise LogError("not a ROS bag (.bag, .mcap or .db3)", where=str(path))
-        files.append(BagFile(path, kind, packed))
+        files.append(file)
     return Recording(_split(files[0].path)[0] or files[0].path.name, tuple(files))
 
 
-def read_messages(recording: Recording, wanted: Callable[[Connection], bool], reports: list[FileReport]) -> Messages:
-    """The messages of the wanted topics, file by file; `reports` gets a report of each file.
+def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport]) -> Messages:
+    """Yield the messages of the wanted topics, file by file, and append a report on each file to `reports`.
 
-    A file that cannot be read at all is reported and left out. LogError where that is all of them.
+    An unreadable file is reported and skipped. Raises LogError if no file can be read.
     """
     refused: list[LogError] = []
     for file in recording.files:
@@ -97,8 +95,8 @@ def read_messages(recording: Recording, wanted: Callable[[Connection], bool], re
         with ExitStack() as stack, reading(file.path):
             try:
                 path = _unpacked(file, stack, report)
-                for connection, stamp, data in _READERS[file.kind](path, report, wanted):
-                    if data[:4] == ZSTD_MAGIC:  # no message begins so: rosbag2 packs each on its own where it is told to
+                for connection, stamp, data in _FORMATS[file.kind][2](path, report, wanted):
+                    if data[:4] == ZSTD_MAGIC:  # rosbag2 can compress each message separately.
                         try:
                             data = unpack(data, "zstd")
                         except CorruptDataError as damaged:
@@ -117,25 +115,25 @@ def read_messages(recording: Recording, wanted: Callable[[Connection], bool], re
             reports.append(FileReport(_METADATA, 0, gone, problems=[f"{_METADATA} counts {recording.expected} messages"]))
 
 
-def _kind(path: Path) -> tuple[str, bool]:
-    """The kind of a file ("" if it is no bag) and whether it is packed: by its name, else by its first bytes."""
+def _bag_file(path: Path) -> BagFile | None:
+    """Return the bag file at a path, None for another file. Name and first bytes decide."""
     suffixes = [suffix for suffix in path.suffixes if suffix != ".active"]
     packed = bool(suffixes) and suffixes[-1] == ".zstd"
     suffix = suffixes[-2 if packed else -1] if len(suffixes) > packed else ""
-    if suffix in _READERS:
-        return (suffix, packed) if path.is_file() else ("", False)
-    if packed or not path.is_file() or suffix in (".db3-wal", ".db3-shm"):
-        return "", False
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError:
-        return "", False
-    return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), ""), False
+    if not path.is_file():
+        return None
+    if suffix in _FORMATS:
+        return BagFile(path, suffix, packed)
+    if packed or suffix in (".db3-wal", ".db3-shm"):
+        return None
+    head = b""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(16)
+    return next((BagFile(path, kind, False) for kind, (_, magic, _) in _FORMATS.items() if head.startswith(magic)), None)
 
 
 def _split(path: Path) -> tuple[str, int]:
-    """A file's name without its number and endings, and the number (-1 without one)."""
+    """Return the name of a file without number and suffixes, and the number, -1 without one."""
     match = _SPLIT.fullmatch(path.name)
     return (match[1], int(match[2] or -1)) if match else (path.name, -1)
 
@@ -143,13 +141,13 @@ def _split(path: Path) -> tuple[str, int]:
 def _read_folder(folder: Path, ledger: Ledger) -> Recording:
     inside = Inside(folder)
     here = []
-    for file in sorted(folder.iterdir(), key=_split):
-        kind, packed = _kind(file)
-        reason = inside.reason_against(file) if kind else None
-        if reason is not None:
-            ledger.drop(f"bag file that {reason}", where=str(file))
-        elif kind:
-            here.append(BagFile(file, kind, packed))
+    for path in sorted(folder.iterdir(), key=_split):
+        if (bag := _bag_file(path)) is None:
+            continue
+        if (reason := inside.reason_against(path)) is not None:
+            ledger.drop(f"bag file that {reason}", where=str(path))
+        else:
+            here.append(bag)
     metadata = _read_metadata(folder / _METADATA, ledger) if (folder / _METADATA).exists() else {}
     listed = _listed(metadata, [file.path.name for file in here], ledger)
     if listed:
@@ -157,10 +155,9 @@ def _read_folder(folder: Path, ledger: Ledger) -> Recording:
         if unlisted:
             ledger.warn(f"{folder}: {_METADATA} does not list {', '.join(unlisted[:5])}: left out")
         here = [file for name in listed for file in here if file.path.name == name]
-    groups = {(_split(file.path)[0], file.kind) for file in here}
     if not here:
         raise LogError("no bag file in it", where=str(folder))
-    if not listed and len(groups) > 1:
+    if not listed and len({(_split(file.path)[0], file.kind) for file in here}) > 1:
         names = ", ".join(file.path.name for file in here[:8])
         raise LogError(f"several recordings: {names}", where=str(folder), hint="name one of them")
     count = metadata.get("message_count")
@@ -175,12 +172,12 @@ def _read_metadata(file: Path, ledger: Ledger) -> dict[str, Any]:
         return dict(data["rosbag2_bagfile_information"])
     except (LogError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = error.message if isinstance(error, LogError) else "not what rosbag2 writes"
-        ledger.warn(f"{file}: {reason}: left out, the files of the folder are read as they are")
+        ledger.warn(f"{file}: {reason}: left out, all bag files of the folder are read")
         return {}
 
 
 def _listed(metadata: dict[str, Any], here: list[str], ledger: Ledger) -> list[str]:
-    """The names of the files that the metadata list and that are in the folder; old ones name them with their folder."""
+    """Return the names of the listed files that exist in the folder. Old metadata list files with their folder."""
     names = []
     given = metadata.get("relative_file_paths")
     for entry in given if isinstance(given, list) else []:
@@ -200,7 +197,6 @@ def _unpacked(file: BagFile, stack: ExitStack, report: FileReport) -> Path:
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="objslam_bag_"))
     target = Path(folder, "bag" + file.kind)
     limit = min(_MAX_FILE, max(1 << 30, _MAX_RATIO * file.path.stat().st_size))
-    problem = unpack_file(file.path, target, limit)
-    if problem:
+    if problem := unpack_file(file.path, target, limit):
         report.damage(problem)
     return target

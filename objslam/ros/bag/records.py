@@ -1,57 +1,43 @@
-"""What a bag file holds, whatever its format: connections and messages; and what could not be read of it."""
-
-from __future__ import annotations
+"""The content of a bag file, independent of its format, and the report of unreadable parts."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-MAX_RECORD = 256 << 20
-"""The largest record, chunk or message that is loaded, bytes, packed or not; chosen to bound the memory."""
-
-LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}
-"""The language of a definition, by the name that a bag has for it."""
-
-Message = tuple["Connection", int, bytes]
-"""Connection, time of recording (ns), and the serialised message."""
-Messages = Iterator[Message]
-
-MAX_NAME = 256  # The longest name of a topic or frame that is kept, letters; chosen for a line that can be read.
+MAX_RECORD = 256 << 20  # The size limit of a record, chunk or message, packed or unpacked, bytes. The limit bounds memory.
+LANGUAGES = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl"}  # The definition language by its name in bags.
+MAX_NAME = 256  # The length limit of a topic or frame name, characters. The limit keeps messages readable.
 _TYPE = re.compile(r"([A-Za-z]\w*)/(?:(?:msg|action|srv)/)?([A-Za-z]\w*)", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A topic as one file describes it.
-
-    type: as ROS 2 writes it, package/msg/Name. encoding: "ros1", "cdr", or what else the file says. definition: the text of
-    the type, in `language` "msg" or "idl"; empty where the file brings none.
-    """
+    """A topic as one file describes it."""
 
     topic: str
-    type: str
-    encoding: str
-    definition: str = ""
-    language: str = "msg"
+    type: str  # The message type in ROS 2 form, package/msg/Name.
+    encoding: str  # The encoding of messages: "ros1", "cdr", or another name from the file.
+    definition: str = ""  # The text of the message type, empty if the file does not contain it.
+    language: str = "msg"  # The language of the definition, "msg" or "idl".
+
+
+Messages = Iterator[tuple[Connection, int, bytes]]  # Each tuple has connection, recording time (ns) and message bytes.
+Wanted = Callable[[Connection], bool]  # The function returns whether the caller wants the messages of a connection.
 
 
 @dataclass
 class FileReport:
-    """How the reading of one file went: messages read, lost (known from the file's own indexes), and why, in words.
-
-    expected: how many messages the file says it holds, None where it does not say. complete: False where something is gone
-    of which nothing tells how much.
-    """
+    """The result of reading one file."""
 
     file: str
-    messages: int = 0
-    lost: int = 0
-    expected: int | None = None
-    complete: bool = True
-    problems: list[str] = field(default_factory=list)
+    messages: int = 0  # The number of messages read.
+    lost: int = 0  # The number of messages known to be lost.
+    expected: int | None = None  # The message count that the file states, None if unknown.
+    complete: bool = True  # False if an unknown number of messages is lost.
+    problems: list[str] = field(default_factory=list)  # One text per kind of damage.
 
     def damage(self, problem: str, lost: int | None = None) -> None:
-        """Note a damaged place; lost: the messages gone with it, None where that is not known."""
+        """Add a damaged place. `lost` is the number of messages lost there, None if unknown."""
         if problem not in self.problems:
             self.problems.append(problem)
         if lost is None:
@@ -60,36 +46,56 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """Settle the count when all is read: what the file says it holds is better than the sum over its damaged places."""
+        """Compute the final number of lost messages. A count stated by the file overrides the sum over damaged places."""
         if self.expected is not None:
             self.lost = max(self.lost, self.expected - self.messages)
             self.complete = True
 
     def lines(self) -> list[str]:
-        """The report in words, one line a problem; nothing where the file is whole."""
+        """Return the report as a list of at most one line. The list is empty for an intact file."""
         if not self.problems and not self.lost:
             return []
         known = f"at least {self.lost}" if self.lost else "an unknown number"
-        lost = f"{self.lost if self.complete else known} lost"
-        return [
-            f"{self.file}: damaged, {self.messages} messages read, {lost}: {'; '.join(self.problems) or 'no reason seen'}"
-        ]
+        why = "; ".join(self.problems) or "no reason seen"
+        return [f"{self.file}: damaged, {self.messages} messages read, {self.lost if self.complete else known} lost: {why}"]
+
+
+@dataclass
+class Reading:
+    """The state while a file of chunks is read. The index of a chunk follows the chunk."""
+
+    report: FileReport
+    wanted: Wanted
+    connections: dict[int, Connection] = field(default_factory=dict)
+    chunk_read: int = 0
+    chunk_indexed: int = 0
+    chunk_problem: str = ""
+
+    def end_chunk(self) -> None:
+        """Report the current chunk if it is broken, and reset the state for the next chunk."""
+        if self.chunk_problem:
+            self.report.damage(self.chunk_problem, self.chunk_indexed - self.chunk_read if self.chunk_indexed else None)
+        self.chunk_read, self.chunk_indexed, self.chunk_problem = 0, 0, ""
 
 
 def plain(name: str) -> str:
-    """The name of a topic or frame as one line can show it: what is not printable is replaced, what is long is cut."""
+    """Return a topic or frame name with unprintable characters replaced, cut to `MAX_NAME` characters."""
     if len(name) <= MAX_NAME and name.isprintable():
         return name
     return "".join(c if c.isprintable() else "\ufffd" for c in name[:MAX_NAME])
 
 
 def frame_name(frame_id: str) -> str:
-    """A frame as tf knows it: ROS 1 wrote some of them with a leading slash."""
-    name = frame_id.lstrip("/")
-    return name if len(name) <= MAX_NAME and name.isprintable() else plain(name)
+    """Return a frame name as tf2 uses it, without the leading slash of some ROS 1 messages."""
+    return plain(frame_id.lstrip("/"))
 
 
 def type_name(name: str) -> str:
-    """A message type as ROS 2 writes it (nav_msgs/Odometry becomes nav_msgs/msg/Odometry); what is no type stays."""
+    """Return a message type in ROS 2 form, such as nav_msgs/msg/Odometry. Other text is returned as `plain` text."""
     match = _TYPE.fullmatch(name)
     return f"{match[1]}/msg/{match[2]}" if match else plain(name)
+
+
+def make_connection(topic: str, type_: str, encoding: str, definition: str, language: str) -> Connection:
+    """Return a connection with printable names. A definition in an unknown language ("") is dropped."""
+    return Connection(plain(topic), type_name(type_), encoding, definition if language else "", language)

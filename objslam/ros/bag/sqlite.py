@@ -1,28 +1,24 @@
-"""ROS 2 bags of the sqlite3 storage, read by rowid; where the database is damaged, page by page."""
-
-from __future__ import annotations
+"""ROS 2 bags of the sqlite3 storage, read in rowid order. A damaged database is read page by page."""
 
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from objslam.errors import LogError
-from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, plain, type_name
+from objslam.ros.bag.records import LANGUAGES, MAX_RECORD, Connection, FileReport, Messages, Wanted, make_connection
 from objslam.ros.bag.sqlite_pages import missing_pages, rows_of_pages
 
 MAGIC = b"SQLite format 3\0"
 
 
-def read_sqlite(path: Path, report: FileReport, wanted: Callable[[Connection], bool]) -> Messages:
-    """The messages of the wanted topics of a database, in the order of their rowids.
+def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
+    """Yield the messages of the wanted topics in rowid order. Raises LogError if the file is no database of messages.
 
-    Of a file that is cut off or has damaged pages, every row is read that is whole. The write-ahead log or rollback journal
-    of a recorder that was killed is applied to a copy in the folder for temporary files: the file itself is never touched.
-    LogError where there is no table of topics and messages.
+    All whole rows of a damaged file are read. The journal of a killed recorder is applied to a temporary copy of the file.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)
@@ -32,14 +28,14 @@ def read_sqlite(path: Path, report: FileReport, wanted: Callable[[Connection], b
                 report.messages += 1
                 yield topics[key], stamp, data
             else:
-                report.damage("rows that are no messages", 1)
+                report.damage("rows that are not messages", 1)
 
 
 @contextmanager
 def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
-    """The file, or a copy of it that what the recorder left beside it is applied to, and how to open it."""
-    siblings = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
-    siblings = [file for file in siblings if file.is_file() and file.stat().st_size]
+    """Yield the file or its temporary copy, and the mode in which to open it. Only a killed recorder leaves siblings."""
+    names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
+    siblings = [file for file in names if file.is_file() and file.stat().st_size]
     if not siblings:
         yield path, "mode=ro&immutable=1"
         return
@@ -57,25 +53,21 @@ def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
 
 @contextmanager
 def _open(file: Path, mode: str, path: Path) -> Iterator[sqlite3.Connection]:
-    database = None
     try:
-        database = sqlite3.connect(f"{file.resolve().as_uri()}?{mode}", uri=True, isolation_level=None)
-        database.text_factory = lambda text: text.decode("utf-8", "replace")
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
-        database.execute("PRAGMA trusted_schema = OFF")
-        database.execute("PRAGMA writable_schema = ON")  # else a file that is shorter than it says is not opened at all
-        if mode == "mode=rw":
-            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        yield database
+        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{mode}", uri=True, isolation_level=None)) as database:
+            database.text_factory = lambda text: text.decode("utf-8", "replace")
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD)
+            database.execute("PRAGMA trusted_schema = OFF")
+            database.execute("PRAGMA writable_schema = ON")  # Needed to open a truncated file.
+            if mode == "mode=rw":
+                database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            yield database
     except sqlite3.Error as error:
         raise LogError(f"not a database that can be read: {error}", where=str(path)) from error
-    finally:
-        if database is not None:
-            database.close()
 
 
 def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connection]:
-    # rootpage > 0: a view or a virtual table could make up rows without end
+    # Views and virtual tables (rootpage 0) are excluded, because they can generate endless rows.
     tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}
     if not {"topics", "messages"} <= tables:
         raise LogError("not a ROS 2 bag: the database has no tables of topics and messages", where=str(path))
@@ -86,18 +78,18 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
     topics = {}
     for key, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
         language, text = definitions.get(kind, ("", ""))
-        topics[key] = Connection(plain(str(name)), type_name(str(kind)), str(encoding), text if language else "", language)
+        topics[key] = make_connection(str(name), str(kind), str(encoding), text, language)
     return topics
 
 
 def _rows(
     database: sqlite3.Connection, file: Path, topics: frozenset[int], report: FileReport
 ) -> Iterator[tuple[int, int, Any, Any]]:
-    """Rows of the topics in the order of their rowids; from the first that the database fails on, page by page."""
+    """Yield the rows of the topics in rowid order. After a failure of the database, the rest is read page by page."""
     marks = ", ".join("?" * len(topics))
     last = -1
     pages, missing = missing_pages(file)
-    if missing:  # the database would make zeros of the page that the cut goes through
+    if missing:  # SQLite would fill the cut page with zeros.
         report.damage(f"cut off at byte {file.stat().st_size}, {missing} of {pages + missing} pages are missing")
     else:
         try:
@@ -114,4 +106,4 @@ def _rows(
         yield row
         last, found = row[0], found + 1
     if last - first > found:
-        report.damage("rows between others are gone", last - first - found)
+        report.damage("rows between other rows are missing", last - first - found)

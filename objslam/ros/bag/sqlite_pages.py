@@ -1,9 +1,7 @@
-"""Rows of a damaged SQLite file, found page by page: where the tree above a leaf page is gone, its rows are still there.
+"""Find the rows of a damaged SQLite file page by page. The rows of a leaf page survive the loss of the tree above it.
 
 https://www.sqlite.org/fileformat2.html, sections 1.3 (header), 1.6 (b-tree pages, cells, overflow), 2.1 (records).
 """
-
-from __future__ import annotations
 
 import mmap
 import struct
@@ -15,20 +13,18 @@ import numpy as np
 
 from objslam.ros.bag.records import MAX_RECORD
 
-Row = tuple[int, int, int, bytes]
-"""rowid, topic id, time of recording (ns), message."""
-
-_LEAF = 13  # The kind of a page that holds rows.
-_INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # The bytes of an integer, by its serial type.
-_MAX_COLUMNS = 32  # The most columns of a table of messages; a cell with more is none of its rows.
+Row = tuple[int, int, int, bytes]  # Each row is a tuple of rowid, topic id, recording time (ns) and message.
+_LEAF = 13  # The type byte of a table leaf page.
+_INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}  # The size of an integer by its serial type, bytes.
+_MAX_COLUMNS = 32  # The column limit of a messages table. A cell with more columns is not a message.
 
 
 class _CellError(ValueError):
-    """A cell that is not whole, or no row of messages."""
+    """A cell is incomplete or is not a row of messages."""
 
 
 def missing_pages(path: Path) -> tuple[int, int]:
-    """How many whole pages a file has, and how many fewer that is than its header says (0 if that cannot be trusted)."""
+    """Return the number of whole pages of a file and the number of missing pages, 0 if the header is not reliable."""
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:
@@ -39,10 +35,9 @@ def missing_pages(path: Path) -> tuple[int, int]:
 
 
 def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
-    """The rows with rowids above `after` on every leaf page of a file, whole rows only, in the order of their rowids.
+    """Yield the whole rows with rowids above `after` on all leaf pages of a file, in rowid order.
 
-    columns: where topic id, time and message stand in the table. A leaf page says nothing of its table: rows count that have
-    the right types in these columns and one of the `topics`.
+    A leaf page does not name its table. A row counts if its `columns` (topic id, time, message) and its topic are valid.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         size = _page_size(data[:100])
@@ -75,29 +70,29 @@ def _page_size(header: bytes) -> int:
 
 
 def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
+    """Return the variable-length integer at a byte, and the byte behind it."""
     value = 0
-    for i in range(9):
+    for i in range(8):
         byte = data[at + i]
-        if i == 8:
-            return _signed(value << 8 | byte, 8), at + 9
         value = value << 7 | byte & 0x7F
         if byte < 0x80:
-            break
-    return value, at + i + 1
-
-
-def _signed(value: int, size: int) -> int:
-    return value - (1 << 8 * size) if value >> (8 * size - 1) else value
+            return value, at + i + 1
+    value = value << 8 | data[at + 8]
+    return value - (1 << 64) if value >> 63 else value, at + 9
 
 
 def _read_row(
     data: mmap.mmap, at: int, page: int, columns: tuple[int, int, int], topics: frozenset[int], whole: bool
 ) -> tuple[int, int, bytes]:
-    """Topic, time and, if `whole`, message of the cell at a byte of a leaf page."""
+    """Return topic, time and message of the cell at a byte of a leaf page. The message is empty unless `whole`."""
     size, at = _varint(data, at)
-    _, at = _varint(data, at)
+    _, at = _varint(data, at)  # The rowid.
     usable = page - data[20]
-    local = _local_size(size, usable)
+    local = size  # The bytes of the payload in the cell itself. The rest is on overflow pages.
+    if size > usable - 35:
+        least = (usable - 12) * 32 // 255 - 23
+        local = least + (size - least) % (usable - 4)
+        local = local if local <= usable - 35 else least
     if not 4 <= size <= MAX_RECORD or at + local > len(data):
         raise _CellError
     head, start = _varint(data, at)
@@ -110,7 +105,8 @@ def _read_row(
         kinds.append(kind)
     if max(columns) >= len(kinds):
         raise _CellError
-    offsets = np.cumsum([head] + [_column_size(kind) for kind in kinds]).tolist()
+    sizes = [(kind - 12) // 2 if kind >= 12 else 8 if kind == 7 else _INTEGERS.get(kind, 0) for kind in kinds]
+    offsets = np.cumsum([head, *sizes]).tolist()
     if offsets[-1] != size:
         raise _CellError
     topic, stamp = (_integer(data, kinds[c], at + offsets[c], at + local) for c in columns[:2])
@@ -123,26 +119,13 @@ def _read_row(
     return topic, stamp, payload[offsets[columns[2]] : offsets[columns[2] + 1]]
 
 
-def _local_size(size: int, usable: int) -> int:
-    """How much of a payload lies in the cell itself; the rest overflows to other pages."""
-    if size <= usable - 35:
-        return size
-    least = (usable - 12) * 32 // 255 - 23
-    local = least + (size - least) % (usable - 4)
-    return local if local <= usable - 35 else least
-
-
-def _column_size(kind: int) -> int:
-    return (kind - 12) // 2 if kind >= 12 else 8 if kind == 7 else _INTEGERS.get(kind, 0)
-
-
 def _integer(data: mmap.mmap, kind: int, at: int, end: int) -> int:
     if kind in (8, 9):
         return kind - 8
     size = _INTEGERS.get(kind)
     if size is None or at + size > end:
         raise _CellError
-    return _signed(int.from_bytes(data[at : at + size], "big"), size)
+    return int.from_bytes(data[at : at + size], "big", signed=True)
 
 
 def _with_overflow(data: mmap.mmap, at: int, local: int, size: int, page: int, usable: int) -> bytes:
@@ -150,10 +133,11 @@ def _with_overflow(data: mmap.mmap, at: int, local: int, size: int, page: int, u
     rest, link = size - local, at + local
     while rest > 0:
         start = (int.from_bytes(data[link : link + 4], "big") - 1) * page
-        part = data[start + 4 : start + 4 + min(rest, usable - 4)] if start > 0 else b""
-        if len(part) < min(rest, usable - 4):
+        size = min(rest, usable - 4)
+        part = data[start + 4 : start + 4 + size] if start > 0 else b""
+        if len(part) < size:
             raise _CellError
         parts.append(part)
-        rest -= len(part)
+        rest -= size
         link = start
     return b"".join(parts)

@@ -1,4 +1,1 @@
-"""ROS messages by type: bytes to fields, and fields to poses, boxes, cameras and images.
-
-Which topics to read is not decided here; transforms over time are in `ros.tf`.
-"""
+"""Decode ROS messages and convert them to poses, boxes, cameras and images. Transforms over time are in `ros.tf`."""

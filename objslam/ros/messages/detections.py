@@ -1,6 +1,4 @@
-"""Boxes out of detection messages: vision_msgs in its four layouts, and AprilTags in those of several packages."""
-
-from __future__ import annotations
+"""Read boxes from detection messages: vision_msgs in four layouts and AprilTags of several packages."""
 
 import math
 from collections.abc import Iterator
@@ -14,33 +12,27 @@ from objslam.core.geometry import pose_from_quaternion
 from objslam.core.types import MAX_BOXES as MAX_BOXES
 from objslam.ros.messages.topic_types import DETECTIONS
 
-WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)
-"""What `find_boxes` raises for a message that is not laid out as its type says."""
-
+WRONG_LAYOUT = (AttributeError, TypeError, LookupError, ValueError)  # The errors of `find_boxes` for a wrong layout.
 _UNKNOWN = [math.nan] * 4
 
 
 class Found(NamedTuple):
-    """One detection: box x1, y1, x2, y2 in px, label ("" without one), score, and the tracker's name for it ("" likewise).
+    """One detection."""
 
-    points: (5, 3) m in the camera frame, the centre and the corners of a tag of which the message gives only the pose; the
-    box is then not yet known.
-    """
-
-    box: list[float]
-    label: str
+    box: list[float]  # x1, y1, x2, y2, px, or NaN if only `points` is known.
+    label: str  # The label may be empty.
     score: float
-    track: str = ""
-    points: Floats | None = None
+    track: str = ""  # The track name may be empty.
+    points: Floats | None = None  # (5, 3) m, in the camera frame, centre and corners of a tag without image corners.
 
 
 def find_boxes(type_: str, message: Any) -> Iterator[Found]:
-    """The detections of a message of a type that `is_boxes`."""
+    """Yield the detections of a message whose type satisfies `is_boxes`."""
     return vision_boxes(message) if type_ == DETECTIONS else tag_boxes(message)
 
 
 def track_number(name: str, tracks: dict[str, int]) -> int:
-    """A tracker's name for an object as a number: -1 for none, its own number if it is one, else a new one for each name."""
+    """Return the track id of a track name: -1 for "", the number in the name, or a new number stored in `tracks`."""
     if not name:
         return -1
     if name.isascii() and name.isdigit() and len(name) < 18:
@@ -49,10 +41,7 @@ def track_number(name: str, tracks: dict[str, int]) -> int:
 
 
 def boxes_of_points(camera: Camera, points: Floats) -> Floats:
-    """Boxes (M, 4), px of the raw image, around tags (M, 5, 3) seen by the camera, centred on the image of the centre.
-
-    NaN where a tag is not in the field of the camera's lens.
-    """
+    """Return boxes (M, 4), raw px, centred on the first of tag points (M, 5, 3). Boxes outside the lens field are NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
@@ -62,7 +51,7 @@ def boxes_of_points(camera: Camera, points: Floats) -> Floats:
 
 
 def vision_boxes(message: Any) -> Iterator[Found]:
-    """The detections of a vision_msgs/Detection2DArray: of several hypotheses the best, of a turned box its bounds."""
+    """Yield the detections of a vision_msgs/Detection2DArray, with the best hypothesis and the bounds of a rotated box."""
     for detection in message.detections:
         centre, label, score = detection.bbox.center, "", 0.0
         width, height, turn = detection.bbox.size_x, detection.bbox.size_y, centre.theta
@@ -84,26 +73,23 @@ def vision_boxes(message: Any) -> Iterator[Found]:
 
 
 def tag_boxes(message: Any) -> Iterator[Found]:
-    """The tags of an array message of AprilTags, labelled tag_<id>, with score 1.
+    """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
-    The centre of a box is where the diagonals of the tag meet, as the centre of a square does in every picture of it; the
-    box reaches out to the furthest corner. Bundles of tags (apriltag_ros), which are no single thing, give nothing.
+    The box centre is the intersection of the tag diagonals. The box extends to the furthest corner.
+    Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):
-            box = _box_around(_corners(tag.corners))
-            yield Found(box, f"tag_{int(tag.id)}", 1.0)
+            yield Found(_box_around(tag.corners), f"tag_{int(tag.id)}", 1.0)
         elif len(tag.id) == 1:
             yield Found(_UNKNOWN, f"tag_{int(tag.id[0])}", 1.0, points=_tag_points(tag.pose.pose.pose, float(tag.size[0])))
 
 
-def _corners(corners: Any) -> list[tuple[float, float]]:
-    if hasattr(corners[0], "x"):
-        return [(corner.x, corner.y) for corner in corners]
-    return [(float(corners[i]), float(corners[i + 1])) for i in range(0, 8, 2)]
-
-
-def _box_around(corners: list[tuple[float, float]]) -> list[float]:
+def _box_around(tag_corners: Any) -> list[float]:
+    if hasattr(tag_corners[0], "x"):
+        corners = [(corner.x, corner.y) for corner in tag_corners]
+    else:
+        corners = [(float(tag_corners[i]), float(tag_corners[i + 1])) for i in range(0, 8, 2)]
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
     ux, uy, vx, vy = cx - ax, cy - ay, dx - bx, dy - by
     cross = ux * vy - uy * vx

@@ -1,7 +1,7 @@
-"""Image messages as pixels, and as the content of files."""
+"""Convert image messages to pixel arrays and to file contents."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from objslam.io.images import decode_colour, decode_depth
 from objslam.ros.messages.decode import DecodeError
 
-DEPTH_SCALE = 1000.0  # The units of a metre in depth images that are decoded or written.
-_MAX_SIDE = 1 << 15  # The longest side of an image, px; above it a message is taken for damaged.
+DEPTH_SCALE = 1000.0  # The units per metre in decoded and written depth images.
+_MAX_SIDE = 1 << 15  # The limit of width and height, px. A message with a larger image counts as damaged.
 _PLAIN = {"mono8": (np.uint8, 1), "8uc1": (np.uint8, 1), "mono16": (np.uint16, 1), "16uc1": (np.uint16, 1),
           "32fc1": (np.float32, 1), "bgr8": (np.uint8, 3), "8uc3": (np.uint8, 3), "rgb8": (np.uint8, 3),
           "bgra8": (np.uint8, 4), "8uc4": (np.uint8, 4), "rgba8": (np.uint8, 4), "bgr16": (np.uint16, 3),
@@ -20,20 +20,19 @@ _PLAIN = {"mono8": (np.uint8, 1), "8uc1": (np.uint8, 1), "mono16": (np.uint16, 1
 _CONVERSIONS = {"rgb8": "COLOR_RGB2BGR", "rgba8": "COLOR_RGBA2BGR", "bgra8": "COLOR_BGRA2BGR", "8uc4": "COLOR_BGRA2BGR",
                 "rgb16": "COLOR_RGB2BGR", "yuv422": "COLOR_YUV2BGR_UYVY", "uyvy": "COLOR_YUV2BGR_UYVY",
                 "yuv422_yuy2": "COLOR_YUV2BGR_YUY2", "yuyv": "COLOR_YUV2BGR_YUY2",
-                # OpenCV names a Bayer pattern after the second row's second and third pixel
+                # OpenCV names a Bayer pattern by the second and third pixel of the second row.
                 "bayer_rggb": "COLOR_BayerBG2BGR", "bayer_bggr": "COLOR_BayerRG2BGR",
                 "bayer_gbrg": "COLOR_BayerGR2BGR", "bayer_grbg": "COLOR_BayerGB2BGR"}  # fmt: skip
 _ENDINGS = {b"\xff\xd8\xff": ".jpg", b"\x89PNG\r\n": ".png"}
-_DEPTH_HEADER = 12  # The bytes before the PNG in a message of compressed depth.
+_DEPTH_HEADER = 12  # The size of the header before the PNG in a compressed depth message, bytes.
 
 
 def colour_image(message: Any) -> NDArray[Any]:
-    """A sensor_msgs/Image or CompressedImage as pixels (H, W, 3), uint8, BGR; DecodeError where it is none, or depth."""
+    """Return the pixels (H, W, 3), uint8, BGR, of an image message. Raises DecodeError for malformed data or depth."""
     if (packing := _packing(message)) is not None:
-        image = decode_colour(bytes(message.data))
-        if image is None or "compresseddepth" in packing:
-            raise DecodeError(f"not a colour image of the format {message.format[:40]!r}")
-        return image
+        if "compresseddepth" in packing:
+            raise DecodeError(f"not a colour image but depth of the format {message.format[:40]!r}")
+        return _unpack(decode_colour, message)
     image = _colours(message)
     if image.dtype == np.uint16:
         image = (image // 256).astype(np.uint8)
@@ -41,25 +40,18 @@ def colour_image(message: Any) -> NDArray[Any]:
 
 
 def depth_image(message: Any) -> NDArray[Any]:
-    """A sensor_msgs/Image or CompressedImage of depth as (H, W), uint16, in `DEPTH_SCALE` units per metre, 0 where unknown.
-
-    DecodeError where it is none.
-    """
+    """Return the depth (H, W), uint16, 1 / `DEPTH_SCALE` m, 0 if unknown. Raises DecodeError for other messages."""
     if (packing := _packing(message)) is None:
         return _depth_units(_pixels(message)[0])
-    data = bytes(message.data)
     if "compresseddepth" in packing:
-        return _compressed_depth(data, packing)
-    image = decode_depth(data)
-    if image is None:
-        raise DecodeError(f"not an image of the format {message.format[:40]!r}")
-    return _depth_units(image)
+        return _compressed_depth(bytes(message.data), packing)
+    return _depth_units(_unpack(decode_depth, message))
 
 
 def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
-    """A sensor_msgs/Image or CompressedImage as the content of a file, and the ending of its name.
+    """Return file content and file suffix of an image message. Raises DecodeError if the message is malformed.
 
-    JPEG and PNG stay as they are, all else becomes PNG; depth as `depth_image` has it. DecodeError where it is none.
+    JPEG and PNG data are not changed. Other images become PNG. Depth becomes a PNG of the array of `depth_image`.
     """
     packing = _packing(message)
     if depth or "compresseddepth" in (packing or ""):
@@ -68,29 +60,30 @@ def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
         return _encode(_colours(message)), ".png"
     data = message.data.tobytes()
     ending = next((ending for magic, ending in _ENDINGS.items() if data.startswith(magic)), None)
-    if ending is not None:
-        return data, ending
-    image = decode_colour(data)
+    return (data, ending) if ending is not None else (_encode(_unpack(decode_colour, message)), ".png")
+
+
+def _unpack(decode: Callable[[bytes], NDArray[Any] | None], message: Any) -> NDArray[Any]:
+    image = decode(bytes(message.data))
     if image is None:
         raise DecodeError(f"not an image of the format {message.format[:40]!r}")
-    return _encode(image), ".png"
+    return image
 
 
 def _packing(message: Any) -> str | None:
-    """The format of a CompressedImage, without capitals and blanks; None for an Image."""
+    """Return the format of a CompressedImage in lower case without blanks, None for an Image."""
     return str(message.format).lower().replace(" ", "") if hasattr(message, "format") else None
 
 
 def _colours(message: Any) -> NDArray[Any]:
-    """The pixels of a sensor_msgs/Image in grey or BGR, of 8 or 16 bits."""
     image, conversion = _pixels(message)
     if image.dtype == np.float32:
-        raise DecodeError("it is of floats, which no colour image is")
+        raise DecodeError("its pixels are floats, which a colour image cannot have")
     return image if conversion is None else _convert(image, conversion)
 
 
 def _pixels(message: Any) -> tuple[NDArray[Any], str | None]:
-    """The pixels of a sensor_msgs/Image, (H, W) or (H, W, C), and how their colours become BGR, as OpenCV calls it."""
+    """Return the pixels (H, W) or (H, W, C) of a sensor_msgs/Image, and the name of the OpenCV conversion to BGR."""
     encoding, height, width = message.encoding.lower(), int(message.height), int(message.width)
     bayer = encoding.startswith("bayer_") and encoding.endswith("8")
     if encoding not in _PLAIN and not bayer:
@@ -98,10 +91,9 @@ def _pixels(message: Any) -> tuple[NDArray[Any], str | None]:
     dtype, channels = (np.uint8, 1) if bayer else _PLAIN[encoding]
     row = width * channels * np.dtype(dtype).itemsize
     step = int(message.step) or row
-    if not (
-        0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE and step >= row and len(message.data) >= step * (height - 1) + row
-    ):
-        raise DecodeError(f"it says {width} x {height} pixels and has {len(message.data)} bytes")
+    sane = 0 < height <= _MAX_SIDE and 0 < width <= _MAX_SIDE and step >= row
+    if not sane or len(message.data) < step * (height - 1) + row:
+        raise DecodeError(f"its {len(message.data)} bytes do not fit its size of {width} x {height} pixels")
     rows = np.lib.stride_tricks.as_strided(np.asarray(message.data, dtype=np.uint8), (height, row), (step, 1))
     image: NDArray[Any] = np.ascontiguousarray(rows).view(np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<"))
     image = image.astype(dtype).reshape(height, width, channels) if channels > 1 else image.astype(dtype)
@@ -118,7 +110,7 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 
 
 def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
-    """compressed_depth_image_transport: a PNG behind a header, of floats as quantised inverse depth (a / depth + b)."""
+    """Decode compressed_depth_image_transport: a header and a PNG. The PNG of floats has inverse depth a / depth + b."""
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise DecodeError("its compressed depth is not PNG")
     image = decode_depth(data[_DEPTH_HEADER:])
@@ -132,23 +124,20 @@ def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
 
 
 def _depth_units(image: NDArray[Any]) -> NDArray[Any]:
-    """Depth in units of `DEPTH_SCALE`: 16 bit images are in millimetres (REP 118), floats in metres."""
+    """Return depth in 1 / `DEPTH_SCALE` m. Input with 16 bits is in mm and input of floats is in m (REP 118)."""
     if image.dtype == np.uint16 and image.ndim == 2:
         return image
     if image.dtype != np.float32 or image.ndim != 2:
-        raise DecodeError("depth of a kind that is not known")
+        raise DecodeError("its depth is neither 16-bit integers nor 32-bit floats")
     units = np.round(np.nan_to_num(image, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float64) * DEPTH_SCALE)
     return np.where((units > 0) & (units < 1 << 16), units, 0).astype(np.uint16)
 
 
 def _encode(image: NDArray[Any]) -> bytes:
-    """The image as PNG."""
     import cv2
 
-    try:
+    with suppress(cv2.error):
         done, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    except cv2.error as error:
-        raise DecodeError("it cannot be written as PNG") from error
-    if not done:
-        raise DecodeError("it cannot be written as PNG")
-    return bytes(content)
+        if done:
+            return bytes(content)
+    raise DecodeError("it cannot be written as PNG")

@@ -1,23 +1,19 @@
-"""The message types that matter here, as ROS 2 writes them."""
-
-from __future__ import annotations
+"""The names of the message types that objslam reads, in ROS 2 form."""
 
 ODOMETRY, IMAGE, COMPRESSED = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 CAMERA_INFO, DETECTIONS = "sensor_msgs/msg/CameraInfo", "vision_msgs/msg/Detection2DArray"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 IMAGES = (IMAGE, COMPRESSED)
-
-LATCHED = (*TRANSFORMS, CAMERA_INFO)
-"""Types whose past messages matter too: a publisher sends them once, or hands them to whoever comes later."""
+LATCHED = (*TRANSFORMS, CAMERA_INFO)  # The types whose publishers may send a message only once, even before a subscription.
 
 
 def is_tags(type_: str) -> bool:
-    """Whether a type is an array of AprilTag detections, of whatever package."""
+    """Return whether a type is an array of AprilTag detections of any package."""
     package, _, name = type_.partition("/msg/")
     return "apriltag" in package and name.endswith(("Array", "ArrayStamped"))
 
 
 def is_boxes(type_: str) -> bool:
-    """Whether messages of a type hold boxes: detections or tags."""
+    """Return whether messages of a type contain boxes, from detections or tags."""
     return type_ == DETECTIONS or is_tags(type_)

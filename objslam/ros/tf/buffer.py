@@ -1,6 +1,4 @@
-"""The frames of a running robot: transforms of /tf and /tf_static as they come, kept for as long as tf2 keeps them."""
-
-from __future__ import annotations
+"""Buffer the transforms of /tf and /tf_static of a live robot, for as long as tf2 does."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -14,11 +12,11 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.ros.messages.poses import one_pose
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
 
-_MAX_KEPT = 10_000  # The most transforms of one pair of frames that are kept; chosen for 10 s at 1 kHz.
+_MAX_KEPT = 10_000  # The limit of buffered transforms per pair of frames, enough for 10 s at 1 kHz.
 
 
 class UnknownTransform(LookupError):
-    """A transform is not known at that time; `later` tells whether one that is still to come may make it known."""
+    """A transform is unknown at the requested time. `later` is whether a later message may supply it."""
 
     def __init__(self, message: str, later: bool) -> None:
         super().__init__(message)
@@ -27,7 +25,7 @@ class UnknownTransform(LookupError):
 
 @dataclass
 class _Edge:
-    """parent_T_child: one pose while it has never changed, else at stamps, s, increasing."""
+    """parent_T_child at increasing stamps, s. `still` is whether the pose has never changed."""
 
     parent: str
     static: bool
@@ -36,15 +34,14 @@ class _Edge:
     still: bool = True
 
     def add(self, stamp: float, pose: Floats) -> bool:
-        """Add a pose; False where it comes too late to count. A clock that was set back begins again."""
+        """Add a pose, or return False if it is late. A timestamp more than `MAX_GAP` s back clears the buffer."""
         if self.stamps and stamp < self.stamps[-1] - MAX_GAP:
             self.stamps.clear()
             self.poses.clear()
-        if self.stamps and stamp < self.stamps[-1]:
-            return False
-        if self.stamps and stamp == self.stamps[-1]:
-            self.poses[-1] = pose
-            return True
+        if self.stamps and stamp <= self.stamps[-1]:
+            if stamp == self.stamps[-1]:
+                self.poses[-1] = pose
+            return stamp == self.stamps[-1]
         self.still = self.still and (not self.poses or unchanged(pose, self.poses[-1]))
         self.stamps.append(stamp)
         self.poses.append(pose)
@@ -54,7 +51,7 @@ class _Edge:
         return True
 
     def at(self, stamp: float) -> Floats:
-        """The pose at a stamp, interpolated; UnknownTransform outside of what is known."""
+        """Return the interpolated pose at a stamp, s. Raises UnknownTransform outside of the buffered time."""
         if self.still:
             return self.poses[-1]
         after = bisect_left(self.stamps, stamp)
@@ -72,26 +69,22 @@ class _Edge:
 
 
 class TfBuffer:
-    """Transforms by child frame. Poses a_T_b take b coordinates to a coordinates.
+    """The latest transforms of all frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame that a second parent claims keeps its first for as long as that is heard (`MAX_GAP` s); a static transform never
-    takes the place of one that moves.
+    A frame keeps its parent unless the parent is silent for `MAX_GAP` s. A static transform never replaces a moving one.
     """
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transform: Any, received: float, static: bool) -> str:
-        """Add a geometry_msgs/TransformStamped; its child frame. ValueError says why one cannot be used.
-
-        received: s, stands in for a stamp that nobody has set.
-        """
+        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is invalid."""
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
         if pose is None:
-            raise ValueError("transform that is no pose (not finite, or a zero quaternion)")
+            raise ValueError("transform whose pose is invalid (not finite, or a zero quaternion)")
         time = transform.header.stamp
-        stamp = time.sec + time.nanosec * 1e-9 or received
+        stamp = time.sec + time.nanosec * 1e-9 or received  # The arrival time (s) replaces an unset timestamp.
         edge = self._edges.get(child)
         if edge is None and len(self._edges) >= MAX_TRANSFORMS:
             raise ValueError(f"transform beyond the first {MAX_TRANSFORMS} frames")
@@ -100,7 +93,7 @@ class TfBuffer:
                 raise ValueError("static transform of a frame that also has a moving one")
             if edge.parent != parent and abs(stamp - edge.stamps[-1]) < MAX_GAP:
                 raise ValueError("transform of a frame that has another parent")
-        if edge is None or edge.static or edge.parent != parent:  # of static ones the newest alone counts
+        if edge is None or edge.static or edge.parent != parent:  # Only the newest static transform counts.
             edge = self._edges[child] = _Edge(parent, static)
         if not edge.add(stamp, pose):
             raise ValueError("transform that is older than the last")
@@ -112,27 +105,27 @@ class TfBuffer:
         return set(self._edges) | {edge.parent for edge in self._edges.values()}
 
     def above(self, frame: str) -> Sequence[str]:
-        """A frame, its parent, and so on up to the root; UnknownTransform where they run in a circle."""
+        """Return the frames from a frame up to the root. Raises UnknownTransform if they form a cycle."""
         way, circle = climb(frame, lambda child: self._edges[child].parent if child in self._edges else None)
         if circle is not None:
             raise UnknownTransform(f"tf runs in a circle at {circle}", later=True)
         return way
 
     def _between(self, a: str, b: str) -> tuple[Sequence[str], Sequence[str]]:
-        """The frames from a and from b up to, and without, the first above both."""
+        """Return the frames from a and from b up to their first common ancestor, without the ancestor."""
         ways = part(self.above(a), self.above(b))
         if ways is None:
             raise UnknownTransform(f"tf does not connect {a} and {b}", later=True)
         return ways
 
     def at(self, a: str, b: str, stamp: float) -> Floats:
-        """a_T_b (4, 4) at a stamp, s, each moving transform interpolated; UnknownTransform where it is not known."""
+        """Return the interpolated a_T_b (4, 4) at a stamp, s. Raises UnknownTransform if it is unknown."""
         up, down = self._between(a, b)
         top_T_a, top_T_b = self._down(up, stamp), self._down(down, stamp)
         return np.asarray(inverse(top_T_a) @ top_T_b) if up else top_T_b
 
     def newest(self, a: str, b: str) -> float | None:
-        """The newest stamp, s, at which all transforms between a and b are known; None where all of them are static."""
+        """Return the newest stamp, s, with all transforms from a to b known, None if all of them are static."""
         moving = [edge.stamps[-1] for way in self._between(a, b) for child in way if not (edge := self._edges[child]).static]
         return min(moving, default=None)
 

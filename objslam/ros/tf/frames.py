@@ -1,6 +1,4 @@
-"""Coordinate frames by name, and what a recorded tf tree and a live tf buffer have in common."""
-
-from __future__ import annotations
+"""Classify coordinate frames by name, and search the tree of frames."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -11,39 +9,34 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.ros.bag.records import frame_name
 
-MAX_TRANSFORMS = 10_000
-"""The most transforms of one message, and the most frames, that are taken; chosen to bound the memory."""
-
-MAX_GAP = 10.0  # The longest gap between two transforms that is bridged, s; what tf2 remembers by default.
-_STILL = 1e-9  # The most that a number of a pose may change for a frame to stand still; far below what any sensor can tell.
-BASES = ("base_footprint", "base_link")
-"""The frames of a robot's base (REP 105), without namespaces; the first that there is counts."""
-
+MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. The limit bounds memory.
+MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. tf2 has the same default buffer length.
+_STILL = 1e-9  # The largest change of a pose element of a static frame, far below the resolution of any sensor.
+BASES = ("base_footprint", "base_link")  # The base frames of a robot (REP 105) without namespaces, by priority.
 _WORLDS = {"map", "world"}
 
 
 def _leaf(frame: str) -> str:
-    """A frame's name without its namespace."""
     return frame.rpartition("/")[2]
 
 
 def is_world(frame: str) -> bool:
-    """Whether a frame stands still in the world (map, world, robot1/map), as odom does not."""
+    """Return whether a frame is fixed in the world, such as map, world or robot1/map, but not odom."""
     return not _WORLDS.isdisjoint(re.split(r"[^a-z]+", _leaf(frame).lower()))
 
 
 def find_odom(frames: Iterable[str]) -> str:
-    """The first odom of some frames, "" where there is none."""
+    """Return the first odom frame, "" without one."""
     return next((frame for frame in frames if _leaf(frame) == "odom"), "")
 
 
 def find_world(frames: Iterable[str]) -> str:
-    """The first of some frames that stands still in the world, "" where there is none."""
+    """Return the first frame that is fixed in the world, "" without one."""
     return next((frame for frame in frames if is_world(frame)), "")
 
 
 def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
-    """The frame that is base: the one given, else what the odometry moved, else base_footprint or base_link."""
+    """Return the base frame: the given frame, else the child frame of the odometry, else base_footprint or base_link."""
     if given is not None:
         return given.lstrip("/")
     known = set(frames)
@@ -54,7 +47,7 @@ def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
 
 
 def link(transform: Any) -> tuple[str, str]:
-    """Parent and child of a geometry_msgs/TransformStamped; ValueError says why they can be none."""
+    """Return parent and child of a geometry_msgs/TransformStamped. Raises ValueError if they are invalid."""
     parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
     if not parent or not child or parent == child:
         raise ValueError("transform without a frame, or of a frame to itself")
@@ -62,7 +55,7 @@ def link(transform: Any) -> tuple[str, str]:
 
 
 def climb(frame: str, parent_of: Callable[[str], str | None]) -> tuple[tuple[str, ...], str | None]:
-    """A frame, its parent, and so on up to the root; and the frame where they run in a circle, None where they do not."""
+    """Return the frames from a frame up to the root, and the first repeated frame of a cycle, None without a cycle."""
     way, seen = [frame], {frame}
     while (parent := parent_of(way[-1])) is not None:
         if parent in seen:
@@ -73,12 +66,12 @@ def climb(frame: str, parent_of: Callable[[str], str | None]) -> tuple[tuple[str
 
 
 def part(above_a: Sequence[str], above_b: Sequence[str]) -> tuple[Sequence[str], Sequence[str]] | None:
-    """Two ways to the root up to, and without, the first frame of both; None where they have none in common."""
+    """Cut two ways to the root before their first common frame. Return None without a common frame."""
     both = set(above_b)
     common = next((frame for frame in above_a if frame in both), None)
     return None if common is None else (above_a[: above_a.index(common)], above_b[: above_b.index(common)])
 
 
 def unchanged(poses: Floats, pose: Floats) -> bool:
-    """Whether poses (..., 4, 4) are a pose (4, 4), to rounding."""
+    """Return whether the poses (..., 4, 4) equal a pose (4, 4) except for rounding."""
     return bool(np.abs(poses - pose).max() <= _STILL)

@@ -1,6 +1,4 @@
-"""The tree of coordinate frames that /tf and /tf_static describe, at rest and over time."""
-
-from __future__ import annotations
+"""Look up static and moving transforms in the tree of coordinate frames of /tf and /tf_static."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -17,19 +15,19 @@ from objslam.errors import LogError
 from objslam.ros.messages.poses import PoseRows
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
 
-_NAMED = 6  # The most frames that a message lists; chosen for a line that can be read.
+_NAMED = 6  # The limit of frames listed in a message. The limit keeps the message readable.
 
 
 @dataclass
 class TfRows:
-    """Transforms as they came, by (parent, child): the moving ones over time, of the static ones the last."""
+    """Transforms by (parent, child): all moving transforms in the order of arrival, and the last static transform."""
 
     moving: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
     static: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
     def add(self, transform: Any, logged: int, static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped; what cannot be one is refused and counted."""
+        """Add a geometry_msgs/TransformStamped. Invalid transforms are counted in `refused`."""
         try:
             parent, child = link(transform)
         except ValueError as error:
@@ -49,7 +47,7 @@ class TfRows:
 
 @dataclass(frozen=True)
 class _Edge:
-    """parent_T_child at stamps (N,), s, increasing; one pose (1, 4, 4) where it never changes."""
+    """parent_T_child at increasing stamps (N,), s. A static transform has one pose (1, 4, 4)."""
 
     parent: str
     stamps: Floats
@@ -61,23 +59,21 @@ class _Edge:
 
 
 class TfTree:
-    """The frames and how they hang together. Poses a_T_b take b coordinates to a coordinates.
+    """The tree of frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame with several parents keeps the one that most transforms name, with a warning; of two transforms of one stamp the
-    later counts. Methods that need a way between two frames raise LogError where there is none, naming the two parts that
-    nothing connects, or where the tree runs in a circle.
+    A frame with several parents keeps the parent of most transforms. The last of transforms with equal timestamps is used.
+    Methods raise LogError if two frames are not connected or the tree has a cycle.
     """
 
     def __init__(self, rows: TfRows, ledger: Ledger) -> None:
         self._rows, self._ledger = rows, ledger
         self._edges: dict[str, _Edge] = {}
-        parents: dict[str, Counter[str]] = {}
+        self._parents: dict[str, Counter[str]] = {}
         for parent, child in rows.static:
-            parents.setdefault(child, Counter())[parent] += 1
+            self._parents.setdefault(child, Counter())[parent] += 1
         for (parent, child), samples in rows.moving.items():
-            parents.setdefault(child, Counter())[parent] += len(samples)
-        self._parent = {child: max(found, key=lambda name: found[name]) for child, found in parents.items()}
-        self._torn = {child: sorted(found) for child, found in parents.items() if len(found) > 1}
+            self._parents.setdefault(child, Counter())[parent] += len(samples)
+        self._parent = {child: max(found, key=lambda name: found[name]) for child, found in self._parents.items()}
         for reason, count in rows.refused.items():
             ledger.drop(reason, count)
 
@@ -87,18 +83,18 @@ class TfTree:
         return frozenset(self._parent) | frozenset(self._parent.values())
 
     def chain(self, a: str, b: str) -> tuple[str, ...]:
-        """The frames on the way from a to b, both included."""
+        """Return the frames from a to b, including both."""
         up, down = self._ways(a, b)
         top = self._parent[up[-1]] if up else a
         return (*up, top, *reversed(down))
 
     def still(self, a: str, b: str) -> Floats | None:
-        """a_T_b (4, 4), None if it changes over time."""
+        """Return a_T_b (4, 4), None if it changes over time."""
         still = all(self._edge(child).still for way in self._ways(a, b) for child in way)
         return self.at(a, b, np.zeros(1))[0][0] if still else None
 
     def stamps(self, a: str, b: str) -> Floats:
-        """The stamps (N,), s, at which any of the moving transforms between a and b was given, where all are known."""
+        """Return the stamps (N,), s, of the moving transforms between a and b, within the time range of all of them."""
         moving = [edge for way in self._ways(a, b) for child in way if not (edge := self._edge(child)).still]
         if not moving:
             return np.zeros(0)
@@ -107,7 +103,7 @@ class TfTree:
         return stamps[(stamps >= first) & (stamps <= last)]
 
     def above(self, frame: str) -> Sequence[str]:
-        """A frame, its parent, and so on up to the root."""
+        """Return the frames from a frame up to the root."""
         way, circle = climb(frame, self._parent.get)
         if circle is not None:
             names = " -> ".join([*way[way.index(circle) :], circle][:_NAMED])
@@ -115,7 +111,7 @@ class TfTree:
         return way
 
     def at(self, a: str, b: str, stamps: Floats) -> tuple[Floats, Bools]:
-        """a_T_b (Q, 4, 4) at stamps (Q,), s, each transform interpolated, and where (Q,) all of them are known."""
+        """Return the interpolated a_T_b (Q, 4, 4) at stamps (Q,), s, and the mask (Q,) of known poses."""
         up, down = self._ways(a, b)
         top_T_a, known_a = self._down(up, stamps)
         top_T_b, known_b = self._down(down, stamps)
@@ -134,43 +130,36 @@ class TfTree:
         return pose, known
 
     def _ways(self, a: str, b: str) -> tuple[Sequence[str], Sequence[str]]:
-        """The frames from a and from b up to, and without, the first frame above both."""
+        """Return the frames from a and from b up to their first common ancestor, without the ancestor."""
         ways = part(self.above(a), self.above(b))
         if ways is None:
             raise LogError(
                 f"tf does not connect {a!r} and {b!r}: {self._part(a)}; {self._part(b)}",
-                hint="was /tf_static recorded? a camera's place can be given in --camera-info FILE",
+                hint="record /tf_static, or give the pose of the camera in --camera-info FILE",
             )
         return ways
 
     def _part(self, frame: str) -> str:
         if frame not in self.frames:
             return f"{frame!r} is in no transform"
-        others = sorted(self._connected(frame) - {frame})
-        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-        return f"{frame!r} hangs together with {', '.join(others[:_NAMED])}{more}"
-
-    def _connected(self, frame: str) -> set[str]:
         near: dict[str, list[str]] = {}
         for child, parent in self._parent.items():
             near.setdefault(child, []).append(parent)
             near.setdefault(parent, []).append(child)
         found, edge = {frame}, [frame]
         while edge:
-            edge = [other for name in edge for other in near.get(name, ()) if other not in found]
+            edge = [other for name in edge for other in near[name] if other not in found]
             found.update(edge)
-        return found
+        others = sorted(found - {frame})
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        return f"{frame!r} is connected only to {', '.join(others[:_NAMED])}{more}"
 
     def _edge(self, child: str) -> _Edge:
-        if child not in self._edges:
-            self._edges[child] = self._make_edge(child)
-        return self._edges[child]
-
-    def _make_edge(self, child: str) -> _Edge:
+        if child in self._edges:
+            return self._edges[child]
         parent = self._parent[child]
-        if child in self._torn:
-            others = ", ".join(other for other in self._torn[child] if other != parent)
-            self._ledger.warn(f"tf: {child} has several parents, {parent} is taken, not {others}")
+        if others := sorted(self._parents[child].keys() - {parent}):
+            self._ledger.warn(f"tf: {child} has several parents, {parent} is taken, not {', '.join(others)}")
         what = f"transform {parent} -> {child}"
         moving, static = self._rows.moving.get((parent, child)), self._rows.static.get((parent, child))
         stamps, poses = (moving or static or PoseRows()).checked(what, self._ledger)
@@ -182,4 +171,4 @@ class TfTree:
         stamps, poses = stamps[last], poses[last]
         if unchanged(poses, poses[0]):
             stamps, poses = stamps[:1], poses[:1]
-        return _Edge(parent, stamps, poses)
+        return self._edges.setdefault(child, _Edge(parent, stamps, poses))

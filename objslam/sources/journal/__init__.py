@@ -1,4 +1,1 @@
-"""The journal of a live session: what each message is on disk, and the journal as a log to run again.
-
-Who writes it, and when, is `live.session`.
-"""
+"""The journal of a live session: the messages that the session accepted, on disk. A journal is also read as a log."""

@@ -1,11 +1,9 @@
-"""The journal: what a session accepted, record by record, so that nothing of it is lost when the process is killed.
+"""Write and read the journal, the file of all messages that a live session accepted.
 
-A file that only grows: 8 bytes that say what it is, then records of length (4 bytes, little endian), CRC-32 (4 bytes) and
-content. A record is with the kernel before its message counts, so that a killed process loses none; the disk has it a second
-later at the most, so that a power failure loses no more than that.
+The file starts with 8 magic bytes. Each record is its length (4 bytes, little endian), CRC-32 (4 bytes) and content.
+A record is in the kernel's cache before its message counts, so a killed process loses no message. It is on the disk at most
+`_SYNC_EVERY` later, so a power failure loses at most the messages of that time.
 """
-
-from __future__ import annotations
 
 import fcntl
 import itertools
@@ -14,6 +12,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,47 +36,45 @@ from objslam.sources.journal.records import (
 NAME = "journal.objslam"
 MAGIC = b"OBJSLAM1"
 _HEAD = struct.Struct("<II")
-_LONGEST = 1 << 26  # The longest record, bytes; what claims more is damage.
-_SYNC_EVERY = 1.0  # The time between two writes to the disk, s; larger: a power failure loses more.
+_LONGEST = 1 << 26  # The longest record, bytes. A length above it is taken as damage.
+_SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
 
 
 class Journal:
-    """A journal that is written to, by one process at a time; OutputError where the disk refuses.
+    """A journal open for writing. Only one process may write it.
 
-    torn: bytes of a record that was cut off, which opening it again took away.
+    torn: the number of bytes of an incomplete last record, which `resume` removed.
     """
 
     def __init__(self, file: Path, resume: bool = False) -> None:
-        """A new journal, or with `resume` the one that is there, without its torn end. OutputError if it is in use.
+        """Open a new journal, or with `resume` append to the existing journal after removing its torn end.
 
-        Without `resume`, a journal with messages is kept under another name (`set_aside`).
+        Without `resume`, an existing journal with messages is renamed first (`set_aside`).
+        Raises OutputError if another session writes the journal or the disk refuses.
         """
         self.file = file
         if not resume:
             set_aside(file)
-        try:
+        with _refusals("open the journal", file):
             self._stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise OutputError(f"cannot open the journal: {error.strerror}", where=str(file)) from error
         try:
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             os.close(self._stream)
             raise OutputError("another session writes this journal", where=str(file)) from error
-        end = _sound_end(file) if resume else 0
-        self.torn = file.stat().st_size - end if resume else 0
-        os.ftruncate(self._stream, end)
+        self._end = _end_of_records(file) if resume else 0
+        self.torn = file.stat().st_size - self._end if resume else 0
+        os.ftruncate(self._stream, self._end)
         os.lseek(self._stream, 0, os.SEEK_END)
-        self._end = end
         self._broken: OSError | None = None
-        if end == 0:
+        if self._end == 0:
             self._append(MAGIC)
         self._closed = threading.Event()
         self._syncing = threading.Thread(target=self._sync, name="objslam journal", daemon=True)
         self._syncing.start()
 
     def write(self, message: Message) -> None:
-        """Append one message. When this returns, a killed process has not lost it; a second later, nor has a machine."""
+        """Append one message. Raises OutputError if the message is too long or the disk refuses."""
         if self._broken is not None:
             raise OutputError(f"cannot write the journal: {self._broken.strerror}", where=str(self.file))
         content = encode(message)
@@ -86,21 +83,20 @@ class Journal:
         self._append(_HEAD.pack(len(content), zlib.crc32(content)) + content)
 
     def close(self) -> None:
-        """All of it to the disk; nothing is written any more. OutputError where the disk refuses."""
+        """Sync the journal to the disk and close it. Raises OutputError if the disk refuses."""
         if self._stream < 0:
             return
         self._closed.set()
         self._syncing.join()
         stream, self._stream = self._stream, -1
         try:
-            os.fsync(stream)
-        except OSError as error:
-            raise OutputError(f"cannot write the end of the journal: {error.strerror}", where=str(self.file)) from error
+            with _refusals("write the end of the journal", self.file):
+                os.fsync(stream)
         finally:
             os.close(stream)
 
     def _sync(self) -> None:
-        """In a thread of its own: a disk takes milliseconds for it, a slow one far more, and no message is to wait."""
+        """Sync in a thread of its own, so that no message waits for the disk."""
         synced = 0
         while not self._closed.wait(_SYNC_EVERY):
             end = self._end
@@ -119,49 +115,55 @@ class Journal:
                 done += os.write(self._stream, data[done:])
         except OSError as error:
             try:
-                os.ftruncate(self._stream, self._end)  # no half record between whole ones
+                os.ftruncate(self._stream, self._end)  # Remove the incomplete record, so that later records stay readable.
                 os.lseek(self._stream, 0, os.SEEK_END)
-            except OSError as worse:  # nothing that came after it could be read
+            except OSError as worse:
                 self._broken = worse
             raise OutputError(f"cannot write the journal: {error.strerror}", where=str(self.file)) from error
         self._end += len(data)
 
 
 def set_aside(file: Path) -> Path | None:
-    """Rename a journal that holds anything to NAME.1.objslam or the next free number; what it is called now, else None.
+    """Rename a journal with messages to NAME.1.objslam, or to the next free number, and return the new path.
 
-    OutputError where a session writes it, it is another kind of file, or the disk refuses.
+    Returns None if there is no journal, or none with messages.
+    Raises OutputError if another session writes the journal, the file is no journal, or the disk refuses.
     """
-    try:
+    with _refusals("set the journal aside", file):
         if not file.is_file():
             return None
         with file.open("rb") as stream:
             if not MAGIC.startswith(stream.read(len(MAGIC))):
-                raise OutputError("this is no journal, and stands where one goes", where=str(file), hint="move it away")
+                raise OutputError("this file is not a journal", where=str(file), hint="move it out of the way")
             if file.stat().st_size <= len(MAGIC):
                 return None
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OutputError("another session writes this journal", where=str(file)) from error
             others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
             return file.rename(next(other for other in others if not other.exists()))
-    except BlockingIOError as error:
-        raise OutputError("another session writes this journal", where=str(file)) from error
-    except OSError as error:
-        raise OutputError(f"cannot set the journal aside: {error.strerror}", where=str(file)) from error
 
 
 def put_back(aside: Path, file: Path) -> bool:
-    """A journal that was set aside, where it was, if the session that took its place never kept anything; whether it is."""
-    try:
+    """Rename a journal from `set_aside` back, unless the new journal has messages. Returns whether it was renamed."""
+    with _refusals(f"put {aside} back", file):
         if file.is_file() and file.stat().st_size > len(MAGIC):
             return False
         aside.replace(file)
-    except OSError as error:
-        raise OutputError(f"cannot put {aside} back: {error.strerror}", where=str(file)) from error
     return True
 
 
+@contextmanager
+def _refusals(action: str, file: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot {action}: {error.strerror}", where=str(file)) from error
+
+
 def is_journal(path: Path) -> bool:
-    """Whether this is a journal, or a folder with one."""
+    """Return whether a path is a journal or a folder with a journal."""
     file = _file(path)
     if not file.is_file():
         return False
@@ -170,15 +172,15 @@ def is_journal(path: Path) -> bool:
 
 
 def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
-    """The messages of a journal in their order. A torn end is dropped and counted; LogError where it is no journal."""
+    """Read the messages of a journal in order. A torn end is dropped and counted. Raises LogError if it is no journal."""
     file = _file(path)
     if not is_journal(path):
-        raise LogError("no journal", where=str(path))
+        raise LogError("this is no journal", where=str(path))
     with file.open("rb") as stream:
         for content in _records(stream):
             try:
                 yield decode(content)
-            except LogError as error:  # whole by its checksum: another version of objslam wrote it
+            except LogError as error:  # The checksum is right, so another version of objslam wrote the record.
                 ledger.drop(error.message, where=f"{file}:{stream.tell()}")
         rest = file.stat().st_size - stream.tell()
     if rest:
@@ -186,7 +188,7 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
 
 
 def read_journal(path: Path, ledger: Ledger) -> Log:
-    """The log that a journal holds: what the session accepted, on its clock. LogError where it holds no frames."""
+    """Read a journal as a log, with stamps on the session's clock. Raises LogError if the journal holds no frames."""
     poses: dict[str, list[PoseMessage]] = {"odometry": [], "localization": []}
     cameras: dict[str, Camera] = {}
     frames: dict[str, list[FrameMessage]] = {}
@@ -215,10 +217,7 @@ def _file(path: Path) -> Path:
 
 
 def _records(stream: BinaryIO) -> Iterator[bytes]:
-    """The contents of the records before the first torn one.
-
-    Afterwards the stream is at the start of the torn record, or at the end of the file if no record is torn.
-    """
+    """Yield the content of each record. Stops with the stream at the start of the first torn record or the file's end."""
     stream.seek(len(MAGIC))
     while True:
         start = stream.tell()
@@ -233,17 +232,12 @@ def _records(stream: BinaryIO) -> Iterator[bytes]:
         return
 
 
-def _sound_end(file: Path) -> int:
-    """The byte position after the last complete record before any torn one; 0 for an empty file.
-
-    OutputError when the file is not a journal.
-    """
-    size = file.stat().st_size
-    if size == 0:
+def _end_of_records(file: Path) -> int:
+    if file.stat().st_size == 0:
         return 0
+    if not is_journal(file):
+        raise OutputError("cannot resume: this file is no journal", where=str(file), hint="leave out --resume")
     with file.open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            raise OutputError("there is no journal to go on with", where=str(file))
         for _ in _records(stream):
             pass
         return stream.tell()

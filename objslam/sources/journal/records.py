@@ -1,6 +1,4 @@
-"""What a session takes in, one dataclass a message, and each as bytes for the journal."""
-
-from __future__ import annotations
+"""The messages that a live session accepts, and their encoding as bytes for the journal."""
 
 import json
 import struct
@@ -16,8 +14,8 @@ from objslam.errors import LogError
 
 PathKind = Literal["odometry", "localization"]
 
-_POSE = struct.Struct("<c13d")  # A pose: its kind, stamp, and upper three rows.
-_MOUNT = struct.Struct("<cd12dH")  # A mount: its kind, stamp, upper three rows, and the length of its camera's name.
+_POSE = struct.Struct("<c13d")  # The layout of a pose: its kind, its stamp and its upper three rows.
+_MOUNT = struct.Struct("<cd12dH")  # The layout of a mount: as a pose, then the length of the camera's name.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
@@ -25,7 +23,7 @@ _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
 
 @dataclass(frozen=True)
 class PoseMessage:
-    """odom_T_base or map_T_base (4, 4) at a stamp, s."""
+    """A pose of the robot at a stamp (s): odom_T_base or map_T_base (4, 4), by the kind of path."""
 
     path: PathKind
     stamp: float
@@ -34,7 +32,7 @@ class PoseMessage:
 
 @dataclass(frozen=True)
 class MountMessage:
-    """base_T_camera (4, 4) of a camera from a stamp, s, on."""
+    """base_T_camera (4, 4) of a camera, valid from a stamp (s) on."""
 
     stamp: float
     camera: str
@@ -42,7 +40,7 @@ class MountMessage:
 
 
 class HeldMounts:
-    """The mounts of one camera, each of which holds until the next; only the newest are kept where `most` says how many."""
+    """The mounts of one camera. Each mount holds until the next. most: how many of the newest are kept. None keeps all."""
 
     def __init__(self, most: int | None = None) -> None:
         self._most = most
@@ -50,7 +48,7 @@ class HeldMounts:
         self._poses: list[Floats] = []
 
     def add(self, message: MountMessage) -> None:
-        """Add a mount; of several with one stamp the last added holds."""
+        """Add a mount. It replaces an earlier mount with the same stamp."""
         at = bisect_right(self._stamps, message.stamp)
         self._stamps.insert(at, message.stamp)
         self._poses.insert(at, message.pose)
@@ -58,21 +56,21 @@ class HeldMounts:
             del self._stamps[0], self._poses[0]
 
     def at(self, stamp: float, camera: Camera) -> Floats:
-        """base_T_camera (4, 4) at a stamp, s: the last mount by then, before the first that of the camera itself."""
+        """Return base_T_camera (4, 4) at a stamp (s). Before the first mount, this is the camera's own base_T_camera."""
         at = bisect_right(self._stamps, stamp)
         return self._poses[at - 1] if at else camera.base_T_camera
 
 
 @dataclass(frozen=True)
 class CameraMessage:
-    """A camera that is known from now on."""
+    """A new camera, or a new calibration of a known camera."""
 
     camera: Camera
 
 
 @dataclass(frozen=True)
 class FrameMessage:
-    """The boxes of one image, as `types.Detections` has them: boxes (B, 4), labels B, scores, depths, track_ids (B,)."""
+    """The B boxes of one image: boxes (B, 4) and scores, depths and track_ids (B,), each as in `types.Detections`."""
 
     stamp: float
     camera: str
@@ -89,7 +87,7 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """What a session has to remember besides: {"clock": s added to stamps, "odometry": start_T_odom as 16 numbers}."""
+    """The offsets of a session. clock: the seconds added to all stamps. odometry: start_T_odom (4, 4)."""
 
     clock: float
     odometry: Floats
@@ -99,7 +97,7 @@ Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessag
 
 
 def encode(message: Message) -> bytes:
-    """The message as bytes; `decode` gives back the same to the last bit."""
+    """Encode a message. `decode` returns the same message, bit for bit."""
     if isinstance(message, PoseMessage):
         return _POSE.pack(_KINDS[message.path], message.stamp, *message.pose[:3].ravel().tolist())
     if isinstance(message, MountMessage):
@@ -112,13 +110,13 @@ def encode(message: Message) -> bytes:
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
         return _CAMERA_KIND + json.dumps([*data, c.base_T_camera.ravel().tolist(), c.depth_scale, c.sees_size]).encode()
     known = np.where(np.isfinite(message.depths), message.depths, -1.0)
-    columns = (message.boxes, list(message.labels), message.scores, known, message.track_ids)
-    lists = [c if isinstance(c, list) else c.tolist() for c in columns]
-    return _FRAME_KIND + json.dumps([message.stamp, message.camera, *lists, *[True] * message.whole]).encode()
+    numbers = [column.tolist() for column in (message.scores, known, message.track_ids)]
+    row = [message.stamp, message.camera, message.boxes.tolist(), message.labels, *numbers, *[True] * message.whole]
+    return _FRAME_KIND + json.dumps(row).encode()
 
 
 def decode(data: bytes) -> Message:
-    """The message that bytes hold; LogError where they hold none."""
+    """Decode a message. Raises LogError if the bytes are no message."""
     kind = data[:1]
     try:
         if kind in _PATHS:
@@ -128,7 +126,7 @@ def decode(data: bytes) -> Message:
             _, stamp, *rows, length = _MOUNT.unpack_from(data)
             name = data[_MOUNT.size :]
             if len(name) != length:
-                raise ValueError("a name of another length")
+                raise ValueError("the camera's name has another length")
             return MountMessage(stamp, name.decode(), _pose(rows))
         if kind == _NOTE_KIND:
             clock, odometry = json.loads(data[1:])
@@ -136,12 +134,12 @@ def decode(data: bytes) -> Message:
         if kind == _CAMERA_KIND:
             name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
             lens = (_array(matrix, (3, 3)), model, _array(distortion, (-1,)))
-            sees_size = bool(more[0]) if more else True  # older journals do not say
+            sees_size = bool(more[0]) if more else True  # Older journals do not store the flag.
             return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale, sees_size))
         if kind == _FRAME_KIND:
             stamp, camera, boxes, labels, scores, depths, tracks, *whole = json.loads(data[1:])
             if whole not in ([], [True]):
-                raise ValueError("a frame with more than a frame has")
+                raise ValueError("the frame has too many fields")
             known = _array(depths, (len(labels),))
             return FrameMessage(
                 float(stamp),
@@ -154,8 +152,8 @@ def decode(data: bytes) -> Message:
                 bool(whole),
             )
     except (ValueError, TypeError, struct.error) as error:
-        raise LogError(f"a record that cannot be read: {error}") from error
-    raise LogError(f"a record of an unknown kind {kind!r}")
+        raise LogError(f"journal record that cannot be read: {error}") from error
+    raise LogError(f"journal record of an unknown kind {kind!r}")
 
 
 def _pose(rows: list[float]) -> Floats:
@@ -165,5 +163,5 @@ def _pose(rows: list[float]) -> Floats:
 def _array(values: list[float], shape: tuple[int, ...]) -> Floats:
     array = np.array(values, dtype=np.float64).reshape(shape)
     if not np.isfinite(array).all():
-        raise ValueError("a number that is not finite")
+        raise ValueError("a number is not finite")
     return array

@@ -1,9 +1,4 @@
-"""UTIAS MRCLAM: the options that such a folder takes.
-
-How the folder is read is in `reader`, which is imported when a folder is read.
-"""
-
-from __future__ import annotations
+"""The options of UTIAS MRCLAM datasets. The folders are read in `reader`, which `--help` does not import."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,7 +8,7 @@ from objslam.sources.options import Option, WithRange
 
 @dataclass(frozen=True)
 class MrclamOptions:
-    """What the folder does not say: the robot, whether its ranges are used, and whether landmarks hide who they are."""
+    """Choices that the folder leaves open: the robot, the use of ranges, and whether all landmarks share one label."""
 
     robot: Annotated[int | None, Option("--robot", "MRCLAM: which robot.")] = None
     with_range: WithRange = True

@@ -1,10 +1,8 @@
-"""UTIAS MRCLAM: a robot with wheel odometry and a camera that measures range and bearing to barcode landmarks.
+"""Read UTIAS MRCLAM datasets: wheel odometry, and the range and bearing from a camera to landmarks with barcodes.
 
-Leung, Halpern, Barfoot, Liu: The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011. The
-bearings become pixels of a virtual pinhole camera that stands in the origin of base and looks forward.
+Source: Leung, Halpern, Barfoot, Liu, The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011.
+The reader converts bearings into pixels of a virtual pinhole camera in the origin of base that looks forward.
 """
-
-from __future__ import annotations
 
 import re
 from pathlib import Path
@@ -20,25 +18,26 @@ from objslam.errors import LogError
 from objslam.io.text import Table, count_drops, in_order, read_table, reading, select
 from objslam.sources.mrclam import MrclamOptions
 
-ROBOTS = range(1, 6)  # the subjects that are robots, as the dataset numbers them
-LANDMARKS = range(6, 21)  # the subjects that are landmarks
-_SUBJECTS = range(ROBOTS.start, LANDMARKS.stop)  # all that bear a barcode
-
-_FOCAL = 380.0  # px, of the virtual camera: the default pixel noise of 3 px is then 0.45 deg, as good as the bearings are
-_WIDTH, _HEIGHT = 640, 480  # px, of the virtual camera: it sees +-40 deg, where the real one sees +-30 deg
-_HALF_BOX = 4.0  # px; barcodes have a bearing and no box, so half the side of one is chosen small
-_MARGIN = 6.0  # px; a bearing that is nearer to the edge of the image is dropped, for its box would count as cut off
+ROBOTS, LANDMARKS = range(1, 6), range(6, 21)
+"""The dataset's numbers of the subjects that are robots, and of the subjects that are landmarks."""
+_FOCAL = 380.0
+"""The focal length of the virtual camera, px. With it, the default noise of 3 px is the bearings' noise of 0.45 degrees."""
+_WIDTH, _HEIGHT = 640, 480
+"""The image size of the virtual camera, px. It sees +-40 degrees, more than the +-30 degrees of the real camera."""
+_MATRIX = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 _FORWARD = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-"""base_T_camera: the camera stands in the origin of base and looks along its x axis."""
+"""base_T_camera of the virtual camera. The camera is in the origin of base and looks along base x."""
+_HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes. The value is chosen small.
+_MARGIN = 6.0  # The least distance of a bearing from the image's edge, px. Nearer boxes would count as cut off.
 
 
 def is_mrclam(path: Path) -> bool:
-    """Whether the folder is one of the MRCLAM datasets."""
+    """Return whether the folder is an MRCLAM dataset."""
     return _find(path, "Barcodes") is not None and bool(robots(path))
 
 
 def robots(folder: Path) -> tuple[int, ...]:
-    """The robots that the folder has odometry of."""
+    """Return the numbers of the robots with odometry in the folder."""
     found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat(\.gz)?", file.name) for file in folder.glob("Robot*_Odometry.dat*"))
     return tuple(sorted({int(match[1]) for match in found if match}))
 
@@ -46,31 +45,35 @@ def robots(folder: Path) -> tuple[int, ...]:
 def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
     """Read one robot of an MRCLAM folder (files .dat or .dat.gz).
 
-    Odometry starts at the identity; each velocity holds until the next. Each stamp of the measurements is a frame, also
-    where only other robots were seen. Depths are range * cos(bearing). Labels are landmark_<subject>, or "landmark" for all.
-    Truth: landmark positions (z = 0), the robot's path. Sightings of other robots and of unknown barcodes are dropped and
-    counted. LogError where a file cannot be used or the robot is not there.
+    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement is a frame, even if its only
+    measurements are of other robots. Depths are range * cos(bearing). Labels are landmark_<subject>, or "landmark" for all.
+    The ground truth holds the landmark positions (z = 0) and the robot's path.
+    Measurements of other robots and of unknown barcodes are dropped and counted.
+    Raises LogError if a file is unusable or the folder lacks the robot.
     """
     robot = options.robot
     with reading(folder):
-        if robot not in robots(folder):
-            there = ", ".join(map(str, robots(folder))) or "none"
+        if robot not in (found := robots(folder)):
             what = "no robot is chosen" if robot is None else f"there is no robot {robot}"
-            raise LogError(f"{what}, the folder has: {there}", where=str(folder), hint="--robot chooses one of them")
+            numbers = ", ".join(map(str, found)) or "none"
+            raise LogError(f"{what}, the folder has: {numbers}", where=str(folder), hint="choose a robot with --robot")
         prefix = f"Robot{robot}"
-        camera = Camera("camera", _WIDTH, _HEIGHT, _matrix(), base_T_camera=_FORWARD, sees_size=False)
+        detections = _read_measurements(folder, prefix, options, ledger)
+        _, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
+        stamps, velocities = table.values[:, 0], table.values[:, 1:]
+        camera = Camera("camera", _WIDTH, _HEIGHT, _MATRIX, base_T_camera=_FORWARD, sees_size=False)
         return Log(
             name=f"{folder.resolve().name}_robot{robot}",
-            cameras=(CameraLog(camera, _read_measurements(folder, prefix, options, ledger)),),
-            odometry=_read_odometry(folder, prefix, ledger),
+            cameras=(CameraLog(camera, detections),),
+            odometry=_trajectory(stamps, integrate(stamps, velocities)),
             truth=_read_truth(folder, prefix, options.anonymous, ledger),
         )
 
 
 def integrate(stamps: Floats, velocities: Floats) -> Floats:
-    """SE(2) poses (N, 3) x, y, yaw at stamps (N,), s, from the identity.
+    """Integrate velocities (N, 2), forward (m/s) and turn (rad/s), at stamps (N,), s, from the identity.
 
-    velocities: (N, 2) forward m/s and turn rad/s; each row holds until the next one, along an exact arc.
+    Each velocity holds until the next stamp, so the robot drives an exact arc. Returns (N, 3) x, y (m) and yaw (rad).
     """
     way, turn = (velocities[:-1] * np.diff(stamps)[:, None]).T
     half = turn / 2
@@ -81,12 +84,8 @@ def integrate(stamps: Floats, velocities: Floats) -> Floats:
 
 
 def bearing_to_pixel(bearing: Floats) -> Floats:
-    """The column (px) of the virtual camera where bearings (rad, positive to the left) are seen."""
+    """Return the columns (px) of bearings (rad, positive to the left) in the image of the virtual camera."""
     return _WIDTH / 2 - _FOCAL * np.tan(bearing)
-
-
-def _matrix() -> Floats:
-    return np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 
 
 def _find(folder: Path, name: str) -> Path | None:
@@ -101,27 +100,22 @@ def _read(folder: Path, name: str, columns: int, ledger: Ledger, what: str) -> t
 
 
 def _read_forward(folder: Path, name: str, columns: int, ledger: Ledger, what: str) -> tuple[Path, Table]:
-    """A table whose first column, the stamp, never goes back; it may repeat."""
+    """Read a table, and drop the lines whose stamp (the first column) goes back. Stamps may repeat."""
     path, table = _read(folder, name, columns, ledger, what)
     forward = in_order(table.values[:, 0], repeats=True)
     return path, select(table, forward, f"{what} line with a stamp that goes back", path, ledger)
 
 
 def _trajectory(stamps: Floats, xy_yaw: Floats) -> Trajectory:
-    first = np.concatenate([[True], np.diff(stamps) > 0])  # a stamp that repeats is no motion: one pose is enough
+    first = np.concatenate([[True], np.diff(stamps) > 0])  # A Trajectory takes one pose for each stamp.
     return Trajectory(stamps[first], lift_se2(xy_yaw[first]))
-
-
-def _read_odometry(folder: Path, prefix: str, ledger: Ledger) -> Trajectory:
-    _, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
-    stamps = table.values[:, 0]
-    return _trajectory(stamps, integrate(stamps, table.values[:, 1:]))
 
 
 def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger: Ledger) -> Detections:
     _, barcodes = _read(folder, "Barcodes", 2, ledger, "barcode")
     path, table = _read_forward(folder, f"{prefix}_Measurement", 4, ledger, "measurement")
-    subject_of = {code: int(subject) for subject, code in barcodes.values.tolist() if subject in _SUBJECTS}
+    subjects = (*ROBOTS, *LANDMARKS)
+    subject_of = {code: int(subject) for subject, code in barcodes.values.tolist() if subject in subjects}
     stamps, codes, distance, bearing = table.values.T
     subject = np.array([subject_of.get(code, 0) for code in codes.tolist()], dtype=np.int64)
     frame_stamps, frame = np.unique(stamps, return_inverse=True)
@@ -130,7 +124,7 @@ def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger
     for fine, reason in (
         (subject != 0, "measurement of an unknown barcode"),
         (~np.isin(subject, ROBOTS), "measurement of another robot"),
-        (in_view, "measurement with a bearing out of the virtual camera's view"),
+        (in_view, "measurement with a bearing outside the virtual camera's view"),
     ):
         bad = good & ~fine
         count_drops(reason, int(bad.sum()), (f"{path}:{line}" for line in table.lines[bad]), ledger)
@@ -141,17 +135,10 @@ def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger
     count_drops("range that is not above zero (taken as unknown)", int(wrong.sum()), places, ledger)
     depths = np.where(wrong, np.nan, depths)
     label_names, label = label_table([_label(s, options.anonymous) for s in subject[good].tolist()])
-    column, row = bearing_to_pixel(bearing[good]), np.full(int(good.sum()), _HEIGHT / 2)
-    return Detections(
-        frame_stamps=frame_stamps,
-        frame=frame[good],
-        boxes=np.column_stack([column - _HALF_BOX, row - _HALF_BOX, column + _HALF_BOX, row + _HALF_BOX]),
-        label=label,
-        scores=np.ones(int(good.sum())),
-        depths=depths[good],
-        track_ids=np.full(int(good.sum()), -1),
-        label_names=label_names,
-    )
+    count = int(good.sum())
+    centre = np.column_stack([bearing_to_pixel(bearing[good]), np.full(count, _HEIGHT / 2)])
+    boxes, tracks = np.hstack([centre - _HALF_BOX, centre + _HALF_BOX]), np.full(count, -1)
+    return Detections(frame_stamps, frame[good], boxes, label, np.ones(count), depths[good], tracks, label_names)
 
 
 def _read_truth(folder: Path, prefix: str, anonymous: bool, ledger: Ledger) -> Truth | None:
@@ -159,7 +146,7 @@ def _read_truth(folder: Path, prefix: str, anonymous: bool, ledger: Ledger) -> T
     if _find(folder, "Landmark_Groundtruth"):
         file, table = _read(folder, "Landmark_Groundtruth", 5, ledger, "landmark")
         known = np.isin(table.values[:, 0], LANDMARKS)
-        table = select(table, known, "landmark line whose subject is no landmark", file, ledger)
+        table = select(table, known, "landmark line with a subject that is no landmark", file, ledger)
         positions = {int(subject): np.array([x, y, 0.0]) for subject, x, y, *_ in table.values.tolist()}
         objects = tuple(TruthObject(subject, _label(subject, anonymous), at) for subject, at in positions.items())
     path = None

@@ -1,4 +1,1 @@
-"""ROS 1 and ROS 2 bags, read without ROS, whole or damaged: which topics play which part, and the log that comes of it.
-
-Containers, messages and transforms themselves are in `ros`, which live robots share.
-"""
+"""Read ROS 1 and ROS 2 bags, including damaged ones, without a ROS installation. The formats themselves are in `ros`."""

@@ -1,6 +1,4 @@
-"""Which topics belong to one camera, and that camera's calibration and place on the robot."""
-
-from __future__ import annotations
+"""Find the topics of each camera, its calibration and its pose on the robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,13 +14,14 @@ from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import closeness, is_named, is_rectified
 from objslam.sources.ros_bag.survey import Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool
+from objslam.sources.ros_bag.trajectories import tf_path
 
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of one camera, and its optical frame.
+    """The topics of one camera, and the name of its optical frame.
 
-    calibration: where a file gives it. rectified: whether its boxes and images are those of the rectified image.
+    calibration: the calibration from a file, if any. rectified: whether boxes and images are of the rectified image.
     """
 
     name: str
@@ -34,20 +33,16 @@ class CameraTopics:
     calibration: Calibration | None
     rectified: bool
 
-    def roles(self) -> dict[str, Topic]:
-        """Its topics by their roles."""
-        topics = {"detections": self.detections, "image": self.image, "depth": self.depth, "camera_info": self.info}
-        return {role: topic for role, topic in topics.items() if topic is not None}
-
 
 def find_cameras(
     pool: TopicPool, tree: TfTree, calibrations: Sequence[Calibration], rectified: bool | None
 ) -> tuple[CameraTopics, ...]:
-    """The cameras of a recording with their topics.
+    """Find the cameras of a recording and their topics.
 
-    With calibrations from a file: these, each with the topics whose frame or name has its name as a part (a single one takes
-    what there is). Else a camera for each frame with detections; where there are none, for each with colour images and a
-    CameraInfo. Topics belong together that share the frame; of several, the nearest by name is taken, with a warning.
+    With calibrations from a file, each calibration is a camera. Its topics have the camera's name as a part of their name or
+    frame. A single calibration without such topics takes all topics. Without calibrations, each frame with detections is a
+    camera. Without detections, each frame with colour images and a CameraInfo is a camera. A camera's other topics share its
+    frame. If several topics fit a role, the one with the closest name is taken with a warning.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images
@@ -60,7 +55,7 @@ def find_cameras(
             pool.ledger.warn(f"the camera {name!r} has no topics: left out (--topic {name}.detections=/name, or image)")
         taken = {topic.name for topics in named.values() for topic in topics}
         for topic in (topic for topic in detections if topic.name not in taken):
-            pool.ledger.warn(f"{topic.name}: left out, no calibration of that name ({', '.join(named)})")
+            pool.ledger.warn(f"{topic.name}: left out, no calibration has a name that fits ({', '.join(named)})")
         cameras = []
         for calibration in calibrations:
             name = calibration.camera.name
@@ -72,16 +67,17 @@ def find_cameras(
         infos = pool.fitting("camera_info")
         seeds = [topic for topic in images if len(images) == 1 or any(info.frame == topic.frame for info in infos)]
     frames = list(dict.fromkeys(topic.frame for topic in seeds))
-    groups = zip(camera_names(frames), frames, strict=True)
-    alone = len(frames) == 1
     return tuple(
-        _gather(pool, tree, name, frame, [t for t in seeds if t.frame == frame], None, rectified, alone)
-        for name, frame in groups
+        _gather(pool, tree, name, frame, [t for t in seeds if t.frame == frame], None, rectified, len(frames) == 1)
+        for name, frame in zip(camera_names(frames), frames, strict=True)
     )
 
 
 def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) -> tuple[Camera, Trajectory | None]:
-    """The camera, and base_T_camera over time where it moves on the robot; LogError where either cannot be told."""
+    """Build a camera, and base_T_camera over time if the camera moves on the robot, else None.
+
+    Raises LogError if the calibration or the tf from base to the camera is missing.
+    """
     given = topics.calibration
     if given is not None and given.placed:
         return replace(given.camera, name=topics.name), None
@@ -89,20 +85,20 @@ def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) 
         camera, correction = replace(given.camera, name=topics.name), given.camera.base_T_camera
     elif topics.info is not None:
         if len(topics.info.infos) > 1:
-            ledger.warn(f"{topics.info.name}: the calibration changes on the way, the first is taken")
+            ledger.warn(f"{topics.info.name}: the calibration changes during the recording, the first one is used")
         info = next(iter(topics.info.infos.values()))
         camera, correction = camera_of(info, topics.name, topics.info.name, topics.rectified)
     else:
-        hint = "--topic camera_info=/name, or --camera-info FILE"
-        raise LogError(f"no CameraInfo belongs to it (frame {topics.frame!r})", where=f"camera {topics.name}", hint=hint)
+        hint = "give --topic camera_info=/name, or --camera-info FILE"
+        what = f"no CameraInfo belongs to this camera (frame {topics.frame!r})"
+        raise LogError(what, where=f"camera {topics.name}", hint=hint)
     base_T_frame = tree.still(base, topics.frame)
     if base_T_frame is not None:
         return replace(camera, base_T_camera=base_T_frame @ correction), None
-    stamps = tree.stamps(base, topics.frame)
-    poses, known = tree.at(base, topics.frame, stamps)
-    if not known.any():
-        raise LogError(f"tf {base} -> {topics.frame} is never known as a whole", where=f"camera {topics.name}")
-    return camera, Trajectory(stamps[known], poses[known] @ correction)
+    stamps, poses = tf_path(tree, base, topics.frame)
+    if not len(stamps):
+        raise LogError(f"tf {base} -> {topics.frame} is incomplete at all stamps", where=f"camera {topics.name}")
+    return camera, Trajectory(stamps, poses @ correction)
 
 
 def _gather(
@@ -115,7 +111,7 @@ def _gather(
     rectified: bool | None,
     alone: bool,
 ) -> CameraTopics:
-    """All topics of one camera. A camera that is alone takes what a user chose, or what has no frame, whatever its own."""
+    """Find all topics of a camera. A single camera takes topics of any frame if the user chose them or it has no frame."""
 
     def mine(role: str) -> list[Topic]:
         rest = alone and (not frame or bool(pool.choices.of(role)))

@@ -1,6 +1,4 @@
-"""What is inside a recording, and what a run would make of it."""
-
-from __future__ import annotations
+"""A summary of a ROS bag for `objslam info`: its content, and the role of each topic in a run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,31 +15,31 @@ from objslam.ros.tf.tree import TfTree
 from objslam.sources.ros_bag.log import Assembly, assemble
 from objslam.sources.ros_bag.options import BagOptions
 from objslam.sources.ros_bag.survey import Topic
-from objslam.sources.summary import Timing, off_path, timing
+from objslam.sources.summary import FIND_BOXES, Timing, off_path, timing
 
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """One topic.
+    """One topic of a bag.
 
-    messages: all of them. timing: of those that can be used, by the header's stamps where the type matters to objslam, else
-    by the times of recording. role: what a run would use it for, "" for nothing. frame: its frame_id. detail: what its
-    messages hold, in a few words. refused: why messages cannot be used, with their number.
+    messages: the number of messages. timing: the timing of the usable messages by their header stamps. Topics that objslam
+    does not use are timed by when they were recorded. role: the role in a run, "" for none. frame: the frame_id.
+    detail: a short description of the messages. refused: the reasons why messages are unusable, with counts.
     """
 
     name: str
     type: str
     messages: int
     timing: Timing
-    role: str = ""
-    frame: str = ""
-    detail: str = ""
-    refused: tuple[str, ...] = ()
+    role: str
+    frame: str
+    detail: str
+    refused: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """An optical frame and the frames on the way to it; base_T_frame (4, 4), None where it moves on the robot."""
+    """An optical frame. chain: the tf frames from base to it. base_T_frame: (4, 4), None if the frame moves on the robot."""
 
     frame: str
     chain: tuple[str, ...]
@@ -50,11 +48,12 @@ class CameraPlace:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """A recording at a glance.
+    """The summary of a bag.
 
-    start, end: s, of the times of recording. messages: read, and lost where that is known. base, odometry, localization:
-    the base frame and where the robot's path comes from, "" if it is missing. places: every optical frame that tf connects
-    to base. missing: what a run needs and does not find. damage, warnings: as a run would give them.
+    start, end: the first and last time of recording, s. messages, lost: the numbers of messages that were read and lost.
+    base: the base frame. odometry, localization: the sources of the robot's path, "" for none. places: the optical frames
+    that tf connects to base. missing: one line for each thing that a run needs but the bag lacks.
+    damage, warnings: the lines that a run would report.
     """
 
     name: str
@@ -74,22 +73,14 @@ class BagInfo:
     damage: tuple[str, ...]
     warnings: tuple[str, ...]
 
-    @property
-    def duration(self) -> float:
-        """s, between the first and the last message."""
-        return self.end - self.start
-
 
 def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) -> BagInfo:
-    """What a recording holds, which role each topic would get in a run, and what is missing for one.
-
-    LogError where there is nothing to read; ConfigError for options that do not fit.
-    """
+    """Summarise a bag. Raises LogError if no file can be read, and ConfigError for options that do not fit the bag."""
     options = options or BagOptions()
     ledger = Ledger()
     assembly = assemble(paths, ledger, options)
-    survey, found = assembly.survey, assembly.paths
-    roles = _roles(assembly)
+    survey, found, roles = assembly.survey, assembly.paths, _roles(assembly)
+    base = found.base if found else options.base_frame or ""
     logged = [np.frombuffer(topic.logged, dtype=np.int64) for topic in survey.topics.values()]
     return BagInfo(
         name=survey.recording.name,
@@ -104,9 +95,9 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
         odometry=found.odometry_from if found else "",
         localization=found.localization_from if found else "",
         cameras=tuple(camera for _, camera, _ in assembly.cameras),
-        places=_places(assembly.tree, found.base if found else options.base_frame or ""),
+        places=_places(assembly.tree, base),
         missing=_missing(assembly),
-        damage=tuple(line for report in survey.reports for line in report.lines()),
+        damage=survey.damage(),
         warnings=tuple(ledger.lines()),
     )
 
@@ -118,7 +109,7 @@ def _missing(assembly: Assembly) -> tuple[str, ...]:
     for topics, camera, _ in assembly.cameras:
         where, frames = f"camera {camera.name}", topics.detections or topics.image
         if topics.detections is None:
-            missing.append(f"{where}: no detections; run a detector on its images (--detector)")
+            missing.append(f"{where}: no detections; {FIND_BOXES}")
         if frames is not None:
             missing += off_path(where, frames.times() / 1e9, path)
     return tuple(missing)
@@ -132,23 +123,18 @@ def _roles(assembly: Assembly) -> dict[str, str]:
     if assembly.paths is not None:
         roles.update(assembly.paths.roles)
     for topics in assembly.cast:
-        for role, topic in topics.roles().items():
-            roles[topic.name] = f"{topics.name}.{role}" if len(assembly.cast) > 1 else role
+        prefix = f"{topics.name}." if len(assembly.cast) > 1 else ""
+        for role in ("detections", "image", "depth", "camera_info"):
+            if topic := getattr(topics, role.removeprefix("camera_")):
+                roles[topic.name] = prefix + role
     return roles
 
 
 def _topic_info(topic: Topic, role: str) -> TopicInfo:
     stamps = topic.times() if topic.stamps else np.frombuffer(topic.logged, dtype=np.int64)
-    return TopicInfo(
-        name=topic.name,
-        type=topic.type,
-        messages=len(topic.logged),
-        timing=timing(stamps / 1e9),
-        role=role,
-        frame=topic.frame,
-        detail=_detail(topic),
-        refused=tuple(f"{count} {reason}" for reason, count in topic.refused.items()),
-    )
+    refused = tuple(f"{count} {reason}" for reason, count in topic.refused.items())
+    when, detail = timing(stamps / 1e9), _detail(topic)
+    return TopicInfo(topic.name, topic.type, len(topic.logged), when, role, topic.frame, detail, refused)
 
 
 def _detail(topic: Topic) -> str:
@@ -167,9 +153,9 @@ def _detail(topic: Topic) -> str:
 
 def _places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
     places = []
-    for frame in sorted(frame for frame in tree.frames if frame.endswith("optical_frame") or frame.endswith("optical")):
+    for frame in sorted(frame for frame in tree.frames if frame.endswith(("optical_frame", "optical"))):
         try:
             places.append(CameraPlace(frame, tree.chain(base, frame), tree.still(base, frame)))
-        except LogError:  # not of this robot, as far as tf tells; a camera that needs it says so in `missing`
+        except LogError:  # tf does not connect the frame to base. If a camera needs the frame, `missing` has a line.
             continue
     return tuple(places)

@@ -1,43 +1,47 @@
-"""ROS bags read into a log."""
+"""Read ROS bags into a log."""
 
-from __future__ import annotations
-
+import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory
+from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
-from objslam.io.camera_yaml import Calibration, read_calibrations
-from objslam.ros.bag.recording import find_recording
+from objslam.io.camera_yaml import read_calibrations
+from objslam.io.text import count_drops, in_order
+from objslam.ros.bag.recording import Recording, find_recording, read_messages
+from objslam.ros.bag.records import Connection, FileReport
+from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
 from objslam.ros.messages.detections import boxes_of_points
-from objslam.ros.messages.images import DEPTH_SCALE
+from objslam.ros.messages.images import DEPTH_SCALE, image_file
 from objslam.ros.messages.topic_types import is_tags
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
 from objslam.sources.ros_bag.cameras import CameraTopics, build_camera, find_cameras
-from objslam.sources.ros_bag.images import extract_images
 from objslam.sources.ros_bag.options import BagOptions
-from objslam.sources.ros_bag.survey import Survey, Topic, take_survey
+from objslam.sources.ros_bag.survey import Survey, take_survey
 from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
 _KEPT: list[tempfile.TemporaryDirectory[str]] = []
-"""Folders of images that nobody named a place for: removed when the program ends."""
+"""The folders of images from bags that were read without `extract`. They are removed when the program ends."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A recording with all roles cast.
+    """A recording whose topics have their roles.
 
-    cast: the topics of every camera. cameras: those that could be put together as (topics, camera, mount). problems: why a
-    run cannot be; left_out: why some of the cameras are not in it.
+    cast: the topics of every camera. cameras: (topics, camera, mount) of each usable camera. problems: the errors that make
+    a run impossible. left_out: the errors of the unusable cameras.
     """
 
     survey: Survey
@@ -50,23 +54,26 @@ class Assembly:
 
 
 def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions | None = None) -> Log:
-    """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP; file or folder), or several files of one recording.
+    """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
 
-    The recording is read once for everything but images, and a second time for those. Stamps are those of the headers.
-    Damaged files are read as far as they can be, with what is lost in the ledger; they are never changed. LogError where
-    a path of the robot or every camera is missing, with what was found; ConfigError for options that do not fit.
+    The first pass reads all messages but images, the second pass the images. Stamps come from the message headers.
+    Damaged files are read as far as possible and never changed. The ledger counts the lost messages.
+    Raises LogError if the robot's path or every camera is missing, and ConfigError for options that do not fit the bag.
     """
     options = options or BagOptions()
     assembly = assemble(paths, ledger, options)
-    report_damage(assembly.survey, ledger)
+    for report in assembly.survey.reports:
+        ledger.drop("message lost in a damaged bag", report.lost, report.file)
+        for line in report.lines():
+            ledger.warn(line)
     if assembly.problems:
         first = assembly.problems[0]
-        damage = [line for report in assembly.survey.reports for line in report.lines()]
-        raise LogError(first.message, where=first.where, hint="; ".join(filter(None, [first.hint, *damage])))
+        hint = "; ".join(filter(None, [first.hint, *assembly.survey.damage()]))
+        raise LogError(first.message, where=first.where, hint=hint)
     for error in assembly.left_out:
         ledger.warn(f"{error}: left out")
     images = _extract(assembly, options, ledger) if options.with_images else {}
-    assert assembly.paths is not None  # its absence is a problem
+    assert assembly.paths is not None  # Without a path, `problems` is not empty.
     return Log(
         name=assembly.survey.recording.name,
         cameras=tuple(_camera_log(*camera, images, options, ledger) for camera in assembly.cameras),
@@ -76,13 +83,10 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
 
 
 def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) -> Assembly:
-    """Read all but the images of a recording and cast the roles; LogError where no file of it can be read."""
-    calibrations: tuple[Calibration, ...] = ()
-    if options.camera_info is not None:
-        calibrations = read_calibrations(options.camera_info, ledger)
+    """Read a recording without its images, and give topics their roles. Raises LogError if no file can be read."""
+    calibrations = () if options.camera_info is None else read_calibrations(options.camera_info, ledger)
     choices = parse_topics(options.topics)
-    recording = find_recording(paths, ledger)
-    survey = take_survey(recording, label=options.label or "")
+    survey = take_survey(find_recording(paths, ledger), options.label or "")
     check_choices(choices, survey)
     for topic in survey.topics.values():
         for reason, count in topic.refused.items():
@@ -90,11 +94,12 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
     tree, pool = TfTree(survey.tf, ledger), TopicPool(survey, choices, ledger)
     problems: list[LogError] = []
     found: Paths | None = None
+    base = options.base_frame or ""
     try:
         found = read_paths(pool, tree, options.base_frame)
+        base = found.base
     except LogError as error:
         problems.append(error)
-    base = found.base if found is not None else options.base_frame or ""
     cameras, refused = [], []
     cast = find_cameras(pool, tree, calibrations, options.rectified)
     for topics in cast:
@@ -102,46 +107,29 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
             cameras.append((topics, *build_camera(topics, tree, base, ledger)))
         except LogError as error:
             refused.append(error)
+    if not cameras and not refused:
+        images = any(topic.type.endswith(("/Image", "/CompressedImage")) for topic in survey.topics.values())
+        what = "images, but none with a CameraInfo" if images else "no images and no detections"
+        hint = "record Detection2DArray or AprilTag detections, or images with CameraInfo (or give --camera-info FILE)"
+        problems.append(LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint))
     if not cameras:
-        problems += refused or [_no_camera(survey)]
+        problems += refused
     return Assembly(survey, tree, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))
 
 
-def report_damage(survey: Survey, ledger: Ledger) -> None:
-    """Put what was lost of the files into the ledger."""
-    for report in survey.reports:
-        ledger.drop("message lost in a damaged bag", report.lost, report.file)
-        for line in report.lines():
-            ledger.warn(line)
-
-
-def _no_camera(survey: Survey) -> LogError:
-    types = {topic.type for topic in survey.topics.values()}
-    images = any(name.endswith(("/Image", "/CompressedImage")) for name in types)
-    what = "images, but none with a CameraInfo" if images else "no images and no detections"
-    hint = "vision_msgs/Detection2DArray, AprilTag detections, or images with CameraInfo (or --camera-info FILE) are needed"
-    return LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint)
-
-
 def _extract(assembly: Assembly, options: BagOptions, ledger: Ledger) -> dict[str, Images]:
-    wanted: dict[str, tuple[str, bool]] = {}
-    for topics, _, _ in assembly.cameras:
-        for topic, kind in ((topics.image, "rgb"), (topics.depth, "depth")):
-            if topic is not None:
-                wanted.setdefault(topic.name, (f"{_folder_name(topics.name)}/{kind}", kind == "depth"))
-    if not wanted:
+    if not any(topics.image or topics.depth for topics, _, _ in assembly.cameras):
         return {}
     folder = options.extract
     if folder is None:
         _KEPT.append(tempfile.TemporaryDirectory(prefix="objslam_images_"))
         folder = Path(_KEPT[-1].name)
-    return extract_images(
-        assembly.survey.recording, {name: (folder / place, depth) for name, (place, depth) in wanted.items()}, ledger
-    )
-
-
-def _folder_name(camera: str) -> str:
-    return "".join(c if c.isalnum() or c in "_-" else "_" for c in camera)
+    folders: dict[str, tuple[Path, bool]] = {}
+    for topics, _, _ in assembly.cameras:
+        for topic, kind in ((topics.image, "rgb"), (topics.depth, "depth")):
+            if topic is not None:
+                folders.setdefault(topic.name, (folder / re.sub(r"[^\w-]", "_", topics.name) / kind, kind == "depth"))
+    return extract_images(assembly.survey.recording, folders, ledger)
 
 
 def _camera_log(
@@ -153,18 +141,67 @@ def _camera_log(
     ledger: Ledger,
 ) -> CameraLog:
     camera = replace(camera, depth_scale=DEPTH_SCALE)
-    rgb = images.get(topics.image.name) if topics.image is not None else None
-    depth = images.get(topics.depth.name) if topics.depth is not None else None
-    detections = _detections(topics.detections, camera, ledger) if topics.detections is not None else None
+    rgb, depth = (images.get(shown.name) if shown else None for shown in (topics.image, topics.depth))
+    detections, topic = None, topics.detections
+    if topic is not None:
+        boxes = replace(topic.boxes, stamps=(topic.times() / 1e9).tolist(), boxes=list(topic.boxes.boxes))
+        if topic.points:
+            projected = boxes_of_points(camera, np.array(list(topic.points.values())))
+            for index, box in zip(topic.points, projected.tolist(), strict=True):
+                boxes.boxes[index] = box
+        detections = replace(boxes.checked(ledger), whole=is_tags(topic.type))
     if detections is not None and depth is not None and options.with_range:
         detections = depths_at_boxes(detections, depth, camera, ledger)
     return CameraLog(camera, detections, rgb, depth, mount)
 
 
-def _detections(topic: Topic, camera: Camera, ledger: Ledger) -> Detections:
-    boxes = replace(topic.boxes, stamps=(topic.times() / 1e9).tolist(), boxes=list(topic.boxes.boxes))
-    if topic.points:
-        projected = boxes_of_points(camera, np.array(list(topic.points.values())))
-        for index, box in zip(topic.points, projected.tolist(), strict=True):
-            boxes.boxes[index] = box
-    return replace(boxes.checked(ledger), whole=is_tags(topic.type))
+def extract_images(recording: Recording, folders: Mapping[str, tuple[Path, bool]], ledger: Ledger) -> dict[str, Images]:
+    """Write the images of topics into files, and return the written images by topic.
+
+    folders: the target folder of each topic, and whether the topic is depth. JPEG and PNG data is copied. Other images are
+    written as PNG. Depth is written as 16 bit PNG in `DEPTH_SCALE` units per metre, with 0 for unknown depth. The name of a
+    file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
+    Only one image is in memory at a time. Raises LogError if a file cannot be written.
+    """
+    written: dict[str, dict[int, Path]] = {topic: {} for topic in folders}
+    decoders: dict[int, tuple[Connection, Callable[[bytes], Any]]] = {}
+    reports: list[FileReport] = []
+    for folder, _ in folders.values():
+        with _writing("the folder for images cannot be made", folder):
+            folder.mkdir(parents=True, exist_ok=True)
+    for connection, logged, data in read_messages(recording, lambda connection: connection.topic in folders, reports):
+        folder, depth = folders[connection.topic]
+        place = f"{connection.topic} at {logged / 1e9:.3f} s"
+        try:
+            if id(connection) not in decoders:
+                decoders[id(connection)] = connection, make_decoder(connection)
+            stamp = read_head(data, connection.encoding)[0] or logged
+            if stamp in written[connection.topic]:
+                ledger.drop("image with a stamp that repeats", where=place)
+                continue
+            message = decoders[id(connection)][1](data)
+            content, ending = image_file(message, depth)
+        except DecodeError as error:
+            ledger.drop(f"image that cannot be decoded ({error})", where=place)
+            continue
+        path = folder / f"{stamp // 10**9}.{stamp % 10**9:09d}{ending}"
+        with _writing("an image cannot be written", path):
+            path.write_bytes(content)
+        written[connection.topic][stamp] = path
+    found = {}
+    for topic, paths in written.items():
+        seconds = np.array(list(paths), dtype=np.int64) / 1e9
+        forward = in_order(seconds)
+        late = (f"{topic} at {stamp:.3f} s" for stamp in seconds[~forward].tolist())
+        count_drops("image with a stamp that goes back", int((~forward).sum()), late, ledger)
+        if forward.any():
+            found[topic] = Images(seconds[forward], tuple(compress(paths.values(), forward)))
+    return found
+
+
+@contextmanager
+def _writing(what: str, path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise LogError(f"{what}: {error.strerror or error}", where=str(path)) from error

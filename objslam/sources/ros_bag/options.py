@@ -1,6 +1,4 @@
-"""What may be said of ROS messages, recorded or live, and of bags alone."""
-
-from __future__ import annotations
+"""The options of ROS messages, both recorded and live, and the options of bags."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ _BASE = "ROS bags, dds, rclpy: the frame that is the robot's base."
 
 @dataclass(frozen=True)
 class RosOptions:
-    """What ROS messages do not say themselves, be they in a bag or live."""
+    """The options of ROS messages, both in bags and live."""
 
     topics: Annotated[tuple[str, ...], Option("--topic", _TOPIC, metavar="ROLE=/NAME")] = ()
     camera_info: Annotated[Path | None, Option("--camera-info", _CALIBRATION)] = None
@@ -28,12 +26,10 @@ class RosOptions:
 
 @dataclass(frozen=True)
 class BagOptions(RosOptions):
-    """What a bag does not say itself.
+    """The options of bags.
 
-    Attributes:
-        extract: the folder that images go to; None: a temporary one, which is there until the program ends.
-        with_images: whether images are read at all.
-        with_range: whether depth images give the boxes their depth.
+    extract: the folder for the images. None makes a temporary folder that is removed when the program ends.
+    with_images: whether images are read. with_range: whether boxes get depths from the depth images.
     """
 
     extract: Path | None = None

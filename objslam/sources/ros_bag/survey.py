@@ -1,7 +1,7 @@
-"""One pass over a recording: the times of every topic, and the contents of the topics that objslam may use.
+"""Read a recording once, and keep the times of every topic and the messages that objslam may use.
 
-Poses, transforms, boxes and calibrations are small, so all of them are kept. Of images, the times are kept, and the first
-message of each topic.
+All poses, transforms, boxes and calibrations are kept, because they are small. For images, only the times and the first
+message of each topic are kept.
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODO
 from objslam.ros.tf.frames import MAX_TRANSFORMS
 from objslam.ros.tf.tree import TfRows
 
-_MAX_SMALL = 64 << 20  # The largest message of detections, bytes; chosen to bound the memory.
-_MAX_TOPICS = 10_000  # The most topics that are kept; chosen to bound the memory.
+_MAX_SMALL = 64 << 20  # The largest message of detections, bytes. The value is chosen to limit the memory.
+_MAX_TOPICS = 10_000  # The largest number of topics. The value is chosen to limit the memory.
 _Decoder = Callable[[bytes], Any]
 _Handler = Callable[[bytes, int], None]
 
 
 @dataclass
 class Topic:
-    """What one pass learned of a topic.
+    """The content of a topic.
 
-    logged: times of recording, ns. stamps: the header's, ns, for the types that matter. frames: frame_ids and how often, as
-    they came.
-    refused: why messages could not be used, and how many. poses: by (frame, child frame). boxes: with the tracker's names
-    and, by the index of the box, the points of tags that come without a box. infos: distinct CameraInfo messages. image:
-    the first message, decoded.
+    logged: the times of recording, ns. stamps: the header stamps, ns, of types that objslam uses. frames: the count of each
+    frame_id. refused: the count of unusable messages by reason. poses: the poses by (frame, child frame). tracks: the number
+    of each tracker id. points: the corner points of tags that come without a box, by the index of the box.
+    infos: the distinct CameraInfo messages. image: the first image, decoded.
     """
 
     connection: Connection
@@ -55,38 +54,42 @@ class Topic:
 
     @property
     def name(self) -> str:
-        """The topic's name."""
+        """The name of the topic."""
         return self.connection.topic
 
     @property
     def type(self) -> str:
-        """The type of its messages."""
+        """The type of the messages."""
         return self.connection.type
 
     @property
     def frame(self) -> str:
-        """The frame_id that most messages carry, without a leading slash; "" if none does."""
+        """The most frequent frame_id, without a leading slash. It is "" if no message has one."""
         return frame_name(max(self.frames, key=lambda frame: self.frames[frame], default=""))
 
     def times(self) -> Ints:
-        """(N,) ns: the header's stamps; the times of recording where there are none, or all are zero."""
+        """Return the header stamps (N,), ns, or the times of recording if all header stamps are missing or zero."""
         return choose_times(self.stamps, self.logged)
 
 
 @dataclass(frozen=True)
 class Survey:
-    """All topics of a recording by name, its transforms, and how the reading of each file went."""
+    """The topics of a recording by name, its transforms, and a report of the damage in each file."""
 
     recording: Recording
     topics: dict[str, Topic]
     tf: TfRows
     reports: tuple[FileReport, ...]
 
+    def damage(self) -> tuple[str, ...]:
+        """Return one line for each kind of damage in each file."""
+        return tuple(line for report in self.reports for line in report.lines())
 
-def take_survey(recording: Recording, *, label: str = "") -> Survey:
-    """Read a recording once. label: for boxes that come without a class.
 
-    LogError where no file of it can be read. What else cannot be read or used is counted in the reports and topics.
+def take_survey(recording: Recording, label: str) -> Survey:
+    """Read a recording once. `label` is the label of boxes without a class.
+
+    Damage is counted in the reports, and unusable messages in the topics. Raises LogError if no file can be read.
     """
     topics: dict[str, Topic] = {}
     tf = TfRows()
@@ -110,14 +113,13 @@ def take_survey(recording: Recording, *, label: str = "") -> Survey:
 
 
 def _make_handler(connection: Connection, topic: Topic, tf: TfRows, label: str) -> _Handler:
-    """What is done with each message of a connection."""
     kind = connection.type
     makers = {ODOMETRY: _add_pose, CAMERA_INFO: _add_info, IMAGE: _add_image, COMPRESSED: _add_image}
     makers |= dict.fromkeys(POSES, _add_pose)
     if not (kind in makers or kind in TRANSFORMS or is_boxes(kind)):
         return lambda data, logged: None
     if kind != topic.type:
-        return partial(_refuse, f"of type {kind}, the topic's first was {topic.type}")
+        return partial(_refuse, f"the type is {kind}, but the topic's first type is {topic.type}")
     try:
         decode = make_decoder(connection)
     except DecodeError as error:
@@ -160,7 +162,7 @@ def _add_transforms(connection: Connection, decode: _Decoder, tf: TfRows, data: 
 
 def _add_info(connection: Connection, topic: Topic, decode: _Decoder, data: bytes, logged: int) -> None:
     _note_header(connection, topic, data)
-    body = data[12:]  # all but the stamp: the calibration, and the frame it is for
+    body = data[12:]  # The message without its stamp: the frame and the calibration.
     if body not in topic.infos:
         info = decode(data)
         if len(topic.infos) < 2:
@@ -178,7 +180,7 @@ def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: st
     if number > MAX_BOXES:
         raise DecodeError(f"more than {MAX_BOXES} detections in one message")
     if len(data) > _MAX_SMALL:
-        raise DecodeError(f"a message of more than {_MAX_SMALL >> 20} MiB")
+        raise DecodeError(f"message larger than {_MAX_SMALL >> 20} MiB")
     try:
         found = list(find_boxes(connection.type, decode(data)))
     except WRONG_LAYOUT as error:

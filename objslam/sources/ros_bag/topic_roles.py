@@ -1,6 +1,4 @@
-"""Which topic of a recording plays which role, by type and content."""
-
-from __future__ import annotations
+"""Choose the topic for each role in a run, by type and content."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,11 +9,11 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, OD
 from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, Choices, warn_of_choice
 from objslam.sources.ros_bag.survey import Survey, Topic
 
-_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings that only depth images have; mono16 is one of grey images too.
+_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings that only depth images have. Grey images may have mono16 too.
 
 
 def check_choices(choices: Choices, survey: Survey) -> None:
-    """ConfigError where a topic that was chosen is not in a recording, or cannot play its role."""
+    """Raise ConfigError if a topic that the user chose is not in the recording, or does not fit its role."""
     for (camera, role), names in choices.names.items():
         for name in names:
             if name == NONE or (name == TF and role in FROM_TF):
@@ -30,19 +28,19 @@ def check_choices(choices: Choices, survey: Survey) -> None:
 
 @dataclass(frozen=True)
 class TopicPool:
-    """The topics of a recording, and what a user chose of them."""
+    """The topics of a recording, and the user's choices (`--topic`)."""
 
     survey: Survey
     choices: Choices
     ledger: Ledger
 
     def fitting(self, role: str) -> list[Topic]:
-        """The topics that may play a role, those that a user chose for any camera, else all."""
+        """Return the topics that fit a role. If the user chose topics for the role, the others are left out."""
         names = self.choices.of(role)
         return [topic for topic in candidates(self.survey, role) if not names or topic.name in names]
 
     def choose(self, role: str, fitting: Sequence[Topic], camera: str = "") -> Topic | None:
-        """The topic of a role: the one chosen for the camera, else the first that fits, with a warning if several do."""
+        """Return the user's choice for a role of a camera, else the first fitting topic. Warn if several topics fit."""
         names = self.choices.names.get((camera, role))
         if names:
             return None if names[0] in (NONE, TF) else self.survey.topics[names[0]]
@@ -53,15 +51,12 @@ class TopicPool:
 
 
 def candidates(survey: Survey, role: str) -> list[Topic]:
-    """The topics that may play a role, those with short names first: they have messages of a fitting type to show."""
+    """Return the topics with usable messages of a type that fits the role, in the order of the length of their names."""
     topics = sorted(survey.topics.values(), key=lambda topic: (len(topic.name), topic.name))
     return [topic for topic in topics if _fits(topic, role)]
 
 
-def is_depth(topic: Topic) -> bool:
-    """Whether an image topic carries depth."""
-    if topic.image is None:
-        return "depth" in topic.name.lower()
+def _is_depth(topic: Topic) -> bool:
     if topic.type == COMPRESSED:
         return "compresseddepth" in topic.image.format.replace(" ", "").lower()
     encoding = topic.image.encoding.lower()
@@ -77,4 +72,4 @@ def _fits(topic: Topic, role: str) -> bool:
         return is_boxes(topic.type) and bool(topic.boxes.stamps)
     if role == "camera_info":
         return topic.type == CAMERA_INFO and bool(topic.infos)
-    return topic.type in IMAGES and topic.image is not None and is_depth(topic) == (role == "depth")
+    return topic.type in IMAGES and topic.image is not None and _is_depth(topic) == (role == "depth")

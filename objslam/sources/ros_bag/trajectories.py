@@ -1,6 +1,4 @@
-"""The robot's path: odometry and localisation, out of topics and the tf tree."""
-
-from __future__ import annotations
+"""Read the robot's path, odometry and localisation, from topics and the tf tree."""
 
 from dataclasses import dataclass, field, replace
 
@@ -19,14 +17,15 @@ from objslam.sources.ros_bag.survey import Survey, Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _NOT_THE_ROBOT = ("goal", "target", "initial", "setpoint", "waypoint", "truth", "mocap", "vrpn", "vicon")
-"""Words in the names of pose topics that tell something other than where the robot takes itself to be."""
+"""Words in the names of pose topics that are not the robot's own estimate of its pose."""
 
 
 @dataclass(frozen=True)
 class Paths:
-    """odom_T_base and map_T_base, where each comes from, in words ("" if it is missing), and the frame that base is.
+    """The odometry odom_T_base and the localisation map_T_base. base: the name of the base frame.
 
-    roles: the role of each topic that was used.
+    odometry_from, localization_from: the source of each path for messages, "" if the path is missing.
+    roles: the role of each topic that is used.
     """
 
     base: str
@@ -39,7 +38,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class _Odometry:
-    """Odometry before it is decided what base is: poses of `child` in `frame`."""
+    """Poses (N, 4, 4) of the frame `child` in `frame` at stamps (N,), s."""
 
     frame: str
     child: str
@@ -49,12 +48,11 @@ class _Odometry:
 
 
 def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
-    """Odometry and localisation of the robot's base.
+    """Read the odometry and the localisation of the robot's base.
 
     Odometry is a nav_msgs/Odometry topic, else tf from odom to base. Localisation is tf from map to odom, composed with the
-    odometry at its stamps, else a topic of poses in map. A map that never moves against odom is no localisation: it only
-    renames the frame, and the odometry is given in it. LogError where frames that must be connected are not, or there is
-    neither of the two.
+    odometry at the odometry's stamps, else a topic of poses in map. If map never moves against odom, the odometry is given
+    in map and there is no localisation. Raises LogError if both are missing, or if tf does not connect a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]
@@ -63,7 +61,7 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(pool.survey)), "")
     base = find_base(tree.frames, base_frame, moved)
     if base_frame is None and moved not in ("", base):
-        ledger.warn(f"the path is that of {moved!r}, which is not in tf: {base!r} is taken to be the same")
+        ledger.warn(f"the path is that of {moved!r}, which is not in tf: {base!r} is taken as the same frame")
     if odometry is not None:
         odometry = _moved_to(base, odometry, tree, ledger)
     elif pool.choices.of("odometry") != [NONE]:
@@ -75,7 +73,7 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
         raise LogError(
             "there is neither odometry nor localisation",
             where=pool.survey.recording.name,
-            hint="a nav_msgs/Odometry topic, tf from odom or map to base, or poses in map are needed",
+            hint="record a nav_msgs/Odometry topic, tf from odom or map to base, or poses in map",
         )
     return paths
 
@@ -85,18 +83,17 @@ def _main_pair(topic: Topic) -> tuple[str, str]:
 
 
 def _from_topic(topic: Topic, what: str, ledger: Ledger) -> _Odometry:
-    """The poses of the pair of frames that most messages of the topic are in; the others are counted."""
+    """Read the poses of the most frequent pair of frames. Messages with other frames are dropped and counted."""
     pair = _main_pair(topic)
     for other, rows in topic.poses.items():
         if other != pair:
-            ledger.drop(f"{what} in other frames than most", len(rows), f"{topic.name}: {' -> '.join(other)}")
+            ledger.drop(f"{what} in other frames than most messages", len(rows), f"{topic.name}: {' -> '.join(other)}")
     stamps, poses = topic.poses[pair].checked(what, ledger)
     forward = in_order(stamps)
-    late = stamps[~forward].tolist()
-    places = (f"{topic.name} at {stamp:.3f} s" for stamp in late)
-    count_drops(f"{what} with a stamp that repeats or goes back", len(late), places, ledger)
+    places = [f"{topic.name} at {stamp:.3f} s" for stamp in stamps[~forward].tolist()]
+    count_drops(f"{what} with a stamp that repeats or goes back", len(places), places, ledger)
     if not forward.any():
-        raise LogError("no message of it has a usable pose", where=topic.name)
+        raise LogError("none of the topic's messages has a usable pose", where=topic.name)
     return _Odometry(*pair, stamps[forward], poses[forward], topic.name)
 
 
@@ -105,14 +102,13 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
     if child in ("", base):
         return odometry
     if child not in tree.frames or base not in tree.frames:
-        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: it is taken to be the same")
+        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: taken as the same frame")
         return odometry
     child_T_base, known = tree.at(child, base, odometry.stamps)
-    ledger.drop(f"odometry message at whose time tf {child} -> {base} is not known", int((~known).sum()))
+    ledger.drop(f"odometry message with a stamp at which tf {child} -> {base} is not known", int((~known).sum()))
     if not known.any():
-        raise LogError(f"tf {child} -> {base} is known at no time of the odometry", where=odometry.source)
-    moved = (odometry.poses @ child_T_base)[known]
-    return _Odometry(odometry.frame, base, odometry.stamps[known], moved, odometry.source)
+        raise LogError(f"tf {child} -> {base} is not known at any stamp of the odometry", where=odometry.source)
+    return replace(odometry, child=base, stamps=odometry.stamps[known], poses=(odometry.poses @ child_T_base)[known])
 
 
 def _odometry_from_tf(tree: TfTree, base: str) -> _Odometry | None:
@@ -121,20 +117,26 @@ def _odometry_from_tf(tree: TfTree, base: str) -> _Odometry | None:
     frame = find_odom(tree.above(base))
     if frame in ("", base) or tree.still(frame, base) is not None:
         return None
-    stamps = tree.stamps(frame, base)
-    poses, known = tree.at(frame, base, stamps)
-    return _Odometry(frame, base, stamps[known], poses[known], f"tf {frame} -> {base}") if known.any() else None
+    stamps, poses = tf_path(tree, frame, base)
+    return _Odometry(frame, base, stamps, poses, f"tf {frame} -> {base}") if len(stamps) else None
+
+
+def tf_path(tree: TfTree, frame: str, child: str) -> tuple[Floats, Floats]:
+    """Return the known poses (N, 4, 4) of a tf frame in another one, and their stamps (N,), s."""
+    stamps = tree.stamps(frame, child)
+    poses, known = tree.at(frame, child, stamps)
+    return stamps[known], poses[known]
 
 
 def _localized(pool: TopicPool, tree: TfTree, odometry: _Odometry | None, base: str) -> Paths:
-    """The paths, with the localisation that was chosen or that is there."""
+    """Add the localisation that the user chose, else the first available one, to the odometry."""
     chosen = pool.choices.of("localization")
     path, source = (None, "") if odometry is None else (Trajectory(odometry.stamps, odometry.poses), odometry.source)
     if chosen in ([], [TF]):
         found = _from_tf(tree, odometry, base)
         if found is not None:
             stamps, poses, name = found
-            if odometry is not None and len(stamps) == 0:  # map never moves against odom
+            if odometry is not None and len(stamps) == 0:  # The frame map never moves against odom.
                 return Paths(base, Trajectory(odometry.stamps, poses @ odometry.poses), None, f"{source}, in {name}")
             return Paths(base, path, Trajectory(stamps, poses), source, name)
     fitting = [] if chosen == [TF] else _pose_topics(pool.survey)
@@ -152,7 +154,7 @@ def _pose_topics(survey: Survey) -> list[Topic]:
 
 
 def _from_tf(tree: TfTree, odometry: _Odometry | None, base: str) -> tuple[Floats, Floats, str] | None:
-    """Stamps and map_T_base, and in words where from; no stamps and the constant map_T_odom where map does not move."""
+    """Return the stamps, map_T_base, and the source in words. If map does not move: no stamps, and the fixed map_T_odom."""
     frame = odometry.frame if odometry is not None and odometry.frame in tree.frames else base
     if frame not in tree.frames:
         return None
@@ -163,9 +165,8 @@ def _from_tf(tree: TfTree, odometry: _Odometry | None, base: str) -> tuple[Float
     if odometry is None or odometry.frame != frame:
         if still is not None:
             return None
-        stamps = tree.stamps(world, base)
-        poses, known = tree.at(world, base, stamps)
-        return (stamps[known], poses[known], f"tf {world} -> {base}") if known.any() else None
+        stamps, poses = tf_path(tree, world, base)
+        return (stamps, poses, f"tf {world} -> {base}") if len(stamps) else None
     if still is not None:
         return np.zeros(0), still, f"{world} (it does not move against {frame})"
     map_T_odom, known = tree.at(world, frame, odometry.stamps)

@@ -1,9 +1,4 @@
-"""TUM RGB-D: the options that such a folder takes.
-
-How its two layouts are read is in `reader`, which is imported when a folder is read.
-"""
-
-from __future__ import annotations
+"""The options of TUM RGB-D datasets. The folders are read in `reader`, which `--help` does not import."""
 
 from dataclasses import dataclass
 
@@ -12,7 +7,7 @@ from objslam.sources.options import Label, WithRange
 
 @dataclass(frozen=True)
 class TumOptions:
-    """What the folder does not say: the label of boxes without a class ("object"), and whether they get a depth."""
+    """Choices that the folder leaves open: the label of boxes without a class, and whether depth images give ranges."""
 
     label: Label = None
     with_range: WithRange = True

@@ -1,19 +1,22 @@
-"""RGB-D recordings in the style of the TUM benchmark (Sturm et al., IROS 2012) with the text files of a detector.
+"""Read RGB-D recordings of the TUM benchmark (Sturm et al., IROS 2012) with text files of detector boxes.
 
-Two layouts. Numbered (as cube_slam ships its sample): truth_cam_poses.txt with one pose a frame, and boxes/, raw_imgs/,
-depth_imgs/ whose files begin with the frame's number, from 0. Stamped (the benchmark's own): groundtruth.txt, rgb.txt,
-depth.txt, and box files named after the stamp in a folder or a tar archive. The path is the camera's, so base is the camera.
+The numbered layout is that of the cube_slam sample. truth_cam_poses.txt has a pose for each frame. The names of files in
+boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The stamped layout is that of the benchmark, with
+groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are the camera's, so base is the camera.
 """
 
-from __future__ import annotations
-
+import lzma
 import re
+import tarfile
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from objslam.core.camera import Camera
+from objslam.core.coco import COCO_NAMES
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory
 from objslam.errors import LogError
@@ -22,35 +25,39 @@ from objslam.io.box_collector import BoxCollector
 from objslam.io.camera_yaml import read_camera
 from objslam.io.image_list import read_images
 from objslam.io.safe_paths import Inside
-from objslam.io.text import read_bytes, reading
+from objslam.io.text import parse_numbers, read_bytes, reading, split_lines
 from objslam.io.tum_trajectory import read_pose_table, read_trajectory, to_trajectory
 from objslam.sources.log_folder import read_truth
 from objslam.sources.tum_rgbd import TumOptions
-from objslam.sources.tum_rgbd.box_files import find_box_sets, read_box_set
-from objslam.sources.tum_rgbd.box_text import add_boxes
 
-_POSES, _BOXES, _RGB, _DEPTH = "truth_cam_poses.txt", "boxes", "raw_imgs", "depth_imgs"  # the names in the numbered layout
-_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # the names of the path in the stamped layout
-_LABEL = "object"  # the label of boxes without a class, where the options give none
-_DEPTH_SCALE = 5000.0  # units per metre, in all depth images of the benchmark
-_FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])  # px, as the benchmark gives it
+_POSES, _BOXES, _IMAGES = "truth_cam_poses.txt", "boxes", ("raw_imgs", "depth_imgs")  # The names in the numbered layout.
+_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The names of the path in the stamped layout.
+_LABEL = "object"  # The default label of boxes without a class.
+_DEPTH_SCALE = 5000.0  # The units per metre of the benchmark's depth images.
+_FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])
+"""The camera matrix of freiburg3, px, from the benchmark."""
+_STAMPED = re.compile(r"(\d+\.\d+)\.txt")  # The name of a box file, a stamp in s.
+_ARCHIVES = ("*.tar", "*.tar.gz", "*.tgz", "*.tar.bz2", "*.tar.xz")  # The names of archives that may hold box files.
+_MAX_SIZE = 1 << 20  # The largest box file in an archive, bytes. A usual file has a few hundred bytes.
+_BAD_ARCHIVE = (tarfile.TarError, EOFError, zlib.error, lzma.LZMAError, OSError, ValueError)
+"""The exceptions that reading a damaged archive raises."""
 
 
 def is_numbered(path: Path) -> bool:
-    """Whether the folder has the numbered layout."""
+    """Return whether the folder has the numbered layout."""
     return (path / _POSES).is_file() and (path / _BOXES).is_dir()
 
 
 def is_stamped(path: Path) -> bool:
-    """Whether the folder has the stamped layout."""
-    return _stamped_path(path) is not None and ((path / "rgb.txt").is_file() or bool(find_box_sets(path)))
+    """Return whether the folder has the stamped layout."""
+    return _stamped_path(path) is not None and ((path / "rgb.txt").is_file() or bool(_find_box_sets(path)))
 
 
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the numbered layout: line n of the poses (comments not counted) belongs to the files whose name begins with n.
+    """Read the numbered layout. Files whose names begin with n belong to pose line n, not counting comments.
 
-    The camera is that of freiburg3 unless there is a camera.yaml. Files without a pose and second files of one number are
-    dropped and counted. LogError where poses or boxes cannot be used.
+    Without camera.yaml, the calibration is that of freiburg3. Files without a pose, and further files with the same number,
+    are dropped and counted. Raises LogError if the poses or the boxes are unusable.
     """
     with reading(path):
         table = read_pose_table(path / _POSES, ledger)
@@ -58,54 +65,52 @@ def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()
         collector = BoxCollector()
         for number, file in _numbered(path / _BOXES, stamp_of, ledger).items():
             collector.add_frame(stamp_of[number], str(file))
-            add_boxes(read_bytes(file), str(file), options.label or _LABEL, collector, ledger)
+            _add_boxes(read_bytes(file), str(file), options.label or _LABEL, collector, ledger)
         if not collector.stamps:
-            raise LogError("no box file that a pose belongs to", where=str(path / _BOXES))
-        rgb, depth = (_numbered_images(path / name, stamp_of, ledger) for name in (_RGB, _DEPTH))
-        return _log(path, to_trajectory(table), collector.checked(ledger), rgb, depth, options.with_range, ledger)
+            raise LogError("no box file belongs to a pose", where=str(path / _BOXES), hint="number the files from 0")
+        images = [_numbered_images(path / name, stamp_of, ledger) for name in _IMAGES]
+        return _log(path, to_trajectory(table), collector.checked(ledger), images, options, ledger)
 
 
 def read_stamped(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the stamped layout; boxes may be missing where there is rgb.txt. Errors as in `read_numbered`."""
+    """Read the stamped layout. Boxes are optional if the folder has rgb.txt. Raises the errors of `read_numbered`.
+
+    The box files are in a folder or a tar archive, which is not unpacked to disk. Files that are not regular, files that are
+    too large, and files not named after a stamp are dropped and counted.
+    """
     with reading(path):
         file = _stamped_path(path)
         if file is None:
             raise LogError(f"there is no {' or '.join(_PATHS)}", where=str(path))
-        sets = find_box_sets(path)
+        sets = _find_box_sets(path)
         if len(sets) > 1:
             names = ", ".join(source.name for source in sets)
             raise LogError(f"several sets of boxes: {names}", where=str(path), hint="keep one of them")
-        detections = read_box_set(sets[0], options.label or _LABEL, ledger) if sets else None
-        rgb, depth = (
-            read_images(path / name, ledger) if (path / name).exists() else None for name in ("rgb.txt", "depth.txt")
-        )
-        return _log(path, read_trajectory(file, ledger), detections, rgb, depth, options.with_range, ledger)
+        detections = _read_box_set(sets[0], options.label or _LABEL, ledger) if sets else None
+        lists = (path / "rgb.txt", path / "depth.txt")
+        images = [read_images(listed, ledger) if listed.exists() else None for listed in lists]
+        return _log(path, read_trajectory(file, ledger), detections, images, options, ledger)
 
 
 def _log(
     path: Path,
     camera_path: Trajectory,
     detections: Detections | None,
-    rgb: Images | None,
-    depth: Images | None,
-    with_range: bool,
+    images: Sequence[Images | None],
+    options: TumOptions,
     ledger: Ledger,
 ) -> Log:
-    camera = _camera(path, ledger)
-    if detections and depth and with_range:
+    if (path / "camera.yaml").exists():
+        camera = read_camera(path / "camera.yaml", ledger, place_needed=False, depth_scale=_DEPTH_SCALE)
+        camera = replace(camera, base_T_camera=np.eye(4))
+    else:
+        ledger.warn(f"{path}: no camera.yaml, the calibration of TUM freiburg3 is used")
+        camera = Camera("camera", 640, 480, _FREIBURG3.copy(), depth_scale=_DEPTH_SCALE)
+    rgb, depth = images
+    if detections and depth and options.with_range:
         detections = depths_at_boxes(detections, depth, camera, ledger)
-    camera_log = CameraLog(camera, detections, rgb, depth)
-    name = path.resolve().name
-    return Log(name, (camera_log,), localization=camera_path, truth=read_truth(path / "groundtruth", ledger))
-
-
-def _camera(path: Path, ledger: Ledger) -> Camera:
-    file = path / "camera.yaml"
-    if file.exists():
-        camera = read_camera(file, ledger, place_needed=False, depth_scale=_DEPTH_SCALE)
-        return replace(camera, base_T_camera=np.eye(4))
-    ledger.warn(f"{path}: no camera.yaml, the camera is taken as that of TUM freiburg3")
-    return Camera("camera", 640, 480, _FREIBURG3.copy(), depth_scale=_DEPTH_SCALE)
+    cameras = (CameraLog(camera, detections, rgb, depth),)
+    return Log(path.resolve().name, cameras, localization=camera_path, truth=read_truth(path / "groundtruth", ledger))
 
 
 def _stamped_path(path: Path) -> Path | None:
@@ -120,7 +125,7 @@ def _numbered_images(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -
 
 
 def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[int, Path]:
-    """The files of a folder by the number that their name begins with, in its order."""
+    """Map the number at the start of each file's name to the file, sorted by number."""
     inside = Inside(folder)
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()):
@@ -132,7 +137,83 @@ def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[
         elif number not in stamp_of:
             ledger.drop("numbered file that no pose belongs to", where=str(file))
         elif number in found:
-            ledger.drop("numbered file whose number another has", where=str(file))
+            ledger.drop("numbered file with the number of another file", where=str(file))
         else:
             found[number] = file
     return dict(sorted(found.items()))
+
+
+def _find_box_sets(folder: Path) -> list[Path]:
+    folders = [f for f in sorted(folder.iterdir()) if f.is_dir() and any(_STAMPED.fullmatch(i.name) for i in f.iterdir())]
+    archives = sorted({file for pattern in _ARCHIVES for file in folder.glob(pattern) if file.is_file()})
+    return folders + [archive for archive in archives if _holds_boxes(archive)]
+
+
+def _read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
+    """Read a set of box files in the order of their stamps. An archive is read up to its first damage."""
+    files = _archive_files(source, ledger) if source.is_file() else _folder_files(source, ledger)
+    collector = BoxCollector()
+    for stamp, place, data in sorted(files, key=lambda file: file[0]):
+        collector.add_frame(stamp, place)
+        _add_boxes(data, place, label, collector, ledger)
+    if not collector.stamps:
+        raise LogError("none of the box files can be read", where=str(source))
+    return collector.checked(ledger)
+
+
+def _add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledger: Ledger) -> None:
+    """Add the boxes of a file to the collector's last frame. x, y is the top left corner of a box, px."""
+    for number, text in split_lines(data, place, ledger):
+        where = f"{place}:{number}"
+        values = parse_numbers(text.split())
+        if values is None or len(values) not in (5, 6):
+            ledger.drop('box line that is not "[class] x y w h score"', where=where)
+            continue
+        name = label
+        if len(values) == 6:
+            if values[0] not in range(len(COCO_NAMES)):
+                ledger.drop("box line with a class number that is not in COCO", where=where)
+                continue
+            name = COCO_NAMES[int(values[0])]
+        x, y, width, height, score = values[-5:]
+        collector.add_box([x, y, x + width, y + height], name, score, where)
+
+
+def _folder_files(folder: Path, ledger: Ledger) -> Iterator[tuple[float, str, bytes]]:
+    for file in sorted(folder.iterdir()):
+        match = _STAMPED.fullmatch(file.name)
+        if match is None:
+            ledger.drop("box file not named after a stamp", where=str(file))
+        elif file.is_symlink() or not file.is_file():
+            ledger.drop("box file that is not a regular file", where=str(file))
+        else:
+            yield float(match[1]), str(file), read_bytes(file)
+
+
+def _archive_files(archive: Path, ledger: Ledger) -> Iterator[tuple[float, str, bytes]]:
+    try:
+        with tarfile.open(archive) as members:
+            for member in members:
+                name = member.name.rpartition("/")[2]
+                place = f"{archive}:{name}"
+                match = _STAMPED.fullmatch(name)
+                if member.isdir():
+                    continue
+                if not member.isreg():
+                    ledger.drop("box file that is not a regular file", where=place)
+                elif match is None:
+                    ledger.drop("box file not named after a stamp", where=place)
+                elif member.size > _MAX_SIZE:
+                    ledger.drop("box file that is too large", where=place)
+                elif content := members.extractfile(member):
+                    yield float(match[1]), place, content.read()
+    except _BAD_ARCHIVE as error:
+        ledger.warn(f"{archive}: damaged or cut off, the rest of the archive is left out ({error})")
+
+
+def _holds_boxes(archive: Path) -> bool:
+    try:
+        with tarfile.open(archive) as members:
+            return any(member.isreg() and _STAMPED.fullmatch(member.name.rpartition("/")[2]) for member in members)
+    except _BAD_ARCHIVE:
+        return False

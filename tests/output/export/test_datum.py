@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from objslam.output.export.datum import Datum
+from objslam.output.export.content import Datum
 
 _A, _B = 6378137.0, 6356752.314245179  # m, WGS 84
 

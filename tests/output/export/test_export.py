@@ -21,7 +21,7 @@ from objslam.errors import ConfigError, OutputError
 from objslam.graph.factors.odometry import motions
 from objslam.mapping import pipeline
 from objslam.output.export import FORMATS, write_export
-from objslam.output.export.datum import Datum
+from objslam.output.export.content import Datum
 from objslam.output.result_folder import write_result
 from objslam.results.read import load_map, load_trajectory
 

@@ -159,10 +159,10 @@ def test_a_comparison_of_two_maps_is_not_called_the_truth(tmp_path: Path) -> Non
     for given in (None, other):
         write_evaluation(evaluate_folder(tmp_path / "mine", given), tmp_path / "mine")
         told[given] = Page(write_report(tmp_path / "mine"))
-    assert "Against the ground truth, as the two stand" in told[None].all_text
+    assert "Against the ground truth, without alignment" in told[None].all_text
     assert "ground truth" not in told[other].all_text
     assert "truth id" not in told[other].all_text
-    assert f"Against {other}, as the two stand" in told[other].all_text
+    assert f"Against {other}, without alignment" in told[other].all_text
     assert "objects' RMSE, against other/objects.json" in told[other].text["span"]
     assert len(told[other].of("script")) == 1
 

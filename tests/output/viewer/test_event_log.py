@@ -31,29 +31,29 @@ def test_where_the_rays_go_says_what_became_of_an_object() -> None:
     )
     lines = [(line.at, line.level, line.text) for line in round_events(trace, ("cup",))]
     assert lines == [
-        (0, "INFO", "round 1, association at the poses so far: 3 objects, 1 rays that none explains"),
-        (0, "INFO", "born: cup #0, 3 rays"),
-        (0, "INFO", "born: cup #1, 2 rays"),
-        (0, "INFO", "born: cup #2, 3 rays"),
+        (0, "INFO", "round 1, association at the poses so far: 3 objects, 1 unexplained rays"),
+        (0, "INFO", "new: cup #0, 3 rays"),
+        (0, "INFO", "new: cup #1, 2 rays"),
+        (0, "INFO", "new: cup #2, 3 rays"),
         (0, "INFO", "solved in 1 iterations, cost 1 to 1, 0 rays rejected"),
-        (1, "INFO", "round 2, association at the poses so far: 2 objects, 2 rays that none explains"),
+        (1, "INFO", "round 2, association at the poses so far: 2 objects, 2 unexplained rays"),
         (1, "INFO", "merged: cup #0 (3 rays), cup #1 (2 rays) are cup #0, 0.50 m apart"),
-        (1, "INFO", "born: cup #1, 2 rays that were others' or nobody's"),
-        (1, "INFO", "dropped: cup #2, 2 of its 3 rays are explained by nothing now"),
+        (1, "INFO", "new: cup #1, 2 rays of other objects or unexplained"),
+        (1, "INFO", "dropped: cup #2, 2 of its 3 rays are now unexplained"),
         (1, "INFO", "solved in 1 iterations, cost 0.5 to 0.5, 0 rays rejected"),
     ]
 
 
 def test_labels_that_are_no_identities_are_said() -> None:
     texts = [line.text for line in round_events((a_round("labels", [0, 0], 1), a_round("association", [0, 0], 1)), ("cup",))]
-    assert "round 1, every label taken for one object: 1 objects, 0 rays that none explains" in texts
-    assert "labels are no identities: too many rays disagreed with the one object of theirs" in texts
+    assert "round 1, every label taken for one object: 1 objects, 0 unexplained rays" in texts
+    assert "a label is not one object: too many rays disagreed with the only object of their label" in texts
     assert round_events((), ("cup",)) == []
 
 
 def test_many_objects_are_not_all_told() -> None:
     lines = round_events((a_round("association", list(range(50)), 50),), ("cup",))
-    assert sum(line.text.startswith("born") for line in lines) == 40
+    assert sum(line.text.startswith("new") for line in lines) == 40
     assert "... and 10 more" in [line.text for line in lines]
 
 
@@ -93,13 +93,13 @@ def test_a_live_map_tells_what_changed() -> None:
     before = ObjectMap((an_object(1, 0.0), an_object(2, 0.2), an_object(3, 5.0), an_object(4, 6.0, "unresolved")))
     now = ObjectMap((an_object(1, 0.0, "unresolved"), an_object(4, 6.0), an_object(5, 7.0), an_object(6, 8.0, "unresolved")))
     assert map_changes(before, now) == [
-        ("WARN", "no longer sure: cup #1, 9 rays, parallax 12 deg"),
-        ("INFO", "placed: cup #4, 9 rays, parallax 12 deg, sigma 1 cm"),
-        ("INFO", "born: cup #5, 9 rays, parallax 12 deg"),
-        ("INFO", "placed: cup #5, 9 rays, parallax 12 deg, sigma 1 cm"),
-        ("INFO", "born: cup #6, 9 rays, parallax 12 deg"),
+        ("WARN", "no longer resolved: cup #1, 9 rays, parallax 12 deg"),
+        ("INFO", "resolved: cup #4, 9 rays, parallax 12 deg, sigma 1 cm"),
+        ("INFO", "new: cup #5, 9 rays, parallax 12 deg"),
+        ("INFO", "resolved: cup #5, 9 rays, parallax 12 deg, sigma 1 cm"),
+        ("INFO", "new: cup #6, 9 rays, parallax 12 deg"),
         ("INFO", "dropped: cup #2, 9 rays, merged into cup #1"),
-        ("INFO", "dropped: cup #3, 9 rays, nothing explains it any more"),
+        ("INFO", "dropped: cup #3, 9 rays, its rays are now unexplained"),
     ]
     renamed = ObjectMap((an_object(1, 0.0, label="mug"),))
     assert map_changes(ObjectMap((an_object(1, 0.0),)), renamed) == [("INFO", "renamed: cup #1 is a mug")]

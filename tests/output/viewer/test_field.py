@@ -60,7 +60,7 @@ def test_the_field_of_an_object_is_a_recording(tmp_path: Path, recording: bool) 
         np.testing.assert_allclose(strips[:, 0], result.origins[mask], rtol=1e-5, atol=1e-5)
         (colour,) = r.get(f"/map/field/{name}", "LineStrips3D:colors")[0]
         assert np.argmax(rgb(colour)) == leads
-    assert "| rejected (red) | 4 |" in r.get("/field", "TextDocument:text")[0][0]
+    assert "| rejected rays (red) | 4 |" in r.get("/field", "TextDocument:text")[0][0]
 
 
 def test_bright_is_close() -> None:

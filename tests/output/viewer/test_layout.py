@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from synthetic_result import clusters, synthetic_result
 
 from objslam.core.types import Images
-from objslam.output.viewer.image_labels import label_rows
 from objslam.output.viewer.images import choose_images
-from objslam.output.viewer.view_point import first_view_point, label_places, look_at
+from objslam.output.viewer.view_point import first_view_point, label_places, label_rows, look_at
 
 VIEW = np.array([900.0, 620.0])
 

@@ -144,11 +144,11 @@ def test_a_session_becomes_a_recording(result: RunResult, tmp_path: Path) -> Non
     assert [row[0] for row in r.get("/plots/live/lag/p99", "Scalars:scalars")] == pytest.approx([20] * 4)
     assert [row[0] for row in r.get("/plots/live/dropped/messages", "Scalars:scalars")] == [1, 2, 3, 4]
     text = [row[0] for row in r.get("/log", "TextLog:text")]
-    assert sum(t.startswith("born: ") for t in text) == 15
-    assert sum(t.startswith("placed: ") for t in text) == 14
+    assert sum(t.startswith("new: ") for t in text) == 15
+    assert sum(t.startswith("resolved: ") for t in text) == 14
     gone = result.map.objects[3]
     assert [t for t in text if t.startswith("dropped: ")] == [
-        f"dropped: {gone.label} #{gone.id}, {gone.rays} rays, nothing explains it any more"
+        f"dropped: {gone.label} #{gone.id}, {gone.rays} rays, its rays are now unexplained"
     ]
     assert "dropped: boxes cut off | 4" in r.get("/summary", "TextDocument:text")[-1][0]
     # the last frame's boxes, in the colours that they have offline

@@ -11,8 +11,7 @@ from drive_bag import simulated
 from objslam.core.diagnostics import Ledger
 from objslam.ros.bag.recording import find_recording
 from objslam.ros.messages.images import DEPTH_SCALE
-from objslam.sources.ros_bag.images import extract_images
-from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.log import extract_images, read_bag
 from objslam.sources.ros_bag.options import BagOptions
 
 _S = 10**9

@@ -52,7 +52,7 @@ def test_a_drive_at_a_glance(makers, tmp_path, log, kind):
     assert place.chain == ("base_footprint", "base_link", "front_link", "front_optical_frame")
     np.testing.assert_allclose(place.base_T_frame, log.cameras[0].camera.base_T_camera, atol=1e-12)
     assert info.cameras[0].name == "front"
-    assert np.isclose(info.duration, (rows[-1][1] - rows[0][1]) / 1e9)
+    assert np.isclose(info.end - info.start, (rows[-1][1] - rows[0][1]) / 1e9)
 
 
 def test_images_without_detections_need_a_detector(makers, tmp_path, log):
@@ -83,7 +83,7 @@ def test_all_that_is_missing_is_listed(makers, tmp_path):
     info = describe(path)
     assert [line.split(" (")[0] for line in info.missing] == [
         "x: there is neither odometry nor localisation",
-        "camera camera: no CameraInfo belongs to it",
+        "camera camera: no CameraInfo belongs to this camera",
     ]
     assert info.topics[0].role == "detections"
     assert (info.base, info.odometry, info.places) == ("", "", ())
@@ -110,5 +110,5 @@ def test_messages_that_cannot_be_used_are_counted(makers, tmp_path, log):
 def test_an_empty_recording(makers, tmp_path):
     path = write_bag(tmp_path / "x", "mcap-none", makers["4"], [])
     info = describe(path, BagOptions())
-    assert (info.messages, info.topics, info.duration) == (0, (), 0)
+    assert (info.messages, info.topics, info.end - info.start) == (0, (), 0)
     assert len(info.missing) == 2

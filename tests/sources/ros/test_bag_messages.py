@@ -232,9 +232,9 @@ _DECODERS = {
     ("connection", "message"),
     [
         (Connection("/x", "nav_msgs/msg/Odometry", "protobuf"), "encoded as 'protobuf'"),
-        (Connection("/x", "my_msgs/msg/Thing", "cdr"), "does not bring"),
-        (Connection("/x", "my_msgs/msg/Thing", "cdr", "float64[1000000000] x\n"), "absurd size"),
-        (Connection("/x", "my_msgs/msg/Thing", "cdr", "float64 x\n" * 30_000), "larger than any definition"),
+        (Connection("/x", "my_msgs/msg/Thing", "cdr"), "lacks the definition"),
+        (Connection("/x", "my_msgs/msg/Thing", "cdr", "float64[1000000000] x\n"), "too large"),
+        (Connection("/x", "my_msgs/msg/Thing", "cdr", "float64 x\n" * 30_000), "definition is too long"),
         (Connection("/x", "my_msgs/msg/Thing", "cdr", "Other x\n"), "cannot be used"),
         (Connection("/x", "my_msgs/msg/Thing", "cdr", "Thing x\n"), "cannot be used"),
         (Connection("/x", "my_msgs/msg/Thing", "cdr", "import os"), "cannot be used"),

@@ -120,7 +120,7 @@ def test_the_odometry_moves_a_frame_that_tf_does_not_know(makers, tmp_path):
     bag = Bag(makers["4"]).odometry(child="vio_body").tf("base_link", _FRAME, _OPTICAL, static=True).camera().boxes()
     ledger = Ledger()
     log = _read(bag, tmp_path, ledger)
-    assert "'vio_body', which is not in tf: 'base_link' is taken to be the same" in ledger.warnings[0]
+    assert "'vio_body', which is not in tf: 'base_link' is taken as the same frame" in ledger.warnings[0]
     np.testing.assert_allclose(log.cameras[0].camera.base_T_camera, _OPTICAL, atol=1e-12)
 
 
@@ -312,7 +312,7 @@ def test_a_calibration_file_stands_in(makers, tmp_path):
     assert camera_log.detections.label_names == ("mug",)
     assert camera_log.camera.distortion_model == "equidistant"
     np.testing.assert_allclose(camera_log.camera.base_T_camera, left.base_T_camera, atol=1e-12)
-    assert ledger.warnings == ["/rig/front/tags: left out, no calibration of that name (left)"]
+    assert ledger.warnings == ["/rig/front/tags: left out, no calibration has a name that fits (left)"]
 
 
 def test_a_calibration_file_without_a_place_leaves_that_to_tf(makers, tmp_path):
@@ -330,9 +330,9 @@ def test_a_calibration_file_without_a_place_leaves_that_to_tf(makers, tmp_path):
     ("without", "message"),
     [
         ("/odom", "neither odometry nor localisation"),
-        ("/front/camera_info", "no CameraInfo belongs to it"),
+        ("/front/camera_info", "no CameraInfo belongs to this camera"),
         ("/front/detections", "no camera: the recording has no images and no detections"),
-        ("/tf_static", r"'base_link' is in no transform; 'front_optical_frame' is in no transform.*was /tf_static recorded"),
+        ("/tf_static", r"'base_link' is in no transform; 'front_optical_frame' is in no transform.*record /tf_static"),
     ],
 )
 def test_what_is_missing_is_named(bag, tmp_path, without, message):

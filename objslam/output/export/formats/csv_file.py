@@ -1,4 +1,4 @@
-"""CSV (RFC 4180): one line per object, for spreadsheets and data frames."""
+"""The CSV format (RFC 4180): one line per object, for spreadsheets and data frames."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ _COLUMNS = (
     *("id", "label", "status", "x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"),
     *("rays", "frames", "parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"),
 )
-"""Positions and sizes are in m, covariances in m^2, stamps in s; a cell is empty where the value is unknown."""
-
-_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Row and column of the six numbers of a symmetric matrix, in the order of `_COLUMNS`."""
+"""The columns: positions and sizes are in m, covariances in m^2, and stamps in s. The cell of an unknown value is empty."""
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows and columns of the covariance values.
 
 
 def _dump(content: Content) -> bytes:
-    """The objects as UTF-8 text; every number reads back as the same float."""
+    """Write the objects as UTF-8 text; every number is read back as the same float."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(_COLUMNS)

@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946): objects as points and the path as a line, for QGIS, web maps and fleet tools."""
+"""The GeoJSON format (RFC 7946): objects as points and the path as a line, for QGIS, web maps and fleet tools."""
 
 from __future__ import annotations
 
@@ -11,60 +11,42 @@ from objslam.output.export.export_format import ExportFormat
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.core.object_map import MapObject
-    from objslam.output.export.content import Content
-    from objslam.output.export.datum import Datum
+    from objslam.output.export.content import Content, Datum
 
-_DEGREE_DIGITS = 9
-"""Decimal places of longitudes and latitudes in degrees: 1e-9 deg is 0.1 mm on the ground."""
-
-_METRE_DIGITS = 6
-"""Decimal places of coordinates in m: a micrometre, far below any map's accuracy."""
+_DEGREE_DIGITS = 9  # Longitudes and latitudes, deg, have this many decimal places. 1e-9 deg is 0.1 mm on the ground.
+_METRE_DIGITS = 6  # Coordinates, m, have this many decimal places. 1e-6 m is far below the accuracy of any map.
 
 
 def _dump(content: Content) -> bytes:
-    """The map as a FeatureCollection.
+    """Write the map as a FeatureCollection.
 
-    With a datum, coordinates are WGS 84 longitude and latitude, as the RFC asks for; heights are properties, because a map
-    does not know its height above the ellipsoid. Without one, coordinates are m in the map's frame, and the member
-    `coordinates_in` says so. An unresolved object is a feature without a geometry.
+    With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are m in
+    the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
+    above the ellipsoid is unknown. An unresolved object is a feature without a geometry.
     """
     datum, path = content.datum, content.path
     features = [_object(o, datum) for o in content.objects.objects]
     if len(path) > 1:
-        line = _coordinates(path.poses[:, :3, 3], datum)
-        stamps = {"start": float(path.stamps[0]), "end": float(path.stamps[-1])}
-        features.append(_feature({"type": "LineString", "coordinates": line}, {"kind": "path", **stamps}))
+        geometry = {"type": "LineString", "coordinates": _coordinates(path.poses[:, :3, 3], datum)}
+        properties = {"kind": "path", "start": float(path.stamps[0]), "end": float(path.stamps[-1])}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     collection: dict[str, Any] = {"type": "FeatureCollection"}
     if datum is None:
         collection["coordinates_in"] = f"metres in the frame {content.objects.frame}"
-    # one line per feature, so that two files can be compared line by line
+    # Each feature has its own line, so that two files can be compared line by line.
     head, lines = json.dumps(collection)[:-1], ",\n".join(json.dumps(f, allow_nan=False) for f in features)
     return f'{head}, "features": [\n{lines}\n]}}\n'.encode()
 
 
 def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
-    properties = {
-        "kind": "object",
-        "label": o.label,
-        "status": o.status,
-        "z": _finite(o.position[2]),
-        "sigma": _finite(o.sigma),
-        "width": o.extent[0] if o.extent else None,
-        "height": o.extent[1] if o.extent else None,
-        "rays": o.rays,
-        "first_seen": _finite(o.first_seen),
-        "last_seen": _finite(o.last_seen),
-        "existence": _finite(o.existence),
-    }
+    width, height = o.extent or (None, None)
+    properties: dict[str, Any] = {"kind": "object", "label": o.label, "status": o.status}
+    properties |= {"z": _finite(o.position[2]), "sigma": _finite(o.sigma), "width": width, "height": height, "rays": o.rays}
+    properties |= {name: _finite(getattr(o, name)) for name in ("first_seen", "last_seen", "existence")}
     geometry = None
     if o.status == "ok":
-        (coordinates,) = _coordinates(o.position[None], datum)
-        geometry = {"type": "Point", "coordinates": coordinates}
-    return {**_feature(geometry, properties), "id": o.id}
-
-
-def _feature(geometry: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+        geometry = {"type": "Point", "coordinates": _coordinates(o.position[None], datum)[0]}
+    return {"type": "Feature", "geometry": geometry, "properties": properties, "id": o.id}
 
 
 def _coordinates(points: Floats, datum: Datum | None) -> list[list[float]]:

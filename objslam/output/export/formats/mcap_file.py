@@ -1,12 +1,11 @@
-"""MCAP with ROS 2 messages: the map and the path, for Foxglove, RViz (`ros2 bag play`) and anything that reads ROS 2 bags.
+"""The MCAP format with ROS 2 messages: map and path, for Foxglove, RViz (`ros2 bag play`) and readers of ROS 2 bags.
 
-https://mcap.dev/spec, https://docs.ros.org/en/rolling/p/vision_msgs. No ROS is needed to write it.
+The module writes such a file without ROS. Source: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import OutputError
@@ -14,26 +13,21 @@ from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
     from objslam.output.export.content import Content
-    from objslam.output.export.map_messages import MapMessages
 
-_POSE_TOPIC = "/objslam/pose"
-"""The topic of the robot's pose: the only one with a message per stamp."""
-
+_POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose. No other topic has a message per stamp.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  liveliness_lease_duration:\n"
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
-"""The offered QoS as rosbag2 records it: reliable and transient local, so that RViz gets the map whenever it joins."""
-
-_LAST_STAMP = 2.0**31
-"""The stamp, s, from which builtin_interfaces/Time overflows; it also has no stamp below 0."""
+"""The offered QoS in the format of rosbag2: reliable and transient local, so that an RViz that joins late gets the map."""
+_LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows from this stamp, s. It has no stamps below 0.
 
 
 def _dump(content: Content) -> bytes:
-    """The content of the file: objects, markers and path once, at the start; the robot's pose at each stamp of the path.
+    """Write the objects, the markers and the path once, at the start, and the robot's pose at each stamp of the path.
 
-    One message holds all resolved objects with their covariances. Chunks carry CRCs.
+    One message contains all resolved objects with their covariances. Each chunk has a CRC.
     """
     from mcap.writer import CompressionType, Writer
 
@@ -41,24 +35,12 @@ def _dump(content: Content) -> bytes:
 
     stamps = content.path.stamps
     if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < _LAST_STAMP:
-        raise OutputError("stamps that are no ROS time, before 1970 or after 2038", where=str(content.out))
+        raise OutputError("stamps that are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
     messages = MapMessages(content.objects.frame)
     start = float(stamps[0]) if len(stamps) else 0.0
     buffer = io.BytesIO()
     writer = Writer(buffer, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library="objslam")
-    put = _channels(writer, messages)
-    put("/objslam/objects", start, messages.detections(start, content.objects.resolved()))
-    put("/objslam/markers", start, messages.markers(start, content.objects))
-    put("/objslam/path", start, messages.path(start, stamps, content.path.poses))
-    for stamp, pose in zip(stamps.tolist(), content.path.poses, strict=True):
-        put(_POSE_TOPIC, stamp, messages.stamped(stamp, pose))
-    writer.finish()
-    return buffer.getvalue()
-
-
-def _channels(writer: Any, messages: MapMessages) -> Callable[[str, float, Any], None]:
-    """A function that writes a message to a topic; a topic and its type are registered with their first message."""
     channels: dict[str, int] = {}
 
     def put(topic: str, stamp: float, message: Any) -> None:
@@ -71,7 +53,13 @@ def _channels(writer: Any, messages: MapMessages) -> Callable[[str, float, Any],
         at = round(stamp * 1e9)
         writer.add_message(channels[topic], at, bytes(messages.store.serialize_cdr(message, name)), at)
 
-    return put
+    put("/objslam/objects", start, messages.detections(start, content.objects.resolved()))
+    put("/objslam/markers", start, messages.markers(start, content.objects))
+    put("/objslam/path", start, messages.path(start, stamps, content.path.poses))
+    for stamp, pose in zip(stamps.tolist(), content.path.poses, strict=True):
+        put(_POSE_TOPIC, stamp, messages.stamped(stamp, pose))
+    writer.finish()
+    return buffer.getvalue()
 
 
 EXPORT = ExportFormat("mcap", "map.mcap", "map and path as ROS 2 messages, for Foxglove and RViz", _dump)

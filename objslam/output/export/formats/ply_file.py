@@ -1,4 +1,4 @@
-"""PLY: the resolved objects as coloured points, for MeshLab, CloudCompare and Open3D."""
+"""The PLY format: the resolved objects as coloured points, for MeshLab, CloudCompare and Open3D."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _PROPERTIES = (
     *(("red", "u1", "uchar"), ("green", "u1", "uchar"), ("blue", "u1", "uchar")),
     *(("id", "<i4", "int"), ("label", "<i4", "int"), ("sigma", "<f8", "double")),
 )
-"""Each property's name, its numpy type, and its type in PLY."""
+"""The name, the numpy type and the PLY type of each property."""
 
 
 def _dump(content: Content) -> bytes:
-    """One vertex per object: position (m), colour, id, label, and the largest standard deviation (m; 0 where unknown).
+    """Write one vertex per object: position (m), colour, id, label, and the largest standard deviation (m, 0 if unknown).
 
-    `label` is an index into the labels that the header's comments name.
+    `label` is an index into the labels that are listed in the header's comments.
     """
     import numpy as np
 
@@ -30,23 +30,16 @@ def _dump(content: Content) -> bytes:
     pairs = zip(content.objects.objects, object_colours(content.objects), strict=True)
     drawn = [(o, colour) for o, colour in pairs if o.status == "ok"]
     if any(not -(2**31) <= o.id < 2**31 for o, _ in drawn):
-        raise OutputError("an id of more than 32 bits, which PLY does not have", where=str(content.out))
+        raise OutputError("an object id needs more than 32 bits, and PLY has no such integers", where=str(content.out))
     names = sorted({o.label for o, _ in drawn})
-    rows = [
-        (*o.position, *(round(255 * part) for part in colour), o.id, names.index(o.label), o.sigma or 0.0)
-        for o, colour in drawn
-    ]
+    rows = [(*o.position, *(round(255 * c) for c in rgb), o.id, names.index(o.label), o.sigma or 0.0) for o, rgb in drawn]
     vertices = np.array(rows, dtype=[(name, kind) for name, kind, _ in _PROPERTIES])
-    header = ["ply", "format binary_little_endian 1.0", f"comment frame {_one_line(content.objects.frame)}, metres"]
-    header += [f"comment label {i} {_one_line(name)}" for i, name in enumerate(names)]
+    # A line break ends a PLY comment, so all texts are joined to one line.
+    header = ["ply", "format binary_little_endian 1.0", f"comment frame {' '.join(content.objects.frame.split())}, metres"]
+    header += [f"comment label {i} {' '.join(name.split())}" for i, name in enumerate(names)]
     header.append(f"element vertex {len(vertices)}")
     header += [f"property {kind} {name}" for name, _, kind in _PROPERTIES]
     return "\n".join([*header, "end_header\n"]).encode() + vertices.tobytes()
-
-
-def _one_line(text: str) -> str:
-    """Text without line breaks, which would end the comment that it stands in."""
-    return " ".join(text.split())
 
 
 EXPORT = ExportFormat("ply", "objects.ply", "objects as points", _dump)

@@ -1,4 +1,4 @@
-"""A session in the viewer while it runs: a process of its own that draws it, and the messages to that process.
+"""The view of a running session: a separate process that logs to the viewer, and the messages to this process.
 
-What a finished run shows is in `viewer` itself.
+The recording of a finished run is made in `viewer`.
 """

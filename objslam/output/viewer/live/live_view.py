@@ -1,4 +1,4 @@
-"""A view of a session while it runs: its snapshots go to a viewer or a file and never keep the session waiting."""
+"""The view of a running session: its snapshots go to a viewer or a file, and the session never waits for them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from objslam.errors import ConfigError, OutputError
@@ -24,19 +24,20 @@ if TYPE_CHECKING:
 
     from objslam.core.snapshot import Snapshot
 
-_MAX_WAITING = 4  # The largest number of snapshots that wait for the viewer; of more, the oldest is dropped.
-_ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # What the address of a viewer looks like.
+_MAX_WAITING = 4  # At most this many snapshots wait for the viewer. Beyond that, the oldest is dropped.
+_ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # The address of a viewer has this form.
 
 Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
-"""The image of a camera, by its name, at a stamp, s; None where there is none."""
+"""A function from a camera's name and a stamp, s, to an image, or None if there is no image."""
 
 
 def open_view(where: str, say: Callable[[str], None], image: Image | None = None) -> LiveView:
-    """A live view in a window (`window`), a browser (`web`), a recording (a name that ends in .rrd), or at an address.
+    """Open a live view.
 
     Args:
-        say: takes the line that tells the address for a browser.
-        image: finds the images of frames.
+        where: `window`, `web` for a browser, the name of a recording (.rrd), or the address of a viewer.
+        say: receives a line with the address for the browser.
+        image: returns the images of frames.
     """
     if where.endswith(".rrd"):
         return LiveView(file=Path(where), image=image)
@@ -44,7 +45,7 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
         return LiveView(address=where, image=image)
     port = application.free_port()
     address = application.address(port)
-    if where == "window":  # the window stays open at the end
+    if where == "window":  # The window stays open after the session.
         application.start_listening(port, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
         return LiveView(address=address, image=image)
     web = application.free_port()
@@ -54,27 +55,28 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
 
 
 class LiveView:
-    """Shows snapshots. If the viewer is too slow, snapshots are dropped and counted.
+    """Shows snapshots; if the viewer is too slow, snapshots are dropped and counted.
 
-    A separate process does the logging, and a thread feeds it. So a viewer that hangs cannot block the session or its end.
-    If the viewer is killed, the view tries its address again every few seconds. A new viewer at that address receives the
-    snapshots from then on.
+    A separate process logs the snapshots, and a thread feeds this process, so a hanging viewer cannot block the session or
+    its end. If the viewer is killed, the process retries its address every few seconds. A new viewer at this address
+    receives the later snapshots.
     """
 
     def __init__(
         self, file: Path | None = None, address: str | None = None, image: Image | None = None, server: Viewer | None = None
     ) -> None:
-        """Log to a recording file, which can be read at any time, to the viewer at an address, or to both.
+        """Start to log to a recording file, to the viewer at an address, or to both.
 
         Args:
-            image: finds the images of the frames in snapshots; it is called from the view's own thread.
+            file: the recording; it can be read at any time.
+            image: returns the images of frames; the thread of the view calls it.
             server: a viewer to stop at the end.
         Raises:
-            ConfigError: the address is none.
+            ConfigError: the address is malformed.
             OutputError: the file cannot be written.
         """
         if address is not None and not _ADDRESS.fullmatch(address):
-            hint = "rerun+http://127.0.0.1:9876/proxy, for example"
+            hint = "give window, web, FILE.rrd, or an address such as rerun+http://127.0.0.1:9876/proxy"
             raise ConfigError(f"{address!r} is no address of a viewer", hint=hint)
         arguments = [sys.executable, "-m", "objslam.output.viewer.live.live_process"]
         if file is not None:
@@ -85,10 +87,8 @@ class LiveView:
             arguments += ["--file", str(file)]
         if address is not None:
             arguments += ["--address", address]
-        self.shown = 0
-        """The number of snapshots that arrived."""
-        self.dropped = 0
-        """The number of snapshots that did not arrive, because the viewer was too slow or gone."""
+        self.shown = 0  # The number of snapshots that arrived.
+        self.dropped = 0  # The number of snapshots that were lost, because the viewer was too slow or had ended.
         self._image = image
         self._waiting: deque[Snapshot] = deque()
         self._changed = threading.Condition()
@@ -98,14 +98,14 @@ class LiveView:
             arguments,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # rerun reports every message that a dead viewer misses
-            start_new_session=True,  # Ctrl+C ends the session, which then ends this process
+            stderr=subprocess.DEVNULL,  # rerun reports every message that an ended viewer misses.
+            start_new_session=True,  # Ctrl+C ends the session, and the session ends this process.
         )
         self._thread = threading.Thread(target=self._feed, name="objslam live view", daemon=True)
         self._thread.start()
 
     def show(self, snapshot: Snapshot) -> bool:
-        """Take a snapshot and return at once, from any thread; False where an older one was dropped for it."""
+        """Queue a snapshot and return at once, from any thread; False if an older snapshot was dropped."""
         with self._changed:
             full = len(self._waiting) >= _MAX_WAITING
             if full:
@@ -116,7 +116,7 @@ class LiveView:
         return not full
 
     def close(self, timeout: float = 3.0) -> None:
-        """Show what waits for at most `timeout`, s, then end the logging, whatever the viewer does."""
+        """Show the waiting snapshots for at most `timeout`, s, then end the process."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -135,37 +135,34 @@ class LiveView:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _feed(self) -> None:
-        """Hand on one snapshot at a time, each when the last has arrived."""
+        """Send one snapshot at a time to the process; if the process has ended, count the snapshots as dropped."""
         into, back = self._process.stdin, self._process.stdout
         assert into is not None
         assert back is not None
+        answer = b"ok\n"
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closing)
                 if not self._waiting:
                     break
                 snapshot = self._waiting.popleft()
-            try:
-                into.write(encode_snapshot(self._with_images(snapshot), self.dropped))
-                into.flush()
-                answer = back.readline()
-            except OSError:  # the process is gone
-                answer = b""
+            if answer:  # The answer is empty once the process has ended.
+                try:
+                    into.write(encode_snapshot(self._with_images(snapshot), self.dropped))
+                    into.flush()
+                    answer = back.readline()
+                except OSError:
+                    answer = b""
             with self._changed:
                 arrived = answer == b"ok\n"
                 self.shown += arrived
                 self.dropped += not arrived
-            if not answer:
-                self._drop_all()
-                break
-        try:
+        with suppress(OSError):  # The process has ended.
             into.close()
-        except OSError:  # the process is gone, and what was left for it is counted as dropped
-            return
 
     def _with_images(self, snapshot: Snapshot) -> Snapshot:
         find = self._image
@@ -173,11 +170,3 @@ class LiveView:
             return snapshot
         frames = (f if f.image is not None else replace(f, image=find(f.camera.name, f.stamp)) for f in snapshot.frames)
         return replace(snapshot, frames=tuple(frames))
-
-    def _drop_all(self) -> None:
-        """Count snapshots as dropped until the end: there is no process to show them to."""
-        while not self._closing:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._closing)
-                self.dropped += len(self._waiting)
-                self._waiting.clear()

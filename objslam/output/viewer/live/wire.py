@@ -1,6 +1,4 @@
-"""Messages from a session to the process that draws it: JSON, followed by the images."""
-
-from __future__ import annotations
+"""The messages from a session to its view process: JSON, followed by the images."""
 
 import json
 import struct
@@ -15,49 +13,51 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.io.objects_json import dump_objects, parse_objects
 from objslam.output.plot.style import evenly
+from objslam.output.viewer.images import pack
 
-_LENGTH = struct.Struct("<Q")  # The length of the JSON text, bytes, with which a message begins.
-_MAX_POINTS = 500  # The largest number of points of the path that a message carries.
-_MAX_LENGTH = 1 << 30  # The longest text, bytes, that is read: a damaged length must not fill the memory.
+_LENGTH = struct.Struct("<Q")  # A message begins with the length of its JSON text, bytes.
+_MAX_POINTS = 500  # A message has at most this many points of the path.
+_MAX_LENGTH = 1 << 30  # At most this many bytes of text are read, so that a damaged length does not fill the memory.
+_CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion")  # A message has these camera fields.
+_FRAME = ("stamp", "map_T_camera", "boxes", "objects", "rejected")  # A message has these fields of a frame.
 
 
 @dataclass(frozen=True)
 class ShownSnapshot:
-    """What is drawn of a snapshot."""
+    """The part of a snapshot that the view shows."""
 
-    stamp: float  # Of the newest keyframe, s; NaN before the first.
+    stamp: float  # The stamp of the newest keyframe, s; NaN without keyframes.
     map: ObjectMap
-    path: Floats  # (n, 3) m, positions of the base in map, thinned.
-    base: Floats | None  # (4, 4) the newest map_T_base; None before the first.
-    numbers: dict[str, float]  # Keyframes, rebuilds, times in s, and the snapshots that the viewer missed ("unseen").
-    counters: dict[str, int]  # Accepted messages by kind.
-    dropped: dict[str, int]  # Dropped messages by reason.
+    path: Floats  # (n, 3) positions of the base, m in map, evenly chosen.
+    base: Floats | None  # (4, 4) the newest map_T_base; None without keyframes.
+    numbers: dict[str, float]  # Counts of keyframes, rebuilds and missed snapshots ("unseen"), and times in s.
+    counters: dict[str, int]  # The number of accepted messages by kind.
+    dropped: dict[str, int]  # The number of dropped messages by reason.
 
 
 def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
-    """A snapshot as one message; unseen: the number of snapshots that were dropped before it."""
-    frames, path = snapshot.frames, snapshot.path
-    p50, p99 = snapshot.update
+    """Encode a snapshot as one message; `unseen` is the number of snapshots dropped before it."""
+    frames, path, (p50, p99) = snapshot.frames, snapshot.path, snapshot.update
     numbers = {"lag": snapshot.lag, "p50": p50, "p99": p99, "unseen": unseen}
     numbers |= {"keyframes": snapshot.keyframes, "rebuilds": snapshot.rebuilds}
     head: dict[str, Any] = {
         "stamp": snapshot.stamp,
         "map": json.loads(dump_objects(snapshot.map)),
-        "path": path.poses[evenly(len(path), _MAX_POINTS), :3, 3].round(4).tolist(),
-        "base": path.poses[-1].tolist() if len(path) else None,
+        "path": path.poses[evenly(len(path), _MAX_POINTS), :3, 3].round(4),
+        "base": path.poses[-1] if len(path) else None,
         "numbers": {name: float(value) for name, value in numbers.items()},
         "counters": {name: int(n) for name, n in snapshot.counters.items()},
         "dropped": {name: int(n) for name, n in snapshot.dropped.items()},
-        "frames": [_frame(f) for f in frames],
+        "frames": [_fields(f, _FRAME) | {"camera": _fields(f.camera, _CAMERA)} for f in frames],
     }
-    blobs = [b"" if f.image is None else f.image if isinstance(f.image, bytes) else _packed(f.image) for f in frames]
+    blobs = [pack(f.image) if isinstance(f.image, np.ndarray) else f.image or b"" for f in frames]
     head["blobs"] = [len(b) for b in blobs]
-    text = json.dumps(head).encode()
+    text = json.dumps(head, default=np.ndarray.tolist).encode()
     return _LENGTH.pack(len(text)) + text + b"".join(blobs)
 
 
 def read_snapshot(stream: BinaryIO) -> tuple[ShownSnapshot, list[CameraFrame]] | None:
-    """The next message of a stream, and the frames that came with it; None at its end or where it is cut off."""
+    """Read the next message of a stream: the snapshot and its frames; None at the end or if the message is cut off."""
     start = stream.read(_LENGTH.size)
     if len(start) < _LENGTH.size:
         return None
@@ -69,53 +69,24 @@ def read_snapshot(stream: BinaryIO) -> tuple[ShownSnapshot, list[CameraFrame]] |
     blobs = [stream.read(n) for n in head["blobs"]]
     if [len(b) for b in blobs] != head["blobs"]:
         return None
-    shown = ShownSnapshot(
-        stamp=head["stamp"],
-        map=parse_objects(head["map"]),
-        path=np.array(head["path"]).reshape(-1, 3),
-        base=None if head["base"] is None else np.array(head["base"]),
-        numbers=head["numbers"],
-        counters=head["counters"],
-        dropped=head["dropped"],
-    )
+    path, base = np.array(head["path"]).reshape(-1, 3), None if head["base"] is None else np.array(head["base"])
+    counts = head["numbers"], head["counters"], head["dropped"]
+    shown = ShownSnapshot(head["stamp"], parse_objects(head["map"]), path, base, *counts)
     return shown, [_parse_frame(f, b) for f, b in zip(head["frames"], blobs, strict=True)]
 
 
-def _frame(f: CameraFrame) -> dict[str, Any]:
-    c = f.camera
-    return {
-        "stamp": f.stamp,
-        "camera": {
-            "name": c.name,
-            "width": c.width,
-            "height": c.height,
-            "matrix": c.matrix.tolist(),
-            "distortion_model": c.distortion_model,
-            "distortion": c.distortion.tolist(),
-        },
-        "map_T_camera": f.map_T_camera.tolist(),
-        "boxes": f.boxes.tolist(),
-        "objects": f.objects.tolist(),
-        "rejected": f.rejected.tolist(),
-    }
+def _fields(of: CameraFrame | Camera, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}
 
 
 def _parse_frame(entry: dict[str, Any], blob: bytes) -> CameraFrame:
-    camera = dict(entry["camera"])
-    for name in ("matrix", "distortion"):
-        camera[name] = np.array(camera[name])
+    arrays = {name: np.array(entry["camera"][name]) for name in ("matrix", "distortion")}
     return CameraFrame(
         stamp=entry["stamp"],
-        camera=Camera(**camera),
+        camera=Camera(**entry["camera"] | arrays),
         map_T_camera=np.array(entry["map_T_camera"]),
         boxes=np.array(entry["boxes"]).reshape(-1, 4),
         objects=np.array(entry["objects"], dtype=np.int64),
         rejected=np.array(entry["rejected"], dtype=bool),
         image=blob or None,
     )
-
-
-def _packed(pixels: np.ndarray) -> bytes:
-    from objslam.output.viewer.images import pack
-
-    return pack(pixels, (pixels.shape[1], pixels.shape[0]))

@@ -1,0 +1,226 @@
+"""The settings of mapping: measurements, association, estimation, live sessions and outputs."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from objslam.config.section import Count, Device, Finite, NotNegative, Positive, Section, Share
+
+Loss = Literal["l1", "huber", "cauchy", "gnc"]
+
+
+class Poses(Section):
+    """Configure which poses of a log are used."""
+
+    use: Literal["auto", "odometry", "localization"] = "auto"
+    """Poses to use if a log has both kinds. auto uses localisation, and in joint mode also the odometry between its
+    poses."""
+    max_gap: Positive = 1.1
+    """Maximum gap of the path in s. A frame in a longer gap is dropped and counted."""
+
+
+class RayNoise(Section):
+    """Configure how boxes become rays."""
+
+    pixel_sigma: Positive = 3.0
+    """Standard deviation of a box centre per axis in px."""
+    box_sigma: NotNegative = 0.05
+    """Box centre noise as a share of the box size (geometric mean of width and height), added in quadrature to
+    pixel_sigma."""
+    min_score: NotNegative = 0.0
+    """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
+    border: Finite = 1.0
+    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object,
+    so the box is dropped and counted. A negative value keeps such boxes."""
+    border_share: NotNegative = 0.07
+    """Distance from the image edge as a share of the box width or height within which a box also counts as cut off.
+    Detectors often end a cut box short of the edge."""
+
+
+class Depth(Section):
+    """Configure the depth at a box. The depth is optional and is used as a range along the ray of the box."""
+
+    use: bool = True
+    sigma: Positive = 0.03
+    """Constant part of the range noise in m."""
+    sigma_per_m: NotNegative = 0.02
+    """Part of the range noise that grows with the distance, in m per m."""
+    bias: NotNegative = 0.05
+    """Standard deviation in m of the error shared by all ranges of one object. Ranges end on the surface of the object, or
+    have a calibration error. Averaging does not reduce this error."""
+
+
+class Odometry(Section):
+    """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion."""
+
+    x_per_m: NotNegative = 0.02
+    """Standard deviation along the driving direction in m after 1 m of driving."""
+    y_per_m: NotNegative = 0.005
+    """Sideways standard deviation in m after 1 m, small for wheels. An omnidirectional base may need the value of
+    x_per_m."""
+    xy_per_rad: NotNegative = 0.005
+    """Standard deviation of the position in m after 1 rad of turning in place."""
+    yaw_per_m: NotNegative = 0.02
+    """Standard deviation of the heading in rad after 1 m of driving."""
+    yaw_per_rad: NotNegative = 0.05
+    """Standard deviation of the heading in rad after 1 rad of turning."""
+    floor_xy: Positive = 1e-3
+    """Standard deviation of the position in m per keyframe step that also remains for a robot at rest."""
+    floor_yaw: Positive = 1e-3
+    """Standard deviation of the heading in rad per keyframe step that also remains for a robot at rest."""
+
+
+class Planar(Section):
+    """Configure the deviation of each step from a planar path, because a real floor is not perfectly flat."""
+
+    z: Positive = 1e-3
+    """Standard deviation of the height in m."""
+    tilt: Positive = 1e-3
+    """Standard deviation of roll and of pitch in rad."""
+
+
+class Localization(Section):
+    """Configure the accuracy of absolute poses."""
+
+    xy: Positive = 0.02
+    """Standard deviation of x and of y in m."""
+    yaw: Positive = 0.005
+    """Standard deviation of the heading in rad."""
+
+
+class AssociationSettings(Section):
+    """Configure how rays are associated with objects."""
+
+    method: Literal["auto", "global", "by_label"] = "auto"
+    """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
+    if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
+    hypotheses: Annotated[int, Field(ge=16)] = 1024
+    """Number of points from ray pairs tested per label in one pass. A larger value finds rarer objects and takes longer."""
+    gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
+    """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
+    min_existence: Share = 0.5
+    """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
+    min_rays: Annotated[int, Field(ge=2)] = 3
+    """Minimum number of rays of an object, because two rays of different things often intersect. One or two more rays are
+    needed while the poses have not converged. A larger value finds fewer and more certain objects."""
+    duplicate_distance: Positive = 1.0
+    """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
+    loop_evidence: Positive = 7.0
+    """Minimum log odds that current landmarks match those of an earlier place. A larger value closes fewer loops."""
+    loop_lead: NotNegative = 3.0
+    """Minimum lead in log odds of the best place over the next to close a loop. A larger value separates similar places."""
+    fuse_labels: bool = True
+    """Merge objects of different labels that are the same thing into one object with several labels."""
+
+
+class Triangulation(Section):
+    """Configure the triangulation of objects from rays with known poses."""
+
+    device: Device = "auto"
+    consensus: bool = True
+    """Start from the point with the largest consensus of ray pairs, so that outliers do not shift an object."""
+    hypotheses: Count = 256
+    """Number of ray pairs tested per object."""
+    min_parallax_deg: NotNegative = 3.0
+    """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
+    max_rel_sigma: Positive = 0.5
+    """Maximum standard deviation of a position as a share of the distance. A less certain object is unresolved."""
+
+
+class Fixed(Section):
+    """Configure the estimation of objects with fixed poses."""
+
+    loss: Loss = "l1"
+
+
+class Joint(Section):
+    """Configure the joint estimation of poses and objects."""
+
+    loss: Loss = "huber"
+    factor: Literal["bearing", "point_to_line"] = "bearing"
+    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because this reduces all distances."""
+    min_parallax_deg: NotNegative = 8.0
+    """Minimum parallax in degrees between its rays before a landmark enters the growing graph."""
+    prior_sigma: Positive = 20.0
+    """Standard deviation in m of a weak prior on each landmark. The prior keeps the graph determined."""
+    grow_step: Annotated[int, Field(ge=2)] = 60
+    """Number of keyframes added per step if the log has odometry only."""
+    explore_step: Count = 10
+    """Number of keyframes added per step while the association is unknown. Places are recognised from predicted poses, and
+    predictions are accurate over short distances only."""
+    max_rounds: Count = 6
+    """Maximum number of rounds of association and solving. The rounds stop early if no ray changes its object."""
+    max_iterations: Count = 100
+
+
+class Live(Section):
+    """Configure the mapping while the robot drives."""
+
+    keyframe_distance: NotNegative = 0.01
+    """Camera motion in m since the last keyframe for a new keyframe. The first ten frames at rest are keyframes too."""
+    keyframe_angle_deg: NotNegative = 0.5
+    """Camera rotation in degrees since the last keyframe that makes a frame a keyframe. A frame is also a keyframe if the
+    keyframes at the current place lack one of its labels."""
+    max_keyframes: Annotated[int, Field(ge=50)] = 1500
+    """Maximum number of keyframes, to bound memory and time. Above it, a quarter of the older keyframes is removed with
+    their boxes, and the odometry across each removed keyframe is composed."""
+    max_lag: Positive = 0.35
+    """Maximum waiting time of a frame in s. A frame that waits longer is dropped and counted."""
+    max_late: Positive = 2.0
+    """Maximum time in s by which the timestamp of a frame may be older than the newest pose."""
+    max_frames_waiting: Count = 64
+    """Maximum number of waiting frames. Above it, the oldest frame is dropped and counted."""
+    max_speed: Positive = 5.0
+    """Speed in m/s above which odometry counts as a jump. A turn above four times this number in rad/s is also a jump. After
+    a jump, odometry continues from the last pose."""
+    min_rays: Annotated[int, Field(ge=3)] = 5
+    """Consistent boxes before an object enters the graph. It exceeds association.min_rays, because only current poses are
+    known."""
+    ghost_share: Share = 0.1
+    """Share of detections in frames that should show an object. Below it, the object is dropped. A larger value drops true
+    objects too."""
+    ghost_frames: Count = 40
+    """Frames that should show an object before it can be dropped as false. A larger value keeps false objects longer."""
+    reassociate: Annotated[int, Field(ge=0)] = 6000
+    """Maximum number of boxes for a repeated offline association at the end of a session, which takes a few seconds."""
+    forget: Positive = 5.0
+    """Time in s without observation after which a track of fewer than min_rays boxes is dropped. Its boxes stay
+    unexplained."""
+
+
+class Reconstruction(Section):
+    """Configure the surface of the room, which is fused from depth images at the estimated poses."""
+
+    use: bool = True
+    """Reconstruct the surface if the log has depth images."""
+    before: bool = False
+    """Also reconstruct the surface at the poses of the log, for comparison."""
+    cloud: bool = False
+    """Also write the points of the surface with normals to a separate file."""
+    device: Device = "auto"
+    voxel: Positive = 0.02
+    """Edge length of a voxel in m."""
+    truncation: Positive = 0.06
+    """Distance in m from a surface within which depths are averaged. It exceeds the depth error and 2 voxels, not the
+    thickness of things."""
+    max_depth: Positive = 4.0
+    """Maximum depth in m. Larger depths are ignored."""
+    min_views: Count = 3
+    """Minimum number of depth images that show a surface before the surface is kept."""
+    stride: Count = 1
+    """Step between the depth images that are used. 1 uses every depth image."""
+    max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
+    """Maximum number of depth images. Above it, some images are skipped evenly."""
+    max_blocks: Annotated[int, Field(ge=2048)] = 80_000
+    """Maximum number of blocks of 6^3 voxels in the grid. A block takes 4.3 kB."""
+
+
+class Output(Section):
+    """Configure the files that a run writes."""
+
+    recording: bool = True
+    images: Annotated[int, Field(ge=0)] = 1000
+    """Maximum number of images of each camera in the recording, evenly spread. 0 records no images."""
+    image_width: Annotated[int, Field(ge=16)] = 480
+    """Maximum width in px of an image in the recording. A wider image is reduced by an integer factor."""
+    picture: bool = True

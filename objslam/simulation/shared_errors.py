@@ -1,0 +1,46 @@
+"""Put errors that all measurements share into a log: what a robot with a wrong calibration would have recorded."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from objslam.core.geometry import lift_se2, make_pose, split_se2
+from objslam.core.types import Log, Trajectory
+
+
+def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
+    """Return the log as it would be with shared errors of these values, named as in `core.calibration.Calibration`.
+
+    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, range_scale, and for each CAMERA the names
+    CAMERA.clock, CAMERA.roll, CAMERA.tilt and CAMERA.yaw. The odometry must be planar.
+    """
+    odometry = None if log.odometry is None else _wrong_odometry(log.odometry, errors)
+    cameras = []
+    for one in log.cameras:
+        camera, found = one.camera, one.detections
+        turn = Rotation.from_rotvec([errors.get(f"{camera.name}.{axis}", 0.0) for axis in ("roll", "tilt", "yaw")])
+        rotation = turn.inv().as_matrix() @ camera.base_T_camera[:3, :3]
+        wrong = replace(camera, base_T_camera=make_pose(rotation, camera.base_T_camera[:3, 3]))
+        if found is not None:
+            found = replace(
+                found,
+                frame_stamps=found.frame_stamps - errors.get(f"{camera.name}.clock", 0.0),
+                depths=found.depths / (1 + errors.get("range_scale", 0.0)),
+            )
+        cameras.append(replace(one, camera=wrong, detections=found))
+    return replace(log, odometry=odometry, cameras=tuple(cameras))
+
+
+def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajectory:
+    """The odometry whose ways, turns and turn rates err; a correction by the same values gives back the true one."""
+    scale, turn_scale, turn_bias = (errors.get(f"odometry.{name}", 0.0) for name in ("scale", "turn_scale", "turn_bias"))
+    plane, remainder = split_se2(odometry.poses)
+    yaw, place = np.unwrap(plane[:, 2]), plane[:, :2]
+    turns = (np.diff(yaw) - turn_bias * np.diff(odometry.stamps)) / (1 + turn_scale)
+    said = yaw[0] + np.append(0.0, np.cumsum(turns))
+    chord = np.diff(place, axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))  # in the frame of the middle heading
+    ways = chord / (1 + scale) * np.exp(0.5j * (said[1:] + said[:-1]))
+    path = place[0] @ [1, 1j] + np.append(0, np.cumsum(ways))
+    return Trajectory(odometry.stamps, lift_se2(np.stack([path.real, path.imag, said], axis=1)) @ remainder)

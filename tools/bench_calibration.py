@@ -1,0 +1,111 @@
+"""Is the calibration honest? Simulated drives with shared errors drawn from their priors, with and without calibration."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+
+from objslam.config import Settings, load_settings
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.core.types import Log
+from objslam.mapping import pipeline
+from objslam.simulation import preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
+
+CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
+PRIORS = {
+    "odometry.scale": 0.03,
+    "odometry.turn_scale": 0.05,
+    "odometry.turn_bias": 0.001,
+    "front.clock": 0.1,
+    "front.roll": 0.02,
+    "front.tilt": 0.02,
+    "front.yaw": 0.03,
+    "range_scale": 0.01,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--drives", type=int, default=20)
+    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--first", type=int, default=0, help="the seed of the first drive")
+    options = parser.parse_args()
+    for ranged in (True, False):
+        rows = [drive(options.first + seed, options.frames, ranged) for seed in range(options.drives)]
+        print(f"== {'bearings and ranges' if ranged else 'bearings'}, {options.drives} drives of {options.frames} frames")
+        for kind in (
+            "errors, calibrated",
+            "errors, known",
+            "errors, not calibrated",
+            "none, calibrated",
+            "none, not calibrated",
+        ):
+            errors, squared, seconds = (np.concatenate([row[kind][i] for row in rows]) for i in range(3))
+            rmse, median = np.sqrt(np.mean(errors**2)), np.median(errors)
+            inside, middle = np.mean(squared < CHI2_95), np.median(squared)
+            print(
+                f"{kind:24s} RMSE {rmse:.3f} m, median {median:.3f} m; inside the 95 % ellipsoid {inside:.3f}, "
+                f"squared Mahalanobis median {middle:.2f} (honest: 2.37); {np.mean(seconds):.2f} s of CPU"
+            )
+        for name in rows[0]["parameters"]:
+            deviations = np.array([row["parameters"][name][0] for row in rows])
+            sigma = np.mean([row["parameters"][name][1] for row in rows])
+            print(
+                f"  {name:22s} sigma {sigma:.4f} of prior {PRIORS[name]:.4f}; within 3 sigma {np.mean(deviations < 3):.2f}"
+            )
+
+
+def drive(seed: int, frames: int, ranged: bool) -> dict[str, Any]:
+    """One drive, solved in five ways: object errors (m), squared Mahalanobis distances and seconds of each."""
+    rng = np.random.default_rng((seed, 7))
+    errors = {name: sigma * rng.standard_normal() for name, sigma in PRIORS.items() if ranged or name != "range_scale"}
+    settings = load_settings(
+        None, ("mode=joint", "output.recording=false", f"depth.use={str(ranged).lower()}", "depth.bias=0")
+    )
+    changes: dict[str, Any] = {"localization": None, "odometry": settings.odometry, "frames": frames}
+    changes |= {"pixel_sigma": 3.0, "objects": 12, "classes": 12}
+    if ranged:
+        from objslam.simulation.settings import DepthNoise
+
+        changes["depth"] = DepthNoise()
+    clean = simulate(preset("demo", **changes), seed)
+    wrong, off = (
+        add_shared_errors(clean, errors),
+        settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"use": False})}),
+    )
+    found = solved(wrong, settings)
+    parameters = found[0].summary["calibration"]["parameters"]
+    return {
+        "errors, calibrated": found[1:],
+        "errors, known": solved(clean, off)[1:],
+        "errors, not calibrated": solved(wrong, off)[1:],
+        "none, calibrated": solved(clean, settings)[1:],
+        "none, not calibrated": solved(clean, off)[1:],
+        "parameters": {
+            name: (abs(one["value"] - errors[name]) / one["sigma"], one["sigma"]) for name, one in parameters.items()
+        },
+    }
+
+
+def solved(log: Log, settings: Settings) -> tuple[RunResult, Floats, Floats, Floats]:
+    """A run; its object errors (m), squared Mahalanobis distances and seconds, (n,) each."""
+    begin = time.process_time()
+    result = pipeline.run(log, settings, Ledger())
+    seconds = time.process_time() - begin
+    assert log.truth is not None and log.truth.trajectory is not None
+    true = {o.label: o.position for o in log.truth.objects}
+    objects = result.map.resolved()
+    off = np.array([o.position - true[o.label] for o in objects]).reshape(-1, 3)
+    covariance = np.array([o.covariance for o in objects]).reshape(-1, 3, 3)
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+    return result, np.linalg.norm(off, axis=1), squared, np.array([seconds])
+
+
+if __name__ == "__main__":
+    main()
