@@ -128,7 +128,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         return straight / np.linalg.norm(straight, axis=1, keepdims=True), finite
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    flat = cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0]
+    flat: Floats = np.asarray(cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0], float)
     valid = _misses(camera, flat, pixels) < 0.1
     if not valid.all():
         missed = np.flatnonzero(~valid & np.isfinite(pixels).all(axis=1))
