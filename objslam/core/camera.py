@@ -128,14 +128,48 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         return straight / np.linalg.norm(straight, axis=1, keepdims=True), finite
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    flat = cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0]
-    homogeneous = np.column_stack([flat, np.ones(len(flat))])
-    again = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0]
-    with np.errstate(invalid="ignore", over="ignore"):
-        valid = np.isfinite(flat).all(axis=1) & (np.linalg.norm(again - pixels, axis=1) < 0.1)
+    flat: Floats = np.asarray(cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0], float)
+    valid = _misses(camera, flat, pixels) < 0.1
+    if not valid.all():
+        missed = np.flatnonzero(~valid & np.isfinite(pixels).all(axis=1))
+        flat[missed] = _undistort_newton(camera, pixels[missed])
+        valid[missed] = _misses(camera, flat[missed], pixels[missed]) < 0.1
     directions = np.column_stack([np.where(valid[:, None], flat, 0.0), np.ones(len(flat))])
     valid &= in_field(camera, directions)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True), valid
+
+
+def _misses(camera: Camera, flat: Floats, pixels: Floats) -> Floats:
+    """Return the distance (N,), px, between pixels (N, 2) and the projections of flat (N, 2) at z = 1; inf if not finite."""
+    import cv2
+
+    homogeneous = np.column_stack([flat, np.ones(len(flat))])
+    again = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0]
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(np.isfinite(flat).all(axis=1), np.linalg.norm(again - pixels, axis=1), np.inf)
+
+
+def _undistort_newton(camera: Camera, pixels: Floats) -> Floats:
+    """Return the points (N, 2) at z = 1 of raw pixels (N, 2) by damped Newton steps.
+
+    OpenCV's fixed-point iteration diverges far from the axis of a lens with a strong decentring or prism.
+    """
+    import cv2
+
+    flat = np.zeros_like(pixels)
+    miss = _misses(camera, flat, pixels)
+    factor = np.ones(len(pixels))
+    for _ in range(_TURNS):
+        homogeneous = np.column_stack([flat, np.ones(len(flat))])
+        again, by = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+        slope = by[:, 3:5].reshape(-1, 2, 2)  # by the x and y of the translation, which moves the point
+        step = (np.linalg.pinv(slope) @ (pixels - again[:, 0])[..., None])[..., 0]
+        trial = flat + factor[:, None] * step
+        closer = _misses(camera, trial, pixels)
+        better = closer < miss
+        flat, miss = np.where(better[:, None], trial, flat), np.where(better, closer, miss)
+        factor = np.where(better, np.minimum(1.0, 2 * factor), factor / 2)
+    return flat
 
 
 def _undistort_fisheye(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:

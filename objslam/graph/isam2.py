@@ -131,8 +131,8 @@ class IncrementalGraph(GrowingGraph):
 
     def rebuild(self) -> None:
         """Rebuild iSAM2 from the stored factors, linearised at the current estimate."""
-        self.refresh()
         try:
+            self.refresh()
             self._fill(self._store.graph())
         except RuntimeError:
             self._rescue()

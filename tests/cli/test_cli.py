@@ -645,7 +645,7 @@ def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
     [
         ("objects.json", b"{", "not JSON"),
         ("objects.json", b"[]", "not an objects file"),
-        ("objects.json", b"\xff\xfe", "not text"),
+        ("objects.json", b"\xff\xfe", "not UTF-8 text"),
         ("objects.json", None, "missing"),
         ("trajectory.txt", b"hello\n", "8 numbers"),
         ("trajectory.txt", None, "missing"),

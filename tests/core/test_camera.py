@@ -102,6 +102,18 @@ def test_what_is_in_view_is_what_its_pixel_shows(lens, seed, focal):
     assert in_field(one, found[valid]).all()
 
 
+def test_a_pixel_far_from_the_axis_of_a_prism_shows_its_direction():
+    """OpenCV's own iteration does not converge there."""
+    one = camera(*LENSES["prism"], focal=150.0)
+    directions = np.random.default_rng(50899051).standard_normal((300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions[directions[:, 2] > np.cos(np.radians(70.0))]
+    shown, pixels = in_view(one, directions)
+    found, valid = undistort(one, pixels)
+    assert valid.all()
+    np.testing.assert_allclose(found, directions[shown], atol=1e-4)
+
+
 def test_a_pixel_shows_nothing_from_behind_the_fold():
     # r (1 - 0.5 r^2 + 0.1 r^4) rises up to r = 1, falls, and rises again from r = 1.41 on
     one = camera(*LENSES["folds twice"], width=2000, height=2000)

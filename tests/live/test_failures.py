@@ -4,7 +4,6 @@ import importlib
 import json
 import sys
 import threading
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -216,7 +215,7 @@ def test_the_command_leaves_the_last_snapshot_where_no_result_can_be_made(folder
 @pytest.mark.parametrize("when", [1, 2])
 def test_a_view_that_breaks_costs_no_map(folder, command, tmp_path, monkeypatch, when):
     """The first snapshot after the drive is shown while the source goes on, the last one at the end."""
-    shown, make = [], live_command._replay
+    shown, make = [], live_command.Feed
     driven, seen = threading.Event(), threading.Event()
 
     def view(snapshot):
@@ -226,17 +225,15 @@ def test_a_view_that_breaks_costs_no_map(folder, command, tmp_path, monkeypatch,
             if len(shown) >= when:
                 raise RuntimeError("the window\nwent")
 
-    def feed(*what):
-        found, truth = make(*what)
-
+    def feed_with_view(source):
         def run(stop):
-            found.adapter.run(stop)
+            source.run(stop)
             driven.set()
             seen.wait(PATIENCE)
 
-        return replace(found, adapter=SimpleNamespace(ledger=found.adapter.ledger, run=run), views=(view,)), truth
+        return make(SimpleNamespace(ledger=source.ledger, run=run), views=(view,))
 
-    monkeypatch.setattr(live_command, "_replay", feed)
+    monkeypatch.setattr(live_command, "Feed", feed_with_view)
     code, lines = command(folder, tmp_path / "out", "--speed", "0", "--interval", "0.1")
     assert code == 1
     assert "internal error, RuntimeError: the window went (" in lines[-1]
@@ -246,19 +243,13 @@ def test_a_view_that_breaks_costs_no_map(folder, command, tmp_path, monkeypatch,
 
 
 def test_what_is_said_of_a_source_that_breaks_is_one_line(folder, command, tmp_path, monkeypatch):
-    make = live_command._replay
+    run = ReplayAdapter.run
 
-    def feed(*what):
-        found, truth = make(*what)
-        run = found.adapter.run
+    def run_then_break(adapter, stop):
+        run(adapter, stop)
+        raise LogError("the plug\nwas pulled")
 
-        def runs_then_breaks(stop):
-            run(stop)
-            raise LogError("the plug\nwas pulled")
-
-        return replace(found, adapter=SimpleNamespace(ledger=found.adapter.ledger, run=runs_then_breaks)), truth
-
-    monkeypatch.setattr(live_command, "_replay", feed)
+    monkeypatch.setattr(ReplayAdapter, "run", run_then_break)
     code, lines = command(folder, tmp_path / "out", "--speed", "0")
     assert code == 0
     assert "warning: the source ended: the plug was pulled" in lines

@@ -462,7 +462,7 @@ def test_loading_what_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"no result here: trajectory.txt is missing"):
         load_trajectory(tmp_path)
     (tmp_path / ".objslam-staging").mkdir()
-    with pytest.raises(OutputError, match="run again"):
+    with pytest.raises(OutputError, match="run it again"):
         load_map(tmp_path)
 
 
