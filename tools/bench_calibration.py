@@ -98,7 +98,7 @@ def solved(log: Log, settings: Settings) -> tuple[RunResult, Floats, Floats, Flo
     begin = time.process_time()
     result = pipeline.run(log, settings, Ledger())
     seconds = time.process_time() - begin
-    assert log.truth is not None and log.truth.trajectory is not None
+    assert log.truth is not None
     true = {o.label: o.position for o in log.truth.objects}
     objects = result.map.resolved()
     off = np.array([o.position - true[o.label] for o in objects]).reshape(-1, 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,8 @@ from objslam.cli.options import Config, DetectorModel, Mode, Out, Set, settings_
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
     from objslam.core.result import RunResult
@@ -75,6 +77,8 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         numbers = (str(o.rays), f"{o.parallax_deg:.1f}", f"{o.rms_deg:.2f}")
         table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")
     console().print(table)
+    if calibration := result.summary.get("calibration"):
+        console().print(_calibration_table(calibration))
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(
@@ -84,3 +88,20 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     if removed:
         say(f"removed the older result from {out}: {', '.join(removed)}")
     say(f"wrote {out}")
+
+
+def _calibration_table(calibration: dict[str, Any]) -> Table:
+    """Return a table of the shared errors, and which of them the log does not determine."""
+    from rich.table import Table
+
+    pairs = "; ".join(" and ".join(pair) for pair in calibration["traded_off"])
+    table = Table(
+        title="errors that all measurements share", caption=f"this log cannot tell apart: {pairs}" if pairs else None
+    )
+    for name in ("error", "found", "sigma", "prior sigma", "unit", ""):
+        table.add_column(name, justify="left" if name in ("error", "unit", "") else "right")
+    for name, of in calibration["parameters"].items():
+        numbers = (f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
+        remark = "" if of["observable"] else "not observable from this log"
+        table.add_row(name, *numbers, of["unit"], remark, style="" if of["observable"] else "dim")
+    return table

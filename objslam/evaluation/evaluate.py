@@ -19,15 +19,21 @@ from objslam.results.read import load_map, load_trajectory, load_truth
 
 MAX_TRUTH_GAP = 1.0
 """The longest interpolated gap between two true poses in s. A pose in a longer gap has no truth."""
+INSIDE_95 = 5.991
+"""The squared Mahalanobis distance within which 95 % of honest errors lie (chi-squared, 2 degrees of freedom)."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Hold a map object, its true object, and the offset (3,) map minus truth in m after the alignment."""
+    """Hold a map object, its true object, and the offset (3,) map minus truth in m after the alignment.
+
+    squared: squared Mahalanobis distance of the offset in x and y, by the covariance of the object. None without one.
+    """
 
     object: MapObject
     truth: TruthObject
     offset: Floats
+    squared: float | None
 
     @property
     def error(self) -> float:
@@ -173,12 +179,23 @@ def _score_objects(
     moved = transform.apply(ours)
     rows, columns = match_points(moved, theirs, same, radius)
     return ObjectScores(
-        matches=tuple(Match(mapped[i], true[k], moved[i] - theirs[k]) for i, k in zip(rows, columns, strict=True)),
+        matches=tuple(
+            _match(mapped[i], true[k], moved[i] - theirs[k], transform) for i, k in zip(rows, columns, strict=True)
+        ),
         missed=tuple(true[k] for k in np.setdiff1d(np.arange(len(true)), columns)),
         false=tuple(mapped[i] for i in np.setdiff1d(np.arange(len(mapped)), rows)),
         unresolved=len(map) - len(mapped),
         transform=transform,
     )
+
+
+def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
+    """A match with its offset (3,) after the alignment, and the offset in units of the object's own covariance."""
+    if found.covariance is None:
+        return Match(found, true, offset, None)
+    turn = transform.scale * transform.pose[:3, :3]
+    covariance = (turn @ found.covariance @ turn.T)[:2, :2]
+    return Match(found, true, offset, float(offset[:2] @ np.linalg.pinv(covariance, hermitian=True) @ offset[:2]))
 
 
 def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
@@ -198,10 +215,14 @@ def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Align
 
 def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
     counts = ("matched", "missed", "false", "unresolved", "precision", "recall")
+    honest = ("mahalanobis_median", "inside_95")
     if scores is None:
-        return {**dict.fromkeys(counts), **_summary("position_", None), "transform": None}
+        return {**dict.fromkeys((*counts, *honest)), **_summary("position_", None), "transform": None}
     found = (len(scores.matches), len(scores.missed), len(scores.false), scores.unresolved, scores.precision, scores.recall)
     numbers = dict(zip(counts, found, strict=True))
+    squared = [m.squared for m in scores.matches if m.squared is not None]
+    median, inside = (float(np.median(squared)), float(np.mean(np.array(squared) <= INSIDE_95))) if squared else (None, None)
+    numbers |= dict(zip(honest, (median, inside), strict=True))
     return {**numbers, **_summary("position_", scores.errors), "transform": _transform_dict(scores.transform)}
 
 
@@ -222,7 +243,14 @@ def _listing(scores: ObjectScores | None) -> dict[str, Any]:
     if scores is None:
         return {"objects": [], "missed_objects": [], "false_objects": []}
     matches = [
-        {"id": m.object.id, "truth_id": m.truth.id, "label": m.truth.label, "error": m.error, "offset": m.offset.tolist()}
+        {
+            "id": m.object.id,
+            "truth_id": m.truth.id,
+            "label": m.truth.label,
+            "error": m.error,
+            "offset": m.offset.tolist(),
+            "mahalanobis": m.squared,
+        }
         for m in scores.matches
     ]
     return {

@@ -19,6 +19,8 @@ _OBJECT_ROWS = (
     ("position_rmse", "position RMSE", " m"),
     ("position_median", "position median", " m"),
     ("position_max", "position max", " m"),
+    ("mahalanobis_median", "squared Mahalanobis in x, y, median (honest: 1.39)", ""),
+    ("inside_95", "share of truths inside the 95 % ellipse", ""),
 )
 """The rows about objects: key in evaluation.json, name in the table, and unit."""
 

@@ -19,8 +19,8 @@ from objslam.core.types import CameraLog, Images, Keyframes, Log, Rays, Trajecto
 from objslam.frontend.odometry_drift import gathered_drift
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
-"""The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are noisy
-and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
+"""The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
+noisy and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01
 """The step of every other parameter, in its unit; the measurements are close to linear over it."""
 _MOST_SIGMAS = 6.0

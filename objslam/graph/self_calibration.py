@@ -3,6 +3,8 @@
 An outer Gauss-Newton step moves the parameters; an inner solve moves poses and landmarks to the measurements that result.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -11,7 +13,7 @@ import gtsam
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements, Calibration
+from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
 from objslam.core.geometry import exp_se3
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
@@ -30,6 +32,8 @@ _TOLERANCE = 1e-4
 """The relative decrease of the cost in an iteration below which an inner solve ends. A larger value ends it sooner."""
 _HALVINGS = 3
 """How often a step that does not lower the cost is halved before the parameters are left as they are."""
+_LEAST_SIGNAL = 0.05
+"""The least share of signal in the information about a clock. A smaller share lets a noisy clock move farther in a step."""
 _MEMORY = 3
 """The steps that Anderson's acceleration looks back on; more extrapolates farther, and less safely."""
 
@@ -61,22 +65,25 @@ def calibrate(
     Raises:
         SolveError: a linear system has no single solution.
     """
-    weight = errors.prior**-2.0
+    prior = np.diag(errors.prior**-2.0)
     state = _State.of(remeasure(theta), association, found.map_T_camera, found.positions, found.used)
     history: list[tuple[Floats, Floats]] = []
+    signal: Floats | None = None
     for _ in range(_ROUNDS):
         system = state.reduced(errors, theta)
-        posterior = np.linalg.inv(system.information + np.diag(weight))
-        step = posterior @ (system.gradient - weight * theta)
-        if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(posterior))).all():
+        if signal is None:
+            signal = _signal_shares(state, system, errors, remeasure, theta)
+        curvature, covariance = _curvature(system.information, signal, prior)
+        step = np.linalg.solve(curvature, system.gradient - prior @ theta)
+        if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
             break
         history = [*history[-_MEMORY:], (theta, step)]
         target = _accelerated(history, errors.prior)
-        before = state.cost + 0.5 * float((weight * theta**2).sum())
+        before = state.cost + 0.5 * float(theta @ prior @ theta)
         for _ in range(_HALVINGS + 1):
             other = np.clip(target, -errors.bounds, errors.bounds)
             trial = state.moved(system, other - theta, remeasure(other))
-            if trial.cost + 0.5 * float((weight * other**2).sum()) <= before:
+            if trial.cost + 0.5 * float(other @ prior @ other) <= before:
                 break
             target, history = theta + (target - theta) / 2, []
         else:
@@ -86,11 +93,46 @@ def calibrate(
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, None)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
     system = state.reduced(errors, theta)
-    posterior = np.asarray(np.linalg.inv(system.information + np.diag(weight)), dtype=np.float64)
+    assert signal is not None
+    _, covariance = _curvature(system.information, signal, prior)
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     sensitivity[state.landmarks] = system.sensitivity[: 3 * len(state.landmarks)].reshape(-1, 3, len(theta))
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + final.iterations)
-    return CalibratedSolution(Calibration(errors.names, theta, posterior, errors.prior), state.measured, final, sensitivity)
+    return CalibratedSolution(Calibration(errors.names, theta, covariance, errors.prior), state.measured, final, sensitivity)
+
+
+def _signal_shares(
+    state: _State, system: ReducedSystem, errors: CalibratedMeasurements, remeasure: Remeasure, theta: Floats
+) -> Floats:
+    """Return the shares (P,) of the diagonal of the information that are signal; 1 but for clocks.
+
+    The derivative of a motion by a clock is a difference of measured velocities. Their noise enters the Jacobian, and makes
+    its square too large. It does not enter the change of the gradient between two values of the clock.
+    """
+    shares = np.ones(len(theta))
+    for k in np.flatnonzero([kind(name) == "clock" for name in errors.names]).tolist():
+        step = errors.steps[k] * np.eye(len(theta))[k]
+        sides = [
+            state.moved(system, s * step, remeasure(theta + s * step)).reduced(errors, theta + s * step) for s in (1, -1)
+        ]
+        change = (sides[1].gradient[k] - sides[0].gradient[k]) / (2 * errors.steps[k])
+        shares[k] = np.clip(change / max(system.information[k, k], 1e-300), _LEAST_SIGNAL, 1.0)
+    return shares
+
+
+def _curvature(information: Floats, signal: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
+
+    The gradient varies as the whole information says, also by the noise in it, while the curvature is that of the signal
+    alone. Hence the covariance is a sandwich (Huber 1967).
+    """
+    noise = np.diag((1 - signal) * np.diagonal(information))
+    curvature = information - noise + prior
+    while np.linalg.eigvalsh(curvature)[0] <= 0:
+        noise = 0.8 * noise
+        curvature = information - noise + prior
+    inverse = np.linalg.inv(curvature)
+    return curvature, np.asarray(inverse @ (information + prior) @ inverse)
 
 
 def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:

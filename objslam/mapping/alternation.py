@@ -73,9 +73,9 @@ def solve(
     and solve alternate until no ray changes its object. If the settings ask for it, every label is one object instead. The
     joint mode also tries this if no frame has two boxes of one label, and keeps it if the rays agree.
 
-    frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With a start, the
-    joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. The joint mode
-    estimates them, and takes them out of the solution's keyframes and rays. SolveError if the joint mode has neither odometry
+    frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
+    the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. The joint mode
+    estimates them, and takes them out of the keyframes and rays. SolveError if the joint mode has neither odometry
     nor localisation.
     """
     from objslam.graph import batch_solver

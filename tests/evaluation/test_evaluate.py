@@ -359,3 +359,33 @@ def test_where_no_truth_was_found_is_named(tmp_path: Path) -> None:
     (tmp_path / "empty.json").write_text(dump_truth_objects(()))
     with pytest.raises(LogError, match=r"empty\.json: the ground truth is empty"):
         evaluate_folder(tmp_path / "out", tmp_path / "empty.json")
+
+
+@pytest.mark.parametrize("kind", ["none", "se2", "sim2"])
+def test_honest_covariances_hold_the_truth_as_often_as_they_say(kind):
+    """Errors drawn from the covariances themselves: 95 % of them lie inside, and the median is chi-squared's."""
+    rng = np.random.default_rng(5)
+    count = 3000
+    places = rng.uniform(-50, 50, (count, 3))
+    roots = rng.normal(scale=0.02, size=(count, 3, 3))
+    pose, scale = lift_se2(np.array([3.0, -2.0, 0.7])), 1.0 if kind != "sim2" else 1.3
+    pose = np.eye(4) if kind == "none" else pose
+    errors = (roots @ rng.standard_normal((count, 3, 1)))[..., 0]
+    labels = [f"thing {i}" for i in range(count)]
+    turned = (places + errors) @ pose[:3, :3].T * scale + pose[:3, 3]
+    covariances = scale**2 * pose[:3, :3] @ roots @ np.swapaxes(roots, 1, 2) @ pose[:3, :3].T
+    objects = [
+        dataclasses.replace(an_object(i, label, at), covariance=c)
+        for i, (label, at, c) in enumerate(zip(labels, turned, covariances, strict=True))
+    ]
+    data = evaluate(ObjectMap(tuple(objects)), a_truth(places, labels), align=kind).to_dict()
+    assert data["matched"] == count
+    assert data["inside_95"] == pytest.approx(0.95, abs=0.02)
+    assert data["mahalanobis_median"] == pytest.approx(1.386, rel=0.1)
+
+
+def test_objects_without_a_covariance_say_nothing_of_honesty():
+    places = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    data = evaluate(a_map(places, ["a", "b", "c"]), a_truth(places, ["a", "b", "c"])).to_dict()
+    assert data["mahalanobis_median"] is None
+    assert data["inside_95"] is None

@@ -1,0 +1,111 @@
+"""The joint solve with shared errors: against brute force, the errors that were put in, and what a log cannot tell."""
+
+import numpy as np
+import pytest
+from drives import drive_of
+from numpy.testing import assert_allclose
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse
+from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.graph.assembly import Measurements
+from objslam.graph.batch_solver import solve_joint
+from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.shared_error_jacobian import reduce_system
+from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
+
+ERRORS = {
+    "odometry.scale": -0.03,
+    "odometry.turn_scale": 0.05,
+    "front.clock": 0.12,
+    "front.roll": 0.015,
+    "front.tilt": -0.02,
+    "front.yaw": 0.03,
+}
+
+
+def drive(errors, seed=1, overrides=(), **changes):
+    settings = load_settings(None, ("mode=joint", "depth.bias=0", *overrides))
+    changes = {"frames": 300, "objects": 12, "classes": 12, "localization": None, "odometry": Odometry(), **changes}
+    log = simulate(preset("demo", pixel_sigma=3.0, **changes), seed)
+    log = add_shared_errors(log, errors)
+    made = drive_of(log, settings)
+    return made, shared_errors(log, made.keyframes, made.rays, settings)
+
+
+def solve(made, errors):
+    return solve_joint(made.keyframes, made.rays, made.association, made.settings, Ledger(), errors=errors)
+
+
+def optimum(errors: SharedErrors, theta, made, start):
+    """Camera poses, positions, cost and graph of the solve with held parameters, for all rays."""
+    measured = Measurements.of(*errors.at(theta))
+    landmarks = np.arange(made.association.count)
+    which = np.arange(len(made.rays))
+    graph = build_graph(measured.factors(made.association.object, which, landmarks, start[1]))
+    found = levenberg_marquardt(graph, make_values(start[0], start[1], landmarks), 200, 1e-14)
+    places = with_points(start[1], landmarks, found.values)
+    return read_poses(found.values), places, found.cost_after, graph, found.values, measured
+
+
+@pytest.mark.parametrize("localization", [None, PoseNoise(xy=0.02, yaw=0.005)])
+def test_the_reduced_system_is_that_of_solving_anew(localization):
+    """Brute force: solve at parameters that differ a little; the positions move as the sensitivity says."""
+    more = ("calibration.focal=0.01", "calibration.translation=0.01")
+    made, errors = drive({}, overrides=more, frames=60, depth=DepthNoise(), missed=0.0, false=0.0, localization=localization)
+    theta = np.zeros(len(errors.names))
+    true = made.map_T_base @ made.keyframes.base_T_camera
+    start = (made.keyframes.map_T_camera[0] @ inverse(true[0])) @ true, made.points
+    poses, places, _, graph, values, measured = optimum(errors, theta, made, start)
+    rays = np.arange(len(made.rays))
+    system = reduce_system(graph, values, measured, errors, theta, rays, made.association.object, places, poses)
+    told = system.sensitivity[: 3 * len(places)].reshape(-1, 3, len(theta))
+    for k, step in enumerate(0.1 * errors.steps):
+        ahead, behind = (optimum(errors, theta + s * step * np.eye(len(theta))[k], made, (poses, places)) for s in (1, -1))
+        moved = (ahead[1] - behind[1]) / (2 * step)
+        assert_allclose(told[..., k], moved, atol=0.05 * np.abs(moved).max() + 1e-6, err_msg=errors.names[k])
+        slope = (ahead[2] - behind[2]) / (2 * step)
+        assert -system.gradient[k] == pytest.approx(slope, abs=0.1 * np.sqrt(system.information[k, k]), rel=0.1)
+
+
+@pytest.mark.parametrize("ranged", [True, False])
+def test_the_errors_of_a_log_are_found(ranged):
+    made, errors = drive(ERRORS, depth=DepthNoise() if ranged else None)
+    found, plain = solve(made, errors), solve(made, None)
+    true = np.array([ERRORS.get(name, 0.0) for name in errors.names])
+    deviation = np.abs(found.calibration.values - true) / found.calibration.sigma
+    assert (deviation < 4).all(), dict(zip(errors.names, deviation, strict=True))
+    told = found.calibration.sigma < 0.5 * errors.prior
+    assert {"front.clock", "front.yaw", "front.tilt", "front.roll"} <= set(np.array(errors.names)[told])
+    align = "se2" if ranged else "sim2"
+    assert np.median(made.object_errors(found.positions, align)) < 0.7 * np.median(
+        made.object_errors(plain.positions, align)
+    )
+
+
+def test_what_bearings_do_not_tell_stays_at_its_prior_and_widens_the_map():
+    made, errors = drive(ERRORS, overrides=("calibration.scale=0.05",))
+    found, held = solve(made, errors), solve(*drive(ERRORS, overrides=("calibration.scale=0",)))
+    k = errors.names.index("odometry.scale")
+    assert abs(found.calibration.values[k]) < 0.2 * 0.05
+    assert found.calibration.sigma[k] > 0.95 * 0.05
+    assert not found.calibration.to_dict()["parameters"]["odometry.scale"]["observable"]
+    away = found.positions - made.keyframes.map_T_base[0, :3, 3]
+    distance = np.linalg.norm(away, axis=1)
+    unit = away / distance[:, None]
+    more = np.einsum("ni,nij,nj->n", unit, found.covariance - held.covariance, unit)
+    assert_allclose(np.sqrt(more), 0.05 * distance, rtol=0.25, atol=0.02)
+
+
+def test_two_scales_that_trade_off_are_said():
+    made, errors = drive({}, depth=DepthNoise(), overrides=("calibration.scale=0.1", "calibration.range_scale=0.1"))
+    assert ("odometry.scale", "range_scale") in solve(made, errors).calibration.traded_off()
+
+
+def test_without_errors_the_map_is_as_good():
+    made, errors = drive({}, depth=DepthNoise())
+    found, plain = solve(made, errors), solve(made, None)
+    assert np.median(made.object_errors(found.positions)) < 1.2 * np.median(made.object_errors(plain.positions)) + 0.01
