@@ -247,7 +247,7 @@ def depths(camera: Camera, points: Floats) -> Floats:
 
 
 def _fisheye_radius(camera: Camera) -> Floats:
-    """Return the coefficients (10,), lowest power first, of the polynomial from angle (rad) to image radius (focal lengths)."""
+    """Return the polynomial (10,), lowest power first, that turns an angle (rad) into an image radius (focal lengths)."""
     radius = np.zeros(10)
     radius[1::2] = 1.0, *camera.distortion
     return radius
@@ -274,7 +274,7 @@ def _growth(camera: Camera, angle: Floats) -> Floats:
 
 
 def _edge(low: float, right: float, bottom: float, pieces: int) -> Floats:
-    """Return pixels (4 * pieces, 2) around the rectangle with the corners (low, low), the first pixel, and (right, bottom)."""
+    """Return pixels (4 * pieces, 2) around the rectangle from corner (low, low) to (right, bottom), (low, low) first."""
     along = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
     corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
     return np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

@@ -122,7 +122,7 @@ def skew(v: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles, whether each is small enough for a series, and the angles with 1 in place of small ones."""
+    """Return the rotation angles, whether each needs a series because it is small, and the angles with 1 for small ones."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)

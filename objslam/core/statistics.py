@@ -79,7 +79,7 @@ def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
 
 
 def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> Floats:
-    """Return for each group (N,) the least of its values that has `share` of them before it in order. NaN without values."""
+    """Return for each group (N,) the value at the given share of its sorted values. A group without values gives NaN."""
     return grouped_quantiles(values, index, count, (share,))[0]
 
 

@@ -109,8 +109,7 @@ class Images:
 class CameraLog:
     """The data of one camera.
 
-    mount: base_T_camera over time, for a camera that moves on the robot, for example on an arm. It is None if
-    camera.base_T_camera holds all the time.
+    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds all the time.
     """
 
     camera: Camera
@@ -141,7 +140,7 @@ class Truth:
 class Log:
     """The log of a robot, with odometry, localisation or both.
 
-    odometry: odom_T_base. localization: map_T_base. path: the absolute path of the file or folder, None without one.
+    odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
     """
 
     name: str

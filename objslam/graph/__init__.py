@@ -1,4 +1,4 @@
-"""The factor graph, batch and incremental: variables, factors, optimisers and marginals, the only folder that knows GTSAM.
+"""The factor graph, batch and incremental, with variables, factors, optimisers and marginals. Only this folder uses GTSAM.
 
 The alternation of association and solve is in `mapping`.
 """

@@ -1,4 +1,4 @@
-"""Compute motions between keyframes by odometry, their covariances, and their factors."""
+"""Compute the motions between keyframes that odometry measures, with their covariances and their factors."""
 
 import gtsam
 import numpy as np
@@ -33,7 +33,7 @@ def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = No
 
 
 def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
-    """Return whether the odometry is planar. With a localisation, each stretch may have a plane of its own."""
+    """Return whether the odometry is planar. With a localisation, each stretch without a gap may have its own plane."""
     stretch = keyframes.stretch
     if stretch is None or not keyframes.localized_every:
         return is_planar(odom_T_base)
