@@ -61,7 +61,7 @@ class Camera:
 
     @cached_property
     def fisheye(self) -> bool:
-        """Whether the image radius of a point grows with its angle to the optical axis. Else it grows with the tangent."""
+        """Whether the image radius of a point grows with its angle to the optical axis, not with the angle's tangent."""
         return self.distortion_model == "equidistant"
 
     @cached_property
@@ -143,7 +143,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def _misses(camera: Camera, flat: Floats, pixels: Floats) -> Floats:
-    """Return the distances (N,), px, of pixels from the projected points `flat` (N, 2) at z = 1. A NaN point gives inf."""
+    """Return the distances (N,), px, of pixels from projections of `flat` (N, 2) at z = 1. Non-finite points give inf."""
     import cv2
 
     homogeneous = np.column_stack([flat, np.ones(len(flat))])
@@ -242,7 +242,7 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return the depth (N,), m, by which the image size of points (N, 3) shrinks: z, or the distance for a fisheye."""
+    """Return for points (N, 3) the depth (N,), m, that divides their size in the image: z, or the distance for a fisheye."""
     return np.asarray(np.linalg.norm(points, axis=1) if camera.fisheye else points[:, 2])
 
 

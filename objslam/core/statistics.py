@@ -1,7 +1,7 @@
 """Statistical thresholds that several packages share, and medians of groups.
 
 A deviation is a residual divided by its standard deviation, or the norm of several such residuals. The deviation of a ray is
-the norm of the two residuals across the ray. The nominal noise of a ray is its `Rays.sigma`.
+the norm of the two residuals across the ray. The nominal noise of a ray is the standard deviation that the settings give it.
 """
 
 import math
@@ -18,12 +18,12 @@ SAME_POINT_WIDE = 16.266
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-A Gaussian number has the same share within 3 standard deviations. A larger deviation tries less likely motions."""
+It is also the share of a single Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
 """The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
 cost of a ray that fits no object. A larger deviation gives stray rays more influence on the solution."""
 OUTLIER_RAY = 4.0
-"""The deviation above which a ray is rejected. It rejects 3e-4 of an object's own rays (Rayleigh, exp(-4^2 / 2)). A larger
+"""The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
 """The largest deviation that one ray adds to the measured noise of its object. A larger deviation lets a false box raise
@@ -32,10 +32,10 @@ HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives stray rays more influence."""
 HUBER_K = 1.345
-"""The deviation above which Huber's loss grows linearly. It is 95 % efficient on Gaussian noise (Huber, Robust Statistics,
-1981). A larger deviation is more efficient and less robust."""
+"""The deviation above which Huber's loss grows linearly. This loss is 95 % efficient on Gaussian noise (Huber, Robust
+Statistics, 1981). A larger deviation is more efficient and less robust."""
 CAUCHY_K = 2.385
-"""The deviation that scales Cauchy's loss. It is 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger
+"""The deviation that scales Cauchy's loss. This loss is 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger
 deviation is more efficient and less robust."""
 RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 """The median norm of a standard Gaussian in the plane. It scales the median residual of rays to a standard deviation."""

@@ -50,7 +50,7 @@ class Round:
 
 @dataclass
 class Trace:
-    """A collector of the rounds of an estimation. base_T_camera: (K, 4, 4) the mounting of the camera at each keyframe."""
+    """A collector of the rounds of an estimation. base_T_camera: (K, 4, 4) the camera on the robot at each keyframe."""
 
     base_T_camera: Floats
     rounds: list[Round] = field(default_factory=list)

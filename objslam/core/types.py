@@ -153,15 +153,15 @@ class Log:
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Images of all cameras, in the order of time, with the robot poses before the estimation.
+    """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
     stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of
     this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
     localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
     absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
     None without odometry. drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the same
-    coordinate frame. stretch: (K,) the number of the stretch of odometry without a gap in which the keyframe lies, None if
-    all lie in one. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning.
+    coordinate frame. stretch: (K,) gaps split the odometry into stretches, and this is their number at each keyframe. None
+    means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats

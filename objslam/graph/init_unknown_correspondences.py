@@ -28,8 +28,8 @@ from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
 from objslam.graph.variables import make_values, read_points, read_poses
 
 _HORIZON = 0.1
-"""The drift in heading (rad, one standard deviation) since its last observation, up to which a landmark is expected at its
-position. A larger drift recognises landmarks after a longer absence, and confuses neighbouring landmarks more often."""
+"""A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
+landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
@@ -45,7 +45,7 @@ _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 needs more, because it starts farther from its optimum."""
 _STRAIN = 200.0
 """The amount, for each joined landmark, by which a loop closure may raise the cost (a sum of squared deviations). A larger
-amount closes more wrong loops. On MRCLAM, correct loops raised the cost by up to 110, and wrong ones by 240 or more."""
+amount closes more wrong loops. On MRCLAM, correct loops took up to 110 for each landmark, and wrong ones 240 or more."""
 
 
 @dataclass(frozen=True)
@@ -146,14 +146,14 @@ def _close(
 
 
 def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Return the landmarks (N,) since whose last observation the heading has drifted by less than `_HORIZON`, as a mask."""
+    """Return for each landmark (N,) whether the heading drifted by less than `_HORIZON` since its last observation."""
     return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
 
 
 def _recognise(
     rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and the poses (K, 4, 4) with the new ones aligned to them."""
+    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4), aligned from keyframe `begin` on."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)

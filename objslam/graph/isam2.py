@@ -49,8 +49,8 @@ class IncrementalGraph(GrowingGraph):
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
-        An update eliminates all cliques between an observed variable and the root again. So this call moves variables that
-        may be observed near the root, unless they are there. relinearise: also linearise variables again that have changed.
+        An update eliminates all cliques between an observed variable and the root again. So this call moves a variable near
+        to the root if it may be observed and is not there yet. relinearise: whether to relinearise changed variables too.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():

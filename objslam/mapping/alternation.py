@@ -106,7 +106,7 @@ def solve(
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them. Rays hold none of the other poses."""
+    """Return the keyframes that have a ray, and the rays with indices into them. Other poses depend on odometry only."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
 

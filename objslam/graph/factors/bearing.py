@@ -22,7 +22,7 @@ _CENTRE = np.zeros(2)
 
 
 def bearings(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray on the angle (rad) between its direction (R, 3) and L(landmark), in camera X(keyframe)."""
+    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe)."""
     make, unit = gtsam.BearingFactor3D, gtsam.Unit3
     return [
         make(X0 + k, L0 + j, unit(direction), model)
