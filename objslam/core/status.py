@@ -14,7 +14,7 @@ FEWEST_RAYS = 2
 
 
 def is_resolved(sigma: Any, reach: Any, rays: Any, parallax: Any, ranged: Any, limits: config.Triangulation) -> Any:
-    """Return whether the position of each object (N,) is reliable. The arguments are arrays, tensors, or scalars for one object.
+    """Return whether the position of each object (N,) is reliable. Arguments are arrays, tensors, or scalars for one object.
 
     sigma: (N,) m, as `Estimate.seen_sigma`, but inf or NaN if the rays do not determine the position. reach: (N,) m, as the
     function `reach` returns it. rays: (N,) number of inliers. parallax: (N,) rad, the widest angle between these rays.

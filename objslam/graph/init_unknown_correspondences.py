@@ -39,7 +39,7 @@ _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
 covariance, plus the standard deviations `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
-A wrong landmark disturbs all later poses."""
+With fewer rays, more wrong landmarks enter, and each of them disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 """The numbers of iterations of the solve after a step and of the solve after a loop closure. More are slower. The latter
 needs more, because it starts farther from its optimum."""

@@ -79,7 +79,7 @@ class IncrementalRebuild:
         self.isam.update(graph, values)
 
     def finish(self, variables: Variables) -> None:
-        """Add the later variables and factors, linearised at `variables`. RuntimeError if the graph is indeterminate."""
+        """Add the later variables at their values in `variables`, and all other factors. RuntimeError if indeterminate."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key in self._alone:
             self._bring(key, graph, values)

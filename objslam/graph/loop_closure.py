@@ -114,7 +114,7 @@ def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
 
 
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
-    """Return covariances (3, 3) of the x, y and yaw, along the axes of map, of keyframe `now` relative to each anchor.
+    """Return covariances (3, 3) of keyframe `now` relative to each anchor, for x, y and yaw along the axes of map.
 
     anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`.
     """
@@ -135,7 +135,7 @@ def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, 
     """Return a path (K, 4, 4) with a correction (4, 4) spread over the keyframes from `begin` to `end`.
 
     drift: (K,) accumulated along the path. The share of the correction that a keyframe gets is the share of the drift
-    between `begin` and `end` that has gathered there. Earlier keyframes get nothing. Later keyframes get the whole.
+    between `begin` and `end` that has gathered there. Earlier keyframes get nothing. Later ones get all of it.
     """
     gathered = drift - drift[begin]
     share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)
