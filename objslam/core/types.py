@@ -186,8 +186,8 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, it counts as
-        measured all the same. Without odometry, no motion is measured.
+        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, it counts
+        as measured all the same. Without odometry, no motion is measured.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:
