@@ -81,7 +81,8 @@ class Cameras:
     def add(self, boxes: Boxes) -> None:
         """Push boxes, or keep them until they can be pushed.
 
-        Boxes from a second topic of one camera are dropped, because they would count objects twice."""
+        Boxes from a second topic of one camera are dropped, because they would count objects twice.
+        """
         if len(self._topics) < _MAX_CAMERAS and self._topics.setdefault(boxes.frame, boxes.topic) != boxes.topic:
             self._drop("detection frame from a second topic of its camera", boxes.place)
             return
@@ -175,7 +176,8 @@ class Cameras:
     def _source(self, boxes: Boxes, waited: float) -> str | None:
         """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
 
-        It is the frame of the boxes. If no CameraInfo has this frame for a while, the topic with the closest name is used."""
+        It is the frame of the boxes. After a while without a CameraInfo of this frame, that of the closest topic is used.
+        """
         if boxes.frame in self._infos:
             return boxes.frame
         if waited < PATIENCE / 2 or not self._infos:

@@ -38,7 +38,7 @@ class DetectorWorker:
         self._warned: set[str] = set()
 
     def start(self, deliver: Callable[[Boxes], None], drop: Drop, warn: Callable[[str], None]) -> None:
-        """Start the detector's thread. It calls deliver(boxes), drop(reason, place) and warn(message), as `offer` may too."""
+        """Start the detector's thread. It calls deliver(boxes), warn(message) and drop(reason, place)."""
         self._deliver, self._drop, self._warn = deliver, drop, warn
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
         self._thread.start()

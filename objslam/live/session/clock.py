@@ -66,7 +66,8 @@ class Lead:
     def choose(self, path: PathKind, at: float) -> None:
         """Update the leading path for a new pose of a path. at: its session time, s.
 
-        A path that leads again sets the clock back to its own newest stamp."""
+        A path that leads again continues from its own newest stamp.
+        """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))

@@ -85,7 +85,7 @@ def _solve_joint(
     few = association.count and len(rays) <= settings.live.reassociate
     if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return found
-    other_ledger = Ledger()  # of a second solve, because the session may have rejected rays early for good
+    other_ledger = Ledger()  # Of a second solve, because the session may have rejected rays early and for good.
     try:
         other = batch_solver.solve_joint(keyframes, rays, association, settings, other_ledger)
     except SolveError:

@@ -34,7 +34,7 @@ class Describer:
     def map(self, m: MapState, whole: bool = False) -> ObjectMap:
         """Return first the landmarks, in the order of ids, and then the tracks with enough rays, as unresolved objects.
 
-        When the time budget is spent, the other objects keep their last description, but landmarks get their present position.
+        After the time budget is spent, objects keep their last description, but landmarks get their present position.
         New landmarks get a covariance from their rays alone, and new tracks are left out. whole: ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
