@@ -86,7 +86,7 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
 
 
 def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
-    """Return the stamp (F,) of the first pose not older than each frame, or its own if that is more than live.max_late."""
+    """Return the stamp (F,) of the first pose at or after each frame, or its own stamp if live.max_late is exceeded."""
     path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
     own = detections.frame_stamps
     if path is None:

@@ -14,7 +14,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # The time, s, beyond live.max_late that poses are kept, because frames wait in a queue. More costs memory.
+_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, because frames wait in a queue. A longer time costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
@@ -104,7 +104,7 @@ class Course:
         return placed
 
     def _begin(self, stretch: int, path: PathBuffer, stamp: float, keyframes: KeyframeTable) -> _Piece:
-        """Make a new piece that starts at a stamp. If it can, the localisation at or before the stamp places it."""
+        """Make a new piece that starts at a stamp. If possible, the newest localisation until then positions it."""
         last = self._last
         if last is None:
             return _Piece(stretch, np.eye(4), np.zeros((6, 6)))
@@ -128,9 +128,9 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """Make the piece on which a pose on its path becomes start_T_base on the course.
+        """Make the piece that puts a pose of its path at start_T_base on the course.
 
-        own: (6, 6) drift of the pose on its path. drift: (6, 6) drift of start_T_base. noise: (rad, m) of this relation.
+        own: (6, 6) drift of this pose on its path. drift: (6, 6) drift of start_T_base. noise: (rad, m) of this relation.
         """
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)

@@ -17,9 +17,9 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, over the largest observed distance. A larger factor costs time.
+_BEYOND = 1.5  # The largest distance to a candidate, as a factor on the largest observed one. A larger factor costs time.
 _NEAR = 10.0  # The distance (m) up to which every landmark is a candidate. A larger distance costs time.
-_ROUGH = 3.0  # A prediction is rough if it spreads over more than this times a ray's noise. More trusts more single boxes.
+_ROUGH = 3.0  # The least spread of a rough prediction, in units of a ray's noise. A larger value trusts more single boxes.
 _CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value trusts more single boxes.
 _BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
@@ -57,7 +57,7 @@ def match(
     landmark_of_track: Mapping[int, int],
     novelty: float = 1.0,
 ) -> Ints:
-    """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for rays without.
+    """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for a ray without one.
 
     Long unseen tracks are excluded, unless the camera pose in the map is certain. map_T_camera: (4, 4) predicted camera
     pose, with its `uncertainty`. labels: number of labels. gate: share of the right matches that pass the gate.
@@ -135,7 +135,7 @@ def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(No
 def _possible(
     obs: Observations, origin: Floats, predicted: PredictedLandmarks, uncertainty: PoseUncertainty, unseen: Bools
 ) -> Ints:
-    """Return the indices in `predicted` of the candidates for rays from one origin (3,). unseen: (n,), of `predicted`."""
+    """Return the indices in `predicted` of candidates for rays from one origin (3,). unseen: (n,) if long unseen."""
     wanted = np.flatnonzero(np.isin(predicted.label, obs.label))
     to = predicted.position[wanted] - origin
     distance = np.sqrt((to * to).sum(axis=1))

@@ -18,7 +18,7 @@ _HELD = 1e-4  # The information (m^-2) added to each landmark, as parallel rays 
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
 _FURTHER = 1.1  # The factor on its largest observed distance up to which a landmark is expected. More counts more misses.
-_NO_ID = -2  # The id of every track among the predicted landmarks. It is no landmark's id, and not -1 for no landmark.
+_NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has it, and -1 means that there is none.
 
 
 class LandmarkTable(GrowingTable):

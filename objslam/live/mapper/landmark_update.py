@@ -21,7 +21,7 @@ _TRACKS = 4096  # The detector tracks whose landmark is stored. More help if a t
 class LandmarkUpdate:
     """The observations of the newest keyframe, which is in the graph.
 
-    rays: all rays of its frame. matched: (m,) the indices of the rays with a landmark. rows: (m,) the rows of their landmarks
+    rays: all rays of its frame. matched: (m,) the indices of rays with a landmark. rows: (m,) the rows of their landmarks
     in the table. tracks: all tracks with a ray of the frame.
     """
 

@@ -12,7 +12,7 @@ from objslam.live.mapper.state import MapState
 def localize(m: MapState) -> bool:
     """Add absolute poses to the keyframes that the localisation covers only now, and return whether the map moved.
 
-    The first absolute pose moves the map, if odometry began it, because it is relative to the odometry's start until then.
+    The first absolute pose moves the whole map, because odometry alone gives the map relative to its own start.
     """
     if not m.localization.received or not m.localization.pending:
         return False

@@ -20,8 +20,8 @@ from objslam.live.mapper.state import MapState
 _ANCHORS = 3  # The past keyframes that are tried as the start of the loop. More keyframes take longer.
 _NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value relies on updates.
 _TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. A larger value relies on updates.
-_AROUND = 6.0  # Landmarks within this radius (m) of recognised ones are expected too. It is about the view in a hall.
-_ERA = 15.0  # The most time (s) between the last observations of recognised and expected landmarks. More adds misses.
+_AROUND = 6.0  # The radius (m) around recognised landmarks in which others match again. It is about the view in a hall.
+_ERA = 15.0  # The most time (s) between the last observations of recognised landmarks and of these others. More adds misses.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
@@ -88,7 +88,7 @@ def _together(m: MapState) -> Bools:
 
 
 def _close(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). For a large correction, bend the path too."""
+    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). A large correction is distributed first."""
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.landmarks.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
@@ -108,7 +108,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Give the landmarks around `old` (P,) the drift of the first seen of `now` (P,), so that they are expected again."""
+    """Give the landmarks around those in rows `old` (P,) the drift of the first of `now` (P,), so that they match again."""
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
     since = gathered(drift, landmarks.drift)

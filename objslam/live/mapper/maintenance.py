@@ -35,7 +35,7 @@ _VISITS = 6
 of outliers. A larger number keeps one object for longer."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The border around the image, as a share of the image. A wider border prepares the graph for more landmarks.
-_USUAL = 0.75  # The quantile of `far` up to which any landmark may be seen soon. A larger value prepares more landmarks.
+_USUAL = 0.75  # The quantile of the distances `far` up to which any landmark may be seen soon. More prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:
@@ -120,9 +120,9 @@ def _reconsider(m: MapState) -> bool:
 
 
 def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
-    """Return whether the rays (R,) of a label alternate in time between inliers and outliers, which shows two objects.
+    """Return whether rays (R,) of one landmark alternate between inliers and outliers, which shows two objects.
 
-    row: (R,) the landmark of each ray. support: (R,) which rays are inliers.
+    The rays are in time order. row: (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
     """
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))

@@ -145,7 +145,7 @@ class MapState:
         return np.searchsorted(self.landmarks.id, ids)
 
     def bearings(self, at: Ints) -> Bearings:
-        """Return the rays in rows (n,) for the graph. Ranges get more noise, as the bias of an object's ranges stays."""
+        """Return the rays in rows (n,) for the graph. Range noise includes a bias, which does not average out."""
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():

@@ -20,7 +20,7 @@ SLACK = 0.02  # The error (m) between poses on one stretch. A larger error accep
 _AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
 _AGAIN = 1.2  # The growth factor of the rays or the spread after which a track is tried again. A smaller factor costs time.
 _EARLY = 0.4  # The share of joint.min_parallax_deg that suffices for a certain position. More makes landmarks later.
-_SURE = 0.05  # The most sigma of a certain position, as a share of its distance. A larger share makes more false landmarks.
+_SURE = 0.05  # The largest sigma of a certain position, as a share of its distance. More makes more false landmarks.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 

@@ -70,7 +70,7 @@ class RosMessages:
             detector.start(self.add_boxes, self.refuse, self._warn)
 
     def receive(self, type_: str, topic: str, message: Any, received: float) -> None:
-        """Take a message. type_: as in ROS 2, nav_msgs/msg/Odometry. received: s since 1970, used if its stamp is unset."""
+        """Take a message. type_: in ROS 2 form, as nav_msgs/msg/Odometry. received: s since 1970, used for unset stamps."""
         with self._lock:
             if type_ == ODOMETRY:
                 self._take_odometry(topic, message, received)
@@ -105,7 +105,7 @@ class RosMessages:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return an image (H, W, 3), uint8 BGR, of the detector at a stamp, s; None if it is not among the newest."""
+        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s; None if it is not among the detector's newest."""
         with self._lock:
             return self._cameras.image(camera, stamp)
 

@@ -30,7 +30,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Copy the ids of `Sink.push_detections` into an array (count,), in which -1 is unknown; None if an id is invalid."""
+    """Copy the ids of `Sink.push_detections` into an array (count,), with -1 for unknown ids; None if an id is invalid."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)

@@ -75,7 +75,7 @@ def _solve_joint(
 ) -> Estimate:
     """Return the joint solve that starts from the session's poses (K, 4, 4).
 
-    With few rays and only odometry, solve from the odometry too, as offline, and return the solve with smaller residuals.
+    With few rays and without localisation, also solve from the odometry. Return the solve with the smaller residuals.
     """
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements

@@ -32,7 +32,7 @@ _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps 
 
 
 class Session(Intake):
-    """A `Sink` that builds a map. `start` it, push from any thread, take a `snapshot` at any time, and `stop`.
+    """A `Sink` that builds a map. Call `start`, push from any thread, call `snapshot` at any time, and `stop` at the end.
 
     An error in the session's thread ends the session early. Then `failure` holds the error, every wait for the session ends,
     pushes are refused, and `stop` returns the result of the messages before the error.
