@@ -39,7 +39,7 @@ IDENTITY = Transform(np.eye(4))
 
 
 def correspondences(objects: Sequence[MapObject], truth: Sequence[TruthObject]) -> tuple[Floats, Floats, Bools]:
-    """Return the positions (N, 3) of map objects and (M, 3) of true objects, m, and a mask (N, M) of pairs of one label."""
+    """Return positions (N, 3) of map objects and (M, 3) of true objects, m, and a mask (N, M): True if labels are equal."""
     source = np.array([o.position for o in objects]).reshape(-1, 3)
     target = np.array([t.position for t in truth]).reshape(-1, 3)
     same = np.array([[o.label == t.label for t in truth] for o in objects], dtype=bool)
@@ -84,8 +84,7 @@ def align_objects(
         same: (N, M), True if two objects may be the same.
         radius: maximum distance of a match in m.
         start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
-            that may be the same and that are about equally far apart. At most 3,000 of these alignments are sampled, with a
-            fixed seed.
+            with the same labels and a similar distance. At most 3,000 of these alignments are sampled, with a fixed seed.
     """
     if kind == "none" or not same.any():
         return IDENTITY
@@ -117,7 +116,7 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Return the best initial transforms, ordered by cost. Each of them aligns one pair of correspondences."""
+    """Return the best initial transforms. Each aligns two map objects, or one if no two fit, with true objects."""
     i, k = np.nonzero(same)
     if len(i) <= _MAX_CORRESPONDENCES:
         first, second = np.triu_indices(len(i), 1)

@@ -18,7 +18,7 @@ from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, 
 from objslam.results.read import load_map, load_trajectory, load_truth
 
 MAX_TRUTH_GAP = 1.0
-"""The longest gap, s, between two true poses in which the true path is interpolated. A pose in a longer gap has no truth."""
+"""The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class PathScores:
     """The absolute trajectory error (ATE; Sturm et al., IROS 2012) at those timestamps of the path that have a true pose."""
 
     errors: Floats  # The translation errors (N,) in m after the alignment of the path.
-    errors_with_map: Floats | None  # The same after the alignment of the objects; None if no objects are compared.
+    errors_with_map: Floats | None  # Errors (N,) in m after the alignment of the objects; None if no true objects exist.
     outside: int  # The number of timestamps without a true pose.
     transform: Transform  # The alignment of the path.
 

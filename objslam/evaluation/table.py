@@ -26,7 +26,7 @@ _PATH_ROWS = (
     ("ate", "ATE (RMSE)", " m"),
     ("ate_median", "ATE median", " m"),
     ("ate_max", "ATE max", " m"),
-    ("ate_in_map_alignment", "ATE after objects' alignment", " m"),
+    ("ate_in_map_alignment", "ATE after the objects' alignment", " m"),
     ("path_poses", "poses compared", ""),
     ("path_poses_without_truth", "poses without truth", ""),
 )

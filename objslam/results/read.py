@@ -32,10 +32,7 @@ def load_trajectory(out: Path) -> Trajectory:
 
 
 def load_motions(out: Path) -> Motions | None:
-    """Read the odometry between the poses of the result folder `out`, or return None if the folder has no odometry.
-
-    OutputError if the odometry is invalid.
-    """
+    """Read the odometry between the poses of the folder `out`; None if it has no odometry. OutputError if it is invalid."""
     _existing(out, files.OBJECTS)
     file = out / files.MOTIONS
     return read_motions(file) if file.is_file() else None

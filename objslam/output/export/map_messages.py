@@ -60,7 +60,7 @@ class MapMessages:
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
         """Make a vision_msgs/Detection3DArray with the labels, positions and covariances of objects.
 
-        Each label has its share as score. The depth of a box equals its width. A box has size 0 if the size of its object is unknown.
+        The score of a label is its share. The depth of a box equals its width. A box of unknown size has size 0.
         """
         return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 

@@ -68,10 +68,7 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
 
 
 def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
-    """Return the candidate boxes (C, 4), x1, y1, x2, y2, of a label, and their costs (C,).
-
-    At the same distance from the dot, a box on its right costs least, and a box on its left costs the second least.
-    """
+    """Return boxes (C, 4), x1, y1, x2, y2, around a dot and their costs (C,). The right side costs least, then the left."""
     direction = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
     centre = anchor + direction * (_RADII[:, None] + np.abs(direction) @ (size / 2))[..., None]
     reach = _RADII[:, None] + 2.0 * np.abs(direction[:, 1]) + 1.0 * (direction[:, 0] < -0.1)

@@ -18,10 +18,10 @@ _MAX_LABELS = 150  # The picture has at most this many labels. The objects with 
 _MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
 _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
 _CROSS_POINTS = 5  # A label avoids a true object as much as this many points of the path.
-_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the smallest width of the figure, in.
+_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the smallest width of the figure, inches.
 _FONT = 8.0  # Labels and legend have this font size, points.
 _USED, _REJECTED = "#8fbfee", "#ef8f86"  # Used rays are light blue, and rejected rays are light red.
-_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The path before and after, and the legend's objects.
+_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # Colours of the path before, the path after, the legend.
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:

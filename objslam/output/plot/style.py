@@ -26,7 +26,7 @@ more far objects and shrink the rest of the map."""
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time. Stamps of other clocks, which start at 0, stay below three years."""
+    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
     return stamp > 1e8
 
 

@@ -61,7 +61,7 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
 
 
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
-    """Return the indices of the best used rays of an object, at most `count`.
+    """Choose at most `count` of the best used rays of an object, and return their indices.
 
     The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. If
     scores are equal, it has the largest box.
@@ -104,7 +104,7 @@ def cut_crops(
 
 
 def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
-    """Cut a square around a box from an image, and draw the box.
+    """Cut the square around a box out of an image, and draw the box on it.
 
     Returns the JPEG data, the width and the height, px, or None if the box is outside the image.
     """

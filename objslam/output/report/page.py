@@ -160,7 +160,7 @@ def _cards(
 
 
 def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """Return the error, m, and the name of the match for each matched object, by id, and the content of evaluation.json.
+    """Return the error, m, and the match, as text, of each matched object by id. Return also the content of evaluation.json.
 
     If this file does not exist, this function compares the map with the ground truth. A map in a coordinate frame of its
     own is first aligned with the truth. Without a ground truth, there are no errors, and the content is None.

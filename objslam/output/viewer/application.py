@@ -91,7 +91,7 @@ def web_address(web: int, port: int) -> str:
 
 
 def start(*arguments: str) -> Viewer:
-    """Start the viewer with command-line arguments, on the loopback interface. By default, rerun uses every interface."""
+    """Start the viewer on the loopback interface. By default, rerun would listen on every network interface."""
     return subprocess.Popen(
         [str(program()), "--bind", _LOOPBACK, *arguments],
         env={**os.environ, "RUST_LOG": "error"},

@@ -21,8 +21,8 @@ from objslam.output.viewer.times import moments, stamp_column
 from objslam.output.viewer.view_point import label_rows
 
 _BLOCK = 500_000  # This many pairs of an object and an image are tested at once. A larger value takes more memory.
-_NEAR = 0.2  # A camera is expected to see an object from this distance, m.
-_BEYOND = 1.2  # A camera is expected to see an object up to this many times the length of the object's longest ray.
+_NEAR = 0.2  # A camera is expected to see an object only if the object is farther away than this, m.
+_BEYOND = 1.2  # An object is expected to be seen up to this multiple of the length of its longest used ray.
 _LIGHTER = 0.35  # Colours of objects suit a white page. For images, they are lightened by this share, in [0, 1].
 _FRUSTUM = 0.05  # The frustum of a camera has this depth, as a share of the map's size.
 
@@ -120,7 +120,7 @@ def light_colours(objects: ObjectMap) -> NDArray[np.uint8]:
 def _send_objects(
     recording: Any, path: str, result: RunResult, camera: Camera, stamps: Floats, poses: Floats, scale: float
 ) -> None:
-    """Send, for each stamp, the resolved objects that are in view, `.../map`, and their labels, `.../map/labels`."""
+    """Send, for each stamp, the resolved objects that are in view, `PATH/map`, and their labels, `PATH/map/labels`."""
     resolved = [i for i, o in enumerate(result.map.objects) if o.status == "ok"]
     if not resolved:
         return

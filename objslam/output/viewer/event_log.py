@@ -43,7 +43,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive. The events of the whole run come first, then the objects' events in the order of time."""
+    """Return the events of a drive: first those of the whole run, then those of the objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
@@ -108,7 +108,7 @@ def _enough_parallax(result: RunResult) -> Floats:
 
 
 def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list[Event]:
-    """Return the events of all rounds: changes at the first iteration of a round, the solve's result at its last one."""
+    """Return the events of all rounds: changes at a round's first iteration, and the result of its solve at the last."""
     events: list[Event] = []
     at, before = 0, None
     for number, r in enumerate(trace):
@@ -135,7 +135,7 @@ def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list
 def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> list[str]:
     """Return a text for each object that is new, merged or dropped since the round `before`.
 
-    An object of this round continues in the object that now has most of its rays.
+    An object of the earlier round continues as the object that now has most of its rays.
     """
     names = [f"{label_names[k]} #{j}" for j, k in enumerate(now.association.label.tolist())]
     rays = np.bincount(now.association.object[now.association.object >= 0], minlength=now.association.count)
@@ -165,7 +165,7 @@ def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> 
 
 
 def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
-    """Return the level and the text of each change of a live map: new, resolved, unresolved, renamed and dropped ids."""
+    """Return the level and the text of each change of a live map: an id is new, resolved, unresolved, renamed or dropped."""
     old, new = ({o.id: o for o in m.objects} for m in (before, now))
     lines: list[tuple[Level, str]] = []
     for j, o in new.items():

@@ -34,10 +34,7 @@ def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints
 
 
 def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
-    """Return a function that finds an image of the log (H, W, 3), uint8 BGR, from a camera's name and a stamp, s.
-
-    The function returns None if there is no image.
-    """
+    """Return a function that takes a camera's name and a stamp, s, and returns an image (H, W, 3), uint8 BGR, or None."""
     streams = {c.camera.name: c.rgb for c in log.cameras if c.rgb is not None}
 
     def find(camera: str, stamp: float) -> NDArray[np.uint8] | None:
@@ -68,7 +65,7 @@ def _read(path: Path) -> NDArray[np.uint8] | None:
 
 
 def pack(pixels: np.ndarray, size: tuple[int, int] | None = None) -> bytes:
-    """Encode a colour image (H, W, 3), uint8 BGR, or a grey image (H, W) as a JPEG of `size`: width, height, px."""
+    """Encode an image (H, W, 3), uint8 BGR, or (H, W) as a JPEG. It is scaled to `size` (width, height), px, if given."""
     import cv2
 
     if size is not None and (pixels.shape[1], pixels.shape[0]) != size:

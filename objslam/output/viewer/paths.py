@@ -20,7 +20,7 @@ _MAX_STEPS = 400  # A recording has at most this many iterations, evenly chosen.
 
 
 def log_paths(recording: Any, result: RunResult, truth: Truth | None) -> None:
-    """Log static paths in `map/path`: `after` the run, `before` the run if it differs, and the `truth` if it is known."""
+    """Log static paths in `map/path`: `after` the estimation, `before` it if the path differs, `truth` if it is known."""
     paths = {"after": (result.path_after, _AFTER, 2.0)}
     if not np.array_equal(result.path.poses, result.path_after.poses):
         paths["before"] = (result.path, _BEFORE, 1.0)

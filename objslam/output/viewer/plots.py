@@ -17,10 +17,7 @@ _BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
-    """Log curves by stamp: the median and the largest residual of used rays, deg, and the number of rays of each kind.
-
-    The entities are `plots/residual/median`, `plots/residual/worst` and `plots/boxes/KIND`.
-    """
+    """Log by stamp: the residuals, deg, of used rays, `plots/residual`, and the ray counts by kind, `plots/boxes/KIND`."""
     stamps, moment = np.unique(result.keyframes.stamps, return_inverse=True)
     of = moment[result.rays.keyframe]
     kinds = ray_kinds(result)

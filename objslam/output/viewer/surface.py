@@ -14,7 +14,7 @@ _GROWTH = 1.25  # The cells grow by this factor until at most `_MAX_VERTICES` ve
 
 
 def log_surfaces(recording: Any, result: RunResult) -> None:
-    """Log the static surfaces `map/reconstruction/after` and `before`, if they exist: at the run's and at the log's poses.
+    """Log static surfaces in `map/reconstruction`: `after` the estimation of the poses, and `before` it, if they exist.
 
     Only the front of a wall is drawn, so that walls near the view point do not hide the room.
     """
@@ -33,7 +33,7 @@ def log_surfaces(recording: Any, result: RunResult) -> None:
 
 
 def coarser(surface: Surface, most: int) -> Surface:
-    """Simplify a surface to at most `most` vertices: their means in the cells of a grid (Rossignac & Borrel 1993)."""
+    """Reduce a surface to at most `most` vertices. Vertices in one grid cell become their mean (Rossignac & Borrel 1993)."""
     cell = _CELL
     while len(surface.vertices) > most:
         cell *= _GROWTH

@@ -68,7 +68,7 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
 
 
 def look_at(target: Floats, back: Floats, distance: float) -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map. From the target, it lies in direction `back` (3,)."""
+    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from there to the view point."""
     axes = _axes(back)
     return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
 

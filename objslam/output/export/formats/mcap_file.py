@@ -25,9 +25,10 @@ _LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s. It 
 
 
 def _dump(content: Content) -> bytes:
-    """Return a file with one message each of the objects, markers and path, at the start, and the pose at each path stamp.
+    """Return the content of the file.
 
-    One message contains all resolved objects with their covariances. Each chunk has a CRC.
+    The resolved objects with their covariances, the markers and the path have one message each, at the first stamp. The
+    robot's pose has a message at each stamp of the path. Each chunk has a CRC.
     """
     from mcap.writer import CompressionType, Writer
 

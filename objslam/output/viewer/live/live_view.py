@@ -116,7 +116,7 @@ class LiveView:
         return not full
 
     def close(self, timeout: float = 3.0) -> None:
-        """Show the waiting snapshots for at most `timeout`, s, then end the process."""
+        """Wait at most `timeout`, s, until the waiting snapshots are shown, then end the process."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

@@ -30,7 +30,7 @@ class ShownSnapshot:
     map: ObjectMap
     path: Floats  # (n, 3) positions of the base, m in map, evenly chosen.
     base: Floats | None  # (4, 4) the newest map_T_base; None without keyframes.
-    numbers: dict[str, float]  # The counts keyframes, rebuilds and unseen (missed snapshots). Times, s: lag, p50, p99.
+    numbers: dict[str, float]  # Counts: keyframes, rebuilds, unseen snapshots. Times, s: lag; p50, p99 of an update.
     counters: dict[str, int]  # The number of accepted messages by kind.
     dropped: dict[str, int]  # The number of dropped messages by reason.
 
