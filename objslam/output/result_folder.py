@@ -44,10 +44,10 @@ def prepare_output(out: Path) -> None:
             raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
         if resembles_log(out):
             hint = "name another folder with -o"
-            raise OutputError("this folder is a log, and a result cannot replace files of a log", where=str(out), hint=hint)
+            raise OutputError("this is a log, and a result needs a folder of its own", where=str(out), hint=hint)
         names = _existing_files(out)
         if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
-            what = f"the result would replace files that no run wrote: {', '.join(names)}"
+            what = f"these files are in the way of a result and were not written by a run: {', '.join(names)}"
             raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
         for name in _FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():

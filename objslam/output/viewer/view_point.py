@@ -68,7 +68,7 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
 
 
 def look_at(target: Floats, back: Floats, distance: float) -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from there to the view point."""
+    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from the target to it."""
     axes = _axes(back)
     return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
 
