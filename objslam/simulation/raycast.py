@@ -1,4 +1,4 @@
-"""Render images of a furnished room: the colour, the depth and the object at each pixel. Open3D casts the rays on the CPU."""
+"""Render the colour, the depth and the object at each pixel of a furnished room. Open3D casts the rays, on the CPU."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,8 +23,8 @@ _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 class Cast:
     """The surfaces that the rays of an image hit, one ray for each pixel.
 
-    depth: (H, W) z, m, inf without a hit. part: (H, W) the index of the part in the room, -1 without a hit. normal: (H, W, 3)
-    of the surface, in map. point: (H, W, 3) that is hit, in map, m.
+    depth: (H, W) z, m, inf without a hit. part: (H, W) the index of the part in the room, -1 without a hit.
+    normal: (H, W, 3) of the surface, in map. point: (H, W, 3) that is hit, in map, m.
     """
 
     depth: Reals
@@ -124,10 +124,7 @@ class Caster:
         return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
     def shade(self, cast: Cast, eye: Floats) -> Reals:
-        """Compute the linear RGB colour (H, W, 3) of each hit, with diffuse and glossy reflection and with shadows.
-
-        eye: (3,) the position of the camera in map, m.
-        """
+        """Compute the linear RGB colour (H, W, 3), with reflections and shadows. eye: (3,) the camera position in map, m."""
         albedo, gloss = self._albedo(cast)
         view = _unit(eye.astype(np.float32) - cast.point)
         normal = np.where(_dot(cast.normal, view)[..., None] < 0, -cast.normal, cast.normal)

@@ -185,7 +185,7 @@ def render_drive(
 
 
 def drive_room(settings: RenderSettings, seed: int) -> Room:
-    """Return the room that `render_drive` renders for these settings and seed. Raises ConfigError if no room is good enough."""
+    """Return the room that `render_drive` renders for these settings and seed. Raises ConfigError if it finds no room."""
     seeds = np.random.SeedSequence(seed).spawn(5)
     course = Course.lay(settings.motion, np.random.default_rng(seeds[0]))
     stamps = frame_stamps(settings.motion)[:, 0]

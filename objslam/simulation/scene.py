@@ -43,8 +43,8 @@ class Scene:
 class Roamers:
     """The moving objects, which oscillate along each axis.
 
-    label: (K,) indices into the classes of the scene. extent: (K, 2) width and height, m. middle (m), reach (m), rate (rad/s)
-    and phase (rad) describe the oscillation along each axis: (K, 3).
+    label: (K,) indices into the classes of the scene. extent: (K, 2) width and height, m. middle (m), reach (m), rate
+    (rad/s), phase (rad): (K, 3) the parameters of the oscillation along each axis.
     """
 
     label: Ints
@@ -133,10 +133,7 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
-    """Return a lower bound (P,), rad, of the widest angle between the V directions (V, P, 3) of each position.
-
-    seen: (V, P) which directions count.
-    """
+    """Return a lower bound (P,), rad, of the widest angle between directions (V, P, 3). seen: (V, P) which of them count."""
     # Each step finds the direction furthest from the last one. For directions in a plane, the result is the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)

@@ -62,15 +62,14 @@ class CourseSettings(Section):
     room: tuple[Positive, Positive] = (8.0, 6.0)
     """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
-    """The number of swings along x and along y in a lap of a Lissajous curve. (1, 1) is an ellipse. Both numbers must have
-    no common divisor."""
+    """The swings of a Lissajous curve along x and along y in a lap. They have no common divisor. (1, 1) is an ellipse."""
     margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
     """The number of images of each camera. Several cameras take their images one after the other."""
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift per distance and turn (config.Odometry, whose floors are unused), or per image (PoseNoise). None: no odometry."""
+    """The drift: config.Odometry per distance and turn (without its floors), PoseNoise per image. None: no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
@@ -100,8 +99,8 @@ class DriveSettings(CourseSettings):
     false: Probability = 0.0  # The probability of a false box, in each frame for each class.
     depth: DepthNoise | None = None  # The errors of depths. None: boxes have no depths.
     tracks: Literal["none", "broken", "perfect"] = "none"
-    """The track ids of boxes. With `perfect`, boxes have the ids of their objects in the ground truth, and moving objects have
-    the next ids. With `broken`, an object gets a new id after one second without a box. False boxes have no id."""
+    """The track ids of boxes. With `perfect`, boxes have the ids of their objects in the ground truth, and moving objects
+    have the next ids. With `broken`, an object gets a new id after one second without a box. False boxes have no id."""
     odometry_rate: Positive | None = 30.0  # The rate of the odometry, Hz. None: one pose at the stamp of each image.
     localization_rate: Positive | None = 10.0  # The rate of the localisation, Hz. None: one pose at the stamp of each image.
 

@@ -16,10 +16,7 @@ Pattern = Literal["plain", "noise", "stripes", "checks"]
 
 @dataclass(frozen=True)
 class Material:
-    """The look of a surface. A 3D pattern mixes two linear RGB colours (3,). scale: the size of the pattern, m.
-
-    gloss: the strength of the glossy reflection.
-    """
+    """The look of a surface: a 3D pattern of two linear RGB colours (3,). scale: the pattern's size, m. gloss: its shine."""
 
     colour: Floats
     second: Floats
@@ -55,7 +52,7 @@ def turned(profile: list[tuple[float, float]], material: Material, segments: int
 
 
 def torus(radius: float, thickness: float, height: float, material: Material, segments: int = 36) -> Part:
-    """Make a horizontal ring around z at a height of its centre, m. radius: of its centre line. thickness: the tube's radius."""
+    """Make a horizontal ring. radius: of its centre line, m. thickness: the tube's radius, m. height: of its centre, m."""
     angle = np.linspace(0.0, 2 * np.pi, 14, endpoint=False)
     rings = np.column_stack([radius + thickness * np.cos(angle), height + thickness * np.sin(angle)])
     return _swept(rings, True, material, segments)

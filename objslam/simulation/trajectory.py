@@ -13,7 +13,7 @@ from objslam.simulation.settings import DriveSettings, PoseNoise
 
 START = 1_700_000_000.0  # The stamp of the start of every drive, s.
 WHEEL_OFFSET = 0.5
-"""The robot's outer wheel has this distance from its centre, m, and a constant speed. A larger value makes bends slower."""
+"""A wheel at this distance from the robot's centre (m) moves at constant speed. A larger value makes bends slower."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def frame_stamps(settings: DriveSettings) -> Floats:
 
 
 def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate odom_T_base as the sum of the true steps with noise. stamps: (F,) of the images, s. None: no odometry."""
+    """Simulate odom_T_base, if the drive has odometry: the sum of the true steps with noise. stamps: (F,) of images, s."""
     if settings.odometry is None:
         return None
     stamps = _clock(settings.odometry_rate, stamps)
@@ -100,7 +100,7 @@ def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floa
 
 
 def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate map_T_base as the true poses with independent errors. stamps: (F,) of the images, s. None: no localisation."""
+    """Simulate map_T_base, if the drive has localisation: the true poses with independent errors. stamps: (F,) of images, s."""
     noise = settings.localization
     if noise is None:
         return None

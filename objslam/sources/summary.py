@@ -82,10 +82,7 @@ def contents(log: Log) -> Contents:
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
-    """Return a list with one message if no stamp of a camera's frames (N,), s, is within the time of the path.
-
-    Otherwise the list is empty, and also without frames or without a path.
-    """
+    """Return one message if images have stamps (N,), s, but none of them is in the time of the path. Else return none."""
     if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
         return []
     return [

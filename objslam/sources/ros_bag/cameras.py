@@ -53,7 +53,7 @@ def find_cameras(
         if alone and not any(named.values()):
             named = {name: list(seeds) for name in named}
         for name in (name for name, topics in named.items() if not topics):
-            pool.ledger.warn(f"no topics for camera {name!r}: left out (--topic {name}.detections=/name or {name}.image=/name)")
+            pool.ledger.warn(f"camera {name!r}: no topics, left out (--topic {name}.detections=/name or {name}.image=/name)")
         taken = {topic.name for topics in named.values() for topic in topics}
         for topic in (topic for topic in detections if topic.name not in taken):
             pool.ledger.warn(f"{topic.name}: left out, because no calibration has a fitting name ({', '.join(named)})")
