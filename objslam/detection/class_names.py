@@ -33,7 +33,7 @@ def is_background(name: str) -> bool:
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
     """Return the class names of the setting `detector.names`: a list, coco, coco91 or a file. A file is looked up as given,
-    then in the model's folder. Raises ConfigError if the file is missing or unreadable, or if a name is not printable."""
+    then in the model's folder. Raises ConfigError if the file is missing or unreadable or a name is empty or unprintable."""
     if given is None:
         return None
     if isinstance(given, tuple):

@@ -39,7 +39,7 @@ def detect_log(
     cache: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Log:
-    """Run the detector on the rgb images, and return the log with the new detections in place of its own.
+    """Run the detector on the rgb images, and return the log with the boxes found. Cameras without rgb images are unchanged.
 
     An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
     box gets its depth from a depth image if the camera has depth images. `cache` is the folder of the `DetectionCache`. None

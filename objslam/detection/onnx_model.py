@@ -81,7 +81,7 @@ class Network:
 
 def open_network(path: Path, settings: config.Detector) -> Network:
     """Load an ONNX model. The settings give the device and the number of threads. Raises DetectorError if the file is
-    missing, is no ONNX model, or needs other inputs than an image, and ConfigError if the device is cuda without CUDA."""
+    missing, is no ONNX model, or needs other inputs than an image, and ConfigError if cuda is set but missing."""
     import onnxruntime
 
     try:
@@ -148,8 +148,8 @@ def _as_image(tensor: Tensor) -> ImageInput | None:
 
 
 def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
-    """Return the value of an input besides the image: a mask that keeps the whole image, or the size of the original image.
-    For it, the size of the network input is given, so that boxes are in px of the input."""
+    """Return the value of an input besides the image. A pixel mask keeps the whole image. As the size of the original image,
+    the model gets the size of the network input, so that its boxes are in px of the input."""
     kind = _KINDS[tensor.kind]
     if tensor.name == _SIZES:
         return np.tile(np.array([width, height], dtype=kind), (count, 1))

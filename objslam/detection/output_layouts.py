@@ -37,7 +37,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Facts:
-    """The facts that distinguish layouts. height, width: of the input, px. classes: their number, None if unknown."""
+    """The facts that distinguish layouts. height, width: of the input, px. classes: the number of names, None if unknown."""
 
     height: int
     width: int
@@ -53,7 +53,8 @@ class Facts:
 
 def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
     """Return the layout and the output name of each role. The settings override the recognition. Raises ConfigError if the
-    settings name a missing output or roles that form no layout. Raises DetectorError if no layout fits the outputs."""
+    settings name a missing output or roles that form no layout. Raises DetectorError if no layout fits the outputs. Its
+    message lists the outputs and says how to describe them."""
     layout = settings.layout
     roles: Roles | None = settings.outputs
     if roles is not None:

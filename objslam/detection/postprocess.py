@@ -124,8 +124,8 @@ def _likely(recipe: Recipe, rows: Array) -> tuple[Array, Ints]:
 
 
 def _best_class(recipe: Recipe, boxes: Array, values: Array, objectness: Array | None = None) -> Candidates:
-    """Return the boxes whose best class has at least the score `min_score`. values: (N, C) of the classes. The score is
-    multiplied with the objectness (N,), if any."""
+    """Return the boxes whose best class has a score of at least `min_score`. values: (N, C) the outputs for the classes.
+    objectness: (N,) a factor of the scores, if any."""
     values = values[:, : recipe.channels]
     if recipe.activation == "softmax":
         weights = np.exp(values - values.max(axis=1, keepdims=True))
@@ -164,7 +164,7 @@ def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
 
 
 def _name_indices(recipe: Recipe, label: Ints) -> Ints:
-    """Return the index of each class number in the names, -1 for the background. Raises DetectorError if there is none."""
+    """Return the index in the names of each class number, -1 for background. Raises DetectorError if a class has no name."""
     indices = label - recipe.first_label
     beyond = indices >= len(recipe.names)
     if recipe.names and beyond.any():

@@ -62,7 +62,7 @@ class Roamers:
 def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Scene:
     """Place the objects of `settings.placed`, then random objects at positions that are seen well from the path.
 
-    frame_stamps: (F, C) of the images of C cameras, s. Raises ConfigError if there are not enough such positions.
+    frame_stamps: (F, C) the stamps of the images of C cameras, s. Raises ConfigError if there are not enough such positions.
     """
     numbered = (f"{name} {number}" for number in count(2) for name in EXTENTS)
     names = list(islice(chain(EXTENTS, numbered), settings.classes or settings.objects))

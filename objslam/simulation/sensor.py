@@ -12,7 +12,7 @@ class Sensor(Section):
     """The errors of colour and depth images."""
 
     exposure: NotNegative = 0.25
-    """The standard deviation of the natural logarithm of exposure over automatic exposure, which drifts in a drive."""
+    """The standard deviation of ln(exposure / automatic exposure). The exposure drifts slowly during a drive."""
     white: NotNegative = 0.04
     """The standard deviation of the error of each colour channel's gain. The errors are drawn once for a drive."""
     blur: NotNegative = 0.5  # The sigma of the lens blur, px.

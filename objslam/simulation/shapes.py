@@ -103,7 +103,7 @@ def make_object(label: str, rng: np.random.Generator) -> list[Part]:
 
 def _parts(label: str, rng: np.random.Generator) -> list[Part]:
     if label == "ring":
-        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The second is unused, but moves `rng` on.
+        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The unused draw keeps later draws the same.
         return [torus(0.095, 0.026, 0.026, Material(first.colour, first.colour * 0.75, "noise", 0.03, 0.3))]
     if label == "sponge":
         foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)

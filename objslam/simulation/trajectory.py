@@ -74,7 +74,7 @@ def frame_stamps(settings: DriveSettings) -> Floats:
 
 
 def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate odom_T_base, if the drive has odometry: the sum of the true steps with noise. stamps: (F,) of images, s."""
+    """Simulate odom_T_base (None without odometry) as the sum of true steps with noise. stamps: (F,) of the images, s."""
     if settings.odometry is None:
         return None
     stamps = _clock(settings.odometry_rate, stamps)
@@ -100,7 +100,7 @@ def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floa
 
 
 def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate map_T_base, if the drive has localisation: the true poses with independent errors. stamps: (F,) of images, s."""
+    """Simulate map_T_base (None without localisation): true poses with independent errors. stamps: (F,) of the images, s."""
     noise = settings.localization
     if noise is None:
         return None

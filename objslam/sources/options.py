@@ -49,7 +49,7 @@ def flags(kind: type[Any]) -> dict[str, tuple[Any, Option]]:
 
 
 def unused(options: Any, kind: type[Any], taken: Collection[str]) -> list[str]:
-    """Return the flags of the options of `kind` that differ from the default, except those of the field names `taken`."""
+    """Return the flags of the options of `kind` that differ from the default, except those of the fields in `taken`."""
     called = {name: option.flag.partition("/")[0] for name, (_, option) in flags(kind).items()}
     return [
         called.get(field.name, f"--{field.name.replace('_', '-')}")

@@ -44,7 +44,7 @@ _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger va
 class Journal:
     """A journal open for writing. Only one process may write it.
 
-    torn: the bytes of an incomplete record that were removed from the end of a resumed journal, 0 if there were none.
+    torn: how many bytes of an incomplete record were removed from the end of a resumed journal, else 0.
     """
 
     def __init__(self, file: Path, resume: bool = False) -> None:

@@ -88,7 +88,7 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """The offsets that a session applies from now on. clock: the seconds that it adds to stamps. odometry: start_T_odom."""
+    """The offsets of a session from now on. clock: the seconds added to stamps. odometry: start_T_odom (4, 4)."""
 
     clock: float
     odometry: Floats

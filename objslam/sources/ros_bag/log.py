@@ -159,7 +159,7 @@ def _camera_log(
 def extract_images(recording: Recording, folders: Mapping[str, tuple[Path, bool]], ledger: Ledger) -> dict[str, Images]:
     """Write the images of topics into files, and return the written images by topic.
 
-    folders: the target folder of each topic, and whether it has depth images. JPEG and PNG data of colour is copied. Other
+    folders: the target folder of each topic, and whether it has depth images. Colour images in JPEG or PNG are copied. Other
     colour images become PNG. Depth images become 16 bit PNG with `DEPTH_SCALE` units per metre and 0 for unknown depth. The
     name of a file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
     Only one image is in memory at a time. Raises LogError if a file cannot be written.
