@@ -1,4 +1,4 @@
-"""Read and write motions.parquet, the odometry between the poses of a result, for exports and other optimisers."""
+"""Read and write motions.parquet, the odometry between the poses of a result. Exports and other optimisers use it."""
 
 import io
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.errors import OutputError
 
-_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # The numbers per row of each column.
+_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # How many numbers each column has in a row.
 
 
 @dataclass(frozen=True)
