@@ -74,7 +74,7 @@ def main() -> NoReturn:
     except MemoryError:
         say("objslam: out of memory", stderr=True)
         sys.exit(1)
-    except Exception as error:  # hides the traceback of an internal error from the user
+    except Exception as error:  # Hides the traceback of an internal error from the user.
         if debug:
             raise
         said = f"{type(error).__name__}: {one_line(error)}"

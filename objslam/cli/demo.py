@@ -33,7 +33,7 @@ def demo(
 
     prepare_output(out)
     log, model = out / "log", None
-    mark = out / ".objslam-demo"  # marks a log that the demo may replace
+    mark = out / ".objslam-demo"  # This file marks a log that the demo may replace.
     if log.exists() and not mark.exists():
         raise OutputError(
             "this log is not from a demo and is not replaced", where=str(log), hint="choose another folder with -o"

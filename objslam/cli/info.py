@@ -1,4 +1,4 @@
-"""The command `objslam info`, which describes a recording and the parts that a run lacks."""
+"""The command `objslam info`, which describes a recording and what is missing in it for a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def info(
     *,
     options: SourceOptions,
 ) -> None:
-    """Describe a recording: streams, rates, gaps, times, the role of each topic, and the parts that a run lacks."""
+    """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
     from objslam.core.diagnostics import Ledger
     from objslam.sources.summary import contents
 

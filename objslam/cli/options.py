@@ -41,8 +41,8 @@ def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with flags in place of its parameter `options`. Each field with an `Option` in the class of that
-    parameter becomes one flag."""
+    """Return the command with flags in place of its parameter `options`. Each field with an `Option` in the class of
+    `options` becomes one flag."""
     signature = inspect.signature(command, eval_str=True)
     kind = signature.parameters["options"].annotation
     declared = flags(kind)

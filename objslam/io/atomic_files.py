@@ -14,7 +14,7 @@ from objslam.errors import OutputError
 _STAGING = ".objslam-staging"
 _SWAPPING = "swapping"  # This file in the staging folder marks that the replacement of the old files has started.
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
-"""The ignored error codes of network file systems that cannot lock or sync a folder."""
+"""The error codes of network file systems that cannot lock or sync a folder. They are ignored."""
 
 
 @dataclass(frozen=True)

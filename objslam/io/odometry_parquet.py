@@ -19,7 +19,7 @@ class Motions:
     before: Floats  # (M,) timestamp of the first pose, s.
     after: Floats  # (M,) timestamp of the second pose, s.
     motion: Floats  # (M, 4, 4) before_T_after.
-    covariance: Floats  # (M, 6, 6), translation (m), then rotation (rad), in the frame of the second pose.
+    covariance: Floats  # (M, 6, 6) of translation (m), then rotation (rad), in the base frame at `after`.
 
 
 def dump_motions(motions: Motions) -> bytes:

@@ -172,7 +172,7 @@ def _read_metadata(file: Path, ledger: Ledger) -> dict[str, Any]:
         return dict(data["rosbag2_bagfile_information"])
     except (LogError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = error.message if isinstance(error, LogError) else "not what rosbag2 writes"
-        ledger.warn(f"{file}: {reason}: ignored, all bag files of the folder are read")
+        ledger.warn(f"{file}: {reason}: left out, so all bag files of the folder are read")
         return {}
 
 

@@ -17,7 +17,7 @@ _MODELS = {
     "plumb bob": "plumb_bob",
     "rational polynomial": "rational_polynomial",
 }  # The distortion models by the alternative names that drivers use.
-_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # If D is zero, these have no distortion.
+_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # Models without distortion if D is zero.
 _MAX_PIXELS = 1 << 16  # The limit of width and height, px. A calibration with a larger image counts as damaged.
 _MAX_FOCAL = 1e7  # The limit of a camera matrix element, px. A calibration with a larger element counts as damaged.
 _HINT = "--camera-info FILE can give the calibration"

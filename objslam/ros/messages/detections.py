@@ -78,7 +78,7 @@ def vision_boxes(message: Any) -> Iterator[Found]:
 def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
-    The box centre is the intersection of the tag diagonals. On all sides, the box reaches as far as the furthest corner.
+    The box centre is the intersection of the tag diagonals. The box is symmetric about this centre and contains all corners.
     Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:

@@ -5,7 +5,7 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 CAMERA_INFO, DETECTIONS = "sensor_msgs/msg/CameraInfo", "vision_msgs/msg/Detection2DArray"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 IMAGES = (IMAGE, COMPRESSED)
-LATCHED = (*TRANSFORMS, CAMERA_INFO)  # Their publishers may send only one message, even before a subscription.
+LATCHED = (*TRANSFORMS, CAMERA_INFO)  # Types whose publishers may send only one message, possibly before a subscription.
 
 
 def is_tags(type_: str) -> bool:
