@@ -1,4 +1,4 @@
-"""Align a stretch of rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
+"""Align rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared devia
 
 
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
-    """Return the planar correction (4, 4) in map that aligns the rays of these cameras with the landmarks.
+    """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
 
     Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray. positions,
     labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
-    standard deviations of x, y (m) and yaw (rad) in map, which define the prior and bound the grid.
+    standard deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -41,7 +41,7 @@ def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, cen
 def _misfit(
     rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
 ) -> Floats:
-    """Return the cost (H,) of all rays under corrections (H, 3)."""
+    """Return the sum (H,) of the costs of all rays under each correction (H, 3)."""
     origin, direction = rays.in_map(map_T_camera)
     offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
     cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])

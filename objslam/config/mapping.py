@@ -95,7 +95,7 @@ class AssociationSettings(Section):
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects, but is slower."""
+    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects but is slow."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5

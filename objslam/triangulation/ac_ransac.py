@@ -84,7 +84,7 @@ def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
-    """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, these rays (R,) as a mask, and the log NFA (N,).
+    """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. From the best candidate on, two steps alternate while the agreement
@@ -134,7 +134,7 @@ def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
 
 
 def _far_ahead(bundle: Bundle) -> Tensor:
-    """Return a point (N, 3) along the mean ray direction of each object, so far away that all rays see it in one direction."""
+    """Return a point (N, 3) along the mean ray direction of each object, so far that all rays see it in one direction."""
     count = len(bundle.number)
     reach = torch.zeros_like(bundle.number, dtype=bundle.origin.dtype)
     reach = reach.scatter_reduce(0, bundle.index, bundle.origin.norm(dim=1), "amax").clamp(min=1.0)
@@ -202,9 +202,10 @@ def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tu
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have none.
+    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist.
 
-    A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in numpy.
+    Parallel rays have no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it.
+    `closest_approach` does the same in numpy.
     """
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]

@@ -9,7 +9,7 @@ from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.ac_ransac import Bundle
 from objslam.triangulation.point_to_lines import Lines, object_sum
 
-_EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. More cost time.
+_EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
 _RANGE_ITERATIONS = 30  # The iterations of the range fit, which starts at the median range. All objects take as many.
 
 
@@ -96,7 +96,7 @@ def largest_sigma(covariances: Tensor) -> Tensor:
 
 
 def reach(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return the median distance (N,) m from each point (N, 3) to the origins of its rays in `use` (R,). NaN without rays."""
+    """Return the median distance (N,) m of each point (N, 3) from the origins of its rays in `use` (R,), or NaN."""
     index = bundle.index[use]
     return object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
 

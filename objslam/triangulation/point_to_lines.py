@@ -40,7 +40,7 @@ class Lines:
         return perpendicular(points[self.index], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Return the sum (N, 3, 3) of weight (R,) times I - n n^T over the lines of each object. n is the line's direction."""
+        """Return the sum (N, 3, 3) of weight (R,) times I - n n^T over the lines of each object with directions n."""
         eye = torch.eye(3, dtype=weight.dtype, device=weight.device)
         return self.sum(weight)[:, None, None] * eye - self.outer(self.direction * weight[:, None], self.direction)
 

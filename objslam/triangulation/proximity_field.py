@@ -36,7 +36,7 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the mean distance (...) m of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit. It is the cost of Eq. 1 / R."""
+    """Return the mean distance (...) m of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit: the cost of Eq. 1 over R."""
     flat = points.reshape(-1, 3)
     centre = flat.mean(axis=0)  # Squares of large map coordinates would hide small distances.
     p, m = flat - centre, origins - centre
@@ -82,6 +82,6 @@ def main_heading(directions: Floats) -> Floats:
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Return the rays of one object, given as a mask (R,), that have a weight (R,) above 0. If none has, return all its rays."""
+    """Return a mask (R,) of the rays of one object (R,) that have a weight above 0. If none has, it holds all its rays."""
     kept = object_ & (weight > 0)
     return kept if kept.any() else object_

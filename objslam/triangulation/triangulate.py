@@ -68,9 +68,10 @@ def triangulate(
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
     An object is ok if at least 2 rays agree more closely than by chance, if their parallax and the relative precision meet
-    the limits of the settings, and if the object lies ahead of most of these rays. Ranges are fused only for an object whose rays fail these
-    limits, or for which one range is more precise than all rays. Other objects keep the position of Eq. 1, because a range
-    ends on the surface of an object and its rays meet inside. The result does not depend on other objects or on ray order.
+    the limits of the settings, and if the object lies ahead of most of these rays. Ranges are fused only for an object
+    whose rays fail these limits, or for which one range is more precise than all rays. Other objects keep the position of
+    Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object does not
+    depend on other objects or on ray order.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
@@ -147,8 +148,8 @@ def closed_form(
 ) -> tuple[Floats, Bools]:
     """Return the points (N, 3) m with the least sum of squared distances to their rays as lines, and which are unique (N,).
 
-    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then the point of the mean ray
-    that lies 1 m ahead of the mean origin. It is NaN without rays.
+    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then the point of the mean
+    ray that lies 1 m ahead of the mean origin. It is NaN without rays.
     """
     from objslam.triangulation import point_to_lines
 
@@ -215,7 +216,7 @@ def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None =
 def _bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, device: config.Device
 ) -> tuple[Ints, torch.Tensor, Bundle]:
-    """Return the bundle of the rays that have an object, after their indices and the mean ray origin (N, 3) of each object."""
+    """Return the indices of the rays with an object, the mean ray origin (N, 3) of each object, and their bundle."""
     import torch
 
     from objslam.triangulation import point_to_lines
@@ -228,7 +229,7 @@ def _bundle(
     objects = torch.from_numpy(index[where]).to(place)
     base = point_to_lines.object_sum(origin, objects, count) / number[:, None]
     origin = origin - base[objects]
-    # The rays are sorted by their distance from the closed form. So the order and frame of the input do not affect the tried pairs.
+    # The rays are sorted by their distance from the closed form. So the input order does not affect the tried pairs.
     points, _ = point_to_lines.least_squares(origin, direction, objects, count)
     order = torch.argsort(point_to_lines.Lines.through(origin - points[objects], direction, objects, count).foot.norm(dim=1))
     order = order[torch.argsort(objects[order], stable=True)]
