@@ -5,8 +5,7 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""The largest share of frames in which one object may look like two because of wrong boxes. A larger share merges separate
-objects."""
+"""The largest share of frames in which wrong boxes show one object as two. A larger share merges separate objects."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
@@ -19,5 +18,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ, because too many of the frames with the rarer one show both."""
+    """Return whether two objects differ, if `together` of the `frames` that show the rarer one show both."""
     return together > TOGETHER * frames

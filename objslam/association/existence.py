@@ -1,7 +1,5 @@
-"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion.
-
-A phantom is a landmark that is no object, because rays of different things meet there.
-"""
+"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
+landmark that is no object, because rays of different things meet there."""
 
 from dataclasses import dataclass
 
@@ -14,22 +12,22 @@ from objslam.core.arrays import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger ones mean more similar rates.
-_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one; larger drops fewer objects.
+_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one. More drops fewer objects.
 _POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
-_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets; larger keeps more weak objects.
+_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets. A larger value keeps more weak objects.
 _EXPECTED_STRAYS = 5.0  # The number of stray boxes that each class is assumed to have besides the observed ones.
 _LOG_SIZE = 0.7  # The standard deviation of ln size within a class, which is a factor of 2.
 _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms, which is a factor of 100.
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance, which only keeps them finite.
-_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one; larger drops fewer objects.
+_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Beta distributions of the detection rates in each class. mean: (L,). concentration: the sum of the two parameters. It is
+    """Beta distributions of the detection rates in each class. mean: (L,). concentration: the sum of the two parameters,
     the same for all classes."""
 
     mean: Floats
@@ -49,12 +47,9 @@ class Rates:
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
-    """Estimate the detection rate of each class as the median over its boxes. A class with few boxes gets nearly the rate of
-    all classes.
-
-    The concentration is the lowest one that is not clearly less likely than the best one. Their likelihoods allow for any
-    object to be a phantom.
-    """
+    """Estimate the rate of each class as the median over its boxes. If they are few, it is near the rate of all classes. The
+    concentration is the lowest one that is not clearly less likely than the best one. Their likelihoods allow for any object
+    to be a phantom."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
@@ -123,7 +118,7 @@ def stray_share(state: State, gate: float) -> Floats:
 
 
 def size_odds(state: State) -> Floats:
-    """Return the log odds (N,), at most 0, of an object of the class over a phantom, from its size.
+    """Return the log odds (N,), at most 0, of an object of the class over a phantom, from the landmark's size.
 
     Crossing rays of different objects give a wrong distance, and so a wrong size.
     """

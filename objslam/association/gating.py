@@ -11,20 +11,18 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import skew
 
 TRACK_GAIN = 2.0
-"""The cost reduction of a match if most other boxes of the ray's track have its landmark; larger trusts the tracker more."""
-_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together; larger needs more memory.
+"""The cost reduction of a match if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
+more."""
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
-_TABLE = 1 << 22  # The most entries of a dense table of gains; larger tables are sparse.
+_TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Possible matches (E,), sorted by ray, then by landmark.
-
-    deviation: squared deviation of the bearing, in variances (2 degrees of freedom). vague: 2 ln of the ratio between
-    the area in which the landmark may appear and the area of the ray's own noise. cost: the sum of deviation, vague and the
-    range cost.
-    """
+    """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
+    degrees of freedom). vague: 2 ln of the ratio between the area in which the landmark may appear and the area of the ray's
+    own noise. cost: the sum of deviation, vague and the range cost."""
 
     ray: Ints
     landmark: Ints
@@ -48,7 +46,6 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
     """Return the pairs of a ray and a landmark that accepts its label whose squared bearing deviation is at most `gate`.
 
     pose: (R, 6, 6) covariance of the camera pose of each ray, rotations about the map axes (rad) before the position (m).
-    None stands for exact poses.
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]
@@ -75,10 +72,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of the pairs that may be within the gate, by a lower bound on their deviation.
-
-    The bound takes only matrix products, which are fast.
-    """
+    """Return the rays and the landmarks of the pairs that may be within the gate, by a lower bound on their deviation. The
+    bound takes only matrix products, which are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)

@@ -23,16 +23,16 @@ from objslam.core.statistics import grouped_quantile
 from objslam.core.torch_threads import torch_device
 from objslam.core.types import Association, Keyframes, Rays
 
-_TURNS = 8  # The most searches among the unassigned rays; fewer suffice once a search finds nothing.
+_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _ROUNDS = 12  # The most rounds of merging, and of merging and dropping, which could otherwise repeat without end.
-_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change; larger converges further.
+_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change. A larger value converges further.
 _SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames; later searches use other frames.
 _FRAMES = 12  # The fewest frames that a search uses, because an object is where rays of several frames meet.
-_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many; larger costs time.
+_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many. A larger value costs time.
 _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
-_CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search; larger drops weak objects.
-_PARALLAX = np.radians(2.0)  # The least angle (rad) between two rays that define a point; larger finds fewer, surer points.
+_CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
+_PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger one finds fewer, surer points.
 _FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 
 

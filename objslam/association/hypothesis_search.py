@@ -12,11 +12,11 @@ from objslam.core.torch_threads import one_torch_thread
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
 _DRAWS_EACH = 8  # The ray pairs drawn for each hypothesis, because most pairs do not meet.
-_REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis; larger costs time.
-_MIN_LEFT = 0.6  # The least share of its support that better points must leave to a point. With less it waits.
-_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision; a larger one would lose millimetres.
+_REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
+_MIN_LEFT = 0.6  # The share of its support that better points must leave to a point. Else it waits for the next search.
+_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. A larger one would lose millimetres.
 _RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
-_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away; larger trusts ranges more.
+_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
@@ -82,11 +82,9 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw pairs of rays, and return their indices.
-
-    If the first ray has a track, the second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then
-    the number of rays in between is uniform in its logarithm, because near frames more often show the same object.
-    """
+    """Draw pairs of rays, and return their indices. If the first ray has a track, the second ray comes from it with
+    probability 0.5. Otherwise it comes from any frame. Then the number of rays in between is uniform in its logarithm,
+    because near frames more often show the same object."""
     n = len(obs)
     first = rng.integers(n, size=count)
     reach = np.exp(rng.uniform(0.0, np.log(max(n, 2)), count)).astype(np.int64)

@@ -13,7 +13,7 @@ from objslam.core.statistics import grouped_median
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object."""
 _MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
-_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log; larger fuses labels sooner.
+_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log. A larger one fuses labels sooner.
 
 
 def fused_labels(state: State, gate: float) -> Bools:

@@ -44,11 +44,10 @@ class Landmarks:
 @dataclass(frozen=True)
 class PredictedLandmarks:
     """Predicted positions in the next frame of a live session: first of its landmarks, then of its candidates, n in all.
-
     landmarks: the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays
     have only a label in common. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry
-    at the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was seen.
-    """
+    at the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark
+    was seen."""
 
     landmarks: int
     id: Ints
@@ -62,7 +61,7 @@ class PredictedLandmarks:
 
 @dataclass(frozen=True)
 class State:
-    """Landmarks and their observations. matched: (R,) the landmark of each observation, -1 for none. view: the observed frames.
+    """Landmarks and their observations. matched: (R,) the landmark of each observation, or -1. view: the observed frames.
 
     Derived values are computed on first use and cached. P of the R rays have a landmark.
     """
@@ -135,8 +134,8 @@ class State:
 
     @cached_property
     def noise(self) -> Floats:
-        """Ratio (N,) of the actual to the nominal noise of each landmark's rays. If they are few, it is nearly the ratio of the
-        class."""
+        """Ratio (N,) of the actual to the nominal noise of each landmark's rays. If they are few, it is nearly the ratio of
+        the class."""
         middle = np.nan_to_num(grouped_median(self.deviation, self.owner, self.count)) / RAYLEIGH_MEDIAN
         own, number = np.minimum(middle, NOISE_FACTORS[1]), self.ray_count
         pooled = number * own + POOLED_WITH_CLASS * self.class_noise[self.label]

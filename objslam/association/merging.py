@@ -19,21 +19,19 @@ _OBJECT_COST = 10.0
 _SHARED_SPACE = (0.35, 0.5)
 """Two objects fill one space within a distance of the first share of the smaller size, or the second of the larger size."""
 _MOST_APART = 0.1
-"""The largest share of frames in which one object looks like two: of the rarer landmark's rays, or of the frames that should
-show both landmarks."""
+"""The largest share of frames in which one object may look like two. The frames are those of the rarer landmark, or those
+that should show both landmarks."""
 _MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is taken to be at least this.
 _DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
-_NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with; larger costs time in dense scenes.
+_NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0  # Landmarks within this many gates are compared, because little parallax gives one object two distances.
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """P pairs of landmarks a < b, and the rays of all pairs in one flat list of Q rays.
-
-    a, b: (P,) the landmarks. ray, pair: (Q,) the indices of each ray and of its pair. For each pair, the rays of a come
-    before the rays of b. So a ray is listed once for each pair of its landmark.
-    """
+    """P pairs of landmarks a < b, and the rays of all pairs in one flat list of Q rays. a, b: (P,) the landmarks. ray, pair:
+    (Q,) the indices of each ray and of its pair. For each pair, the rays of a come before the rays of b. So a ray is listed
+    once for each pair of its landmark."""
 
     a: Ints
     b: Ints
@@ -75,8 +73,8 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
 
 
 def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
-    """Return the pairs of landmarks a < b (P,) that may be one object. Their distance is small for the noise of their rays or
-    for their sizes, or they lie on one line of sight."""
+    """Return the pairs of landmarks a < b (P,) that may be one object. They are near, compared with the noise of
+    their rays or with their sizes, or they lie on one line of sight."""
     from scipy.spatial import cKDTree
 
     count, position = state.count, state.landmarks.position
@@ -91,8 +89,8 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 
 def _on_one_line(state: State, gate: float) -> Ints:
-    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second one. The reason is little
-    parallax or a phantom."""
+    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second landmark. The reason is
+    little parallax or a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -112,7 +110,7 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 
 def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
-    """Return how much lower -2 ln likelihood (P,) is for one object than for two, by fit, boxes, misses and object number."""
+    """Return by how much one object instead of two lowers -2 ln likelihood (P,), in fit, boxes, misses and object number."""
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]
@@ -146,8 +144,8 @@ def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) ->
 
 
 def _common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
-    """Return four counts (P,) of frames: a and b detected, a and b expected, a detected and b expected, b detected and a
-    expected."""
+    """Return four counts (P,) of frames: both landmarks detected, both expected, a detected and b expected, a expected
+    and b detected."""
     from scipy.sparse import csr_array
 
     shape = len(history.inside), int(history.frame.max(initial=0)) + 1

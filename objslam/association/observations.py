@@ -12,18 +12,16 @@ from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
-"""The least distance (m) of an object from a camera; larger loses objects right in front of the camera."""
+"""The least distance (m) of an object from a camera. A larger value loses objects right in front of the camera."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """R boxes as lines in the map. They are sorted by frame, then by the values of the box. So the input order has no effect.
-
-    frame: (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma:
-    (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown.
+    """R boxes as lines in the map, sorted by frame, then by the values of the box. So the input order has no effect. frame:
+    (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma: (R,)
+    rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown.
     range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px. track: (R,)
-    id of the track, -1 if unknown.
-    """
+    id of the track, -1 if unknown."""
 
     frame: Ints
     label: Ints
@@ -84,7 +82,7 @@ def observe(
 ) -> tuple[Observations, Ints, Ints]:
     """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
-    Frames are sorted by time and camera, and boxes within a frame by label and coordinates. So nothing depends on the input order.
+    Frames are sorted by time and camera, boxes in a frame by label and coordinates. So the input order has no effect.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]

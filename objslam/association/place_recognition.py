@@ -20,11 +20,11 @@ POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
 _BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
-_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment; few are enough from a close start.
+_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
 _CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Any two pairs form a hypothesis.
-_HYPOTHESES = 2000  # The most hypotheses from two pairs. Those with the longest bases are kept. More cost time.
-_VERIFIED = 20  # The most hypotheses that get a best assignment, those with the best quick scores. More cost time.
-_GAINS_AT_ONCE = 200_000  # The most gains computed together; larger needs more memory.
+_HYPOTHESES = 2000  # The most hypotheses from two pairs, with the longest bases. A larger number costs time.
+_VERIFIED = 20  # The hypotheses with the best quick scores that get a best assignment. A larger number costs time.
+_GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
 _MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
 
@@ -39,7 +39,7 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Return landmarks whose covariances are enlarged with the distance from the pivot (2,) m, because neighbourhoods bend."""
+    """Return the landmarks. Their covariances grow with the distance from the pivot (2,) m, because neighbourhoods bend."""
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 
@@ -138,10 +138,8 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift.
-
-    If there are too many pairs, those remain whose landmark here has the fewest partners. They are the most distinctive.
-    """
+    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift. If there are too many pairs, those
+    remain whose landmark here has the fewest partners. They are the most distinctive."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -186,7 +184,7 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
 
 
 def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """Return the corrections (..., 3) after one Gauss-Newton step for the pairs a, b (..., P), and the Hessian (..., 3, 3)."""
+    """Return the corrections (..., 3) after one Gauss-Newton step for pairs a, b (..., P), and the Hessian (..., 3, 3)."""
     at, jacobian = _moved(problem.offset[a], x)
     weighted = np.swapaxes(jacobian, -1, -2) @ information
     hessian = problem.weight + (weighted @ jacobian).sum(axis=-3)
@@ -195,10 +193,8 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: F
 
 
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner.
-
-    a, b: (C,) the candidates, sorted by a.
-    """
+    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) the candidates, sorted
+    by a."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
     first = np.flatnonzero(np.diff(a, prepend=-1))
     size = max(1, _GAINS_AT_ONCE // len(a))
@@ -211,16 +207,14 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
     """Return the log likelihood ratio (..., C) of "one landmark" over "a new one" for each pair under corrections (..., 3).
-
-    It is -inf for a pair outside a gate.
-    """
+    It is -inf for a pair outside a gate."""
     miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
 def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2). None if none fits."""
+    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2), or None."""
     gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
         gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)

@@ -125,7 +125,7 @@ class Triangulation(Section):
     min_parallax_deg: NotNegative = 3.0
     """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
     max_rel_sigma: Positive = 0.5
-    """Maximum standard deviation of a position as a share of its distance to the cameras. A less certain
+    """Maximum standard deviation of a position as a share of its distance from the cameras. A less certain
     object is unresolved."""
 
 
@@ -160,9 +160,9 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m after which a frame becomes a new keyframe. The first ten frames at rest are keyframes too."""
+    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames at rest are keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
-    """Camera rotation in degrees after which a frame becomes a new keyframe. A frame also becomes a keyframe if it shows a
+    """Camera rotation in degrees from the last keyframe to a new keyframe. A frame also becomes a keyframe if it shows a
     label that no keyframe at the current place shows."""
     max_keyframes: Annotated[int, Field(ge=50)] = 1500
     """Maximum number of keyframes, to bound memory and time. Above it, a quarter of the older keyframes is removed with
@@ -183,11 +183,9 @@ class Live(Section):
     """Minimum share of detections among the frames that should show an object. An object with a smaller share is dropped. A
     larger value drops true objects too."""
     ghost_frames: Count = 40
-    """Number of frames that should show an object before the object can be dropped as false. A larger value keeps false
-    objects longer."""
+    """Number of frames that should show an object before it can be dropped. A larger value keeps false objects longer."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
-    """Maximum number of boxes for which the offline association is repeated at the end of a session. The repetition takes a
-    few seconds."""
+    """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""

@@ -2,8 +2,7 @@
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
-& Monasse, IPOL 2, 2012). Its measure is the number of false alarms (NFA): the expected number of subsets that agree as well
-by chance.
+& Monasse, IPOL 2, 2012). Its measure is the number of false alarms (NFA): how many subsets agree as well by chance.
 """
 
 import math
@@ -19,18 +18,15 @@ _VIEW_CAP = 1 - math.cos(math.radians(45))
 """The view in which wrong boxes are uniformly distributed: a cone with 45 degrees half angle. Unit: 2 pi sr."""
 _NOISE_SIGMAS = 3.0  # The standard deviations of noise below which a smaller deviation of a ray scores no better.
 _MOST_NOISE = 0.25  # The largest share of the view for noise. A larger one lets very noisy rays agree with any point.
-_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. More need more memory.
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most alternations of Eq. 1 and selection, which end earlier once the agreement stops growing.
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Rays of many objects, sorted by object.
-
-    origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise along each
-    perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each ray. number: (N,) number of rays
-    of each object.
-    """
+    """Rays of many objects, sorted by object. origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit.
+    sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each
+    ray. number: (N,) number of rays of each object."""
 
     origin: Tensor
     direction: Tensor
@@ -40,11 +36,9 @@ class Bundle:
     number: Tensor
 
     def chunks(self, objects: Tensor, hypotheses: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into chunks of objects with similar numbers of rays.
-
-        A chunk holds the objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill
-        the rows of objects with fewer rays. hypotheses: the number of points to score per object. It limits the chunks.
-        """
+        """Split objects, given by their indices, into chunks of objects with similar numbers of rays. A chunk holds the
+        objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill the rows of objects
+        with fewer rays. hypotheses: the number of points to score per object. It limits the chunks."""
         first = torch.cumsum(self.number, 0) - self.number
         objects = objects[torch.argsort(self.number[objects], stable=True)]
         while len(objects):
@@ -143,10 +137,8 @@ def _far_ahead(bundle: Bundle) -> Tensor:
 
 
 def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which rays (R,) agree with the point (N, 3) of their object, and the log NFA (N,) of this agreement.
-
-    A log NFA below 0 means that the agreement is not by chance.
-    """
+    """Return which rays (R,) agree with the point (N, 3) of their object, and the log NFA (N,) of this agreement. A log NFA
+    below 0 means that the agreement is not by chance."""
     inlier = torch.zeros(len(bundle.origin), dtype=torch.bool, device=points.device)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
     for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
@@ -185,9 +177,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the pairs (B, H) of rays `first` < `second` of objects with `number` (B,) rays, and whether each pair exists.
-
-    which: (H,) indices of the hypotheses, with their jitter (H,).
-    """
+    which: (H,) indices of the hypotheses, with their jitter (H,)."""
     n = number[:, None].to(jitter.dtype)
     pairs = n * (n - 1) / 2
     rank = torch.where(pairs <= hypotheses, which, torch.floor((which + jitter) * (pairs / hypotheses)))
@@ -202,11 +192,9 @@ def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tu
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist.
-
-    Parallel rays have no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it.
-    `closest_approach` does the same in numpy.
-    """
+    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have
+    no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in
+    numpy."""
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
     cos = (n1 * n2).sum(-1)
@@ -221,10 +209,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that the ray of a wrong box is as close to the points (B, H, 3) as each ray is.
-
-    It is 1 for a ray that points away from the point, and for a ray that is not `real`.
-    """
+    """Return the probability (B, H, n) that the ray of a wrong box is as close to the points (B, H, 3) as each ray is. It is
+    1 for a ray that points away from the point, and for a ray that is not `real`."""
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
     distance2 = points.square().sum(-1)[..., None] - 2 * points @ origin.mT + origin.square().sum(-1)[:, None]

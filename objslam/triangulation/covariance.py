@@ -110,9 +110,7 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-
-    For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %.
-    """
+    For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
     rays = _used(bundle, use)
     widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
     axes = _sphere(64, rays.direction)
@@ -137,9 +135,7 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
 
 def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Return the median (N,) of the values (R,) of each object. NaN without values. index: (R,) the object of each value.
-
-    `core.statistics.grouped_median` returns the upper median in numpy.
-    """
+    `core.statistics.grouped_median` returns the upper median in numpy."""
     if len(values) == 0:
         return values.new_full((count,), torch.nan)
     order = torch.argsort(values)
@@ -163,13 +159,11 @@ def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
-    """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation.
-
-    miss: (R,) normalised residuals. Their mean is used, because it is robust. The fit takes `taken` of the 2 n degrees of
-    freedom of n rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is
-    uncertain. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large
-    rest. It is exact to 3 % from 4 rays on.
-    """
+    """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation. miss: (R,)
+    normalised residuals. Their mean is used, because it is robust. The fit takes `taken` of the 2 n degrees of freedom of n
+    rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain.
+    The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
+    exact to 3 % from 4 rays on."""
     number = rays.number.to(miss.dtype)
     mean = object_sum(miss, rays.index, len(number)) / number.clamp(min=1) / RAYLEIGH_MEAN
     rest = (2 * number - taken).clamp(min=1)

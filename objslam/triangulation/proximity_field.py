@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats
 from objslam.triangulation.triangulate import solve_eq1
 
-_AT_ONCE = 2_000_000  # The most distances computed together. More need more memory.
+_AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _REACH = 8.0  # Half the edge of a slice, as a multiple of the rays' median distance from the minimum.
 _LEAST_REACH, _MOST_REACH = 0.15, 3.0  # The least and the largest half edge (m) of a slice.
 
@@ -22,12 +22,9 @@ class FieldSlice:
 
 @dataclass(frozen=True)
 class ProximityField:
-    """The field of one object.
-
-    minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays from the minimum. horizontal: the
-    slice through the minimum parallel to the floor. vertical: the upright slice through the minimum along the mean direction
-    of the rays, in which the object is the least certain.
-    """
+    """The field of one object. minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays from the
+    minimum. horizontal: the slice through the minimum parallel to the floor. vertical: the upright slice through the minimum
+    along the mean direction of the rays, in which the object is the least certain."""
 
     minimum: Floats
     cost: float
