@@ -2,7 +2,7 @@
 
 
 def one_line(text: object) -> str:
-    """Return a text or an exception as one line of valid Unicode. An exception without a text becomes its type name."""
+    """Return a text, or the text of an exception, as one line of valid Unicode. An exception without text gives its type."""
     said = str(text)
     if not said.isprintable():
         joined = " ".join(part for line in said.splitlines() if (part := line.strip()))
@@ -11,8 +11,8 @@ def one_line(text: object) -> str:
 
 
 class ObjslamError(Exception):
-    """Report a failure that a user can correct. `where` is a file:line, topic or timestamp, and `hint` is the remedy.
-    Message, place, hint and the text of the error become one line each."""
+    """A failure that a user can correct. `where` is a file:line, topic or timestamp, and `hint` is the remedy.
+    The message, `where` and `hint` are reduced to one line each, so the text of the error is also one line."""
 
     exit_code = 1
 
@@ -34,22 +34,22 @@ def first_line(error: BaseException) -> str:
 
 
 class LogError(ObjslamError):
-    """Report a log, or a necessary part of a log, that cannot be read."""
+    """A log, or a necessary part of it, cannot be read."""
 
 
 class SolveError(ObjslamError):
-    """Report an estimation without a solution: there is nothing to solve, or every solver fails."""
+    """An estimation has no solution, because there is nothing to solve or because every solver fails."""
 
 
 class DetectorError(ObjslamError):
-    """Report a detector model that cannot be loaded, interpreted or run."""
+    """A detector model cannot be loaded, interpreted or run."""
 
 
 class OutputError(ObjslamError):
-    """Report a result that cannot be written or read."""
+    """A result cannot be written or read."""
 
 
 class ConfigError(ObjslamError):
-    """Report a wrong setting or option, which is a usage error."""
+    """A setting or a command-line option is wrong. This is a usage error."""
 
     exit_code = 2

@@ -1,4 +1,4 @@
-"""Decides which ray belongs to which object, offline and live: gates, assignment, existence and place recognition.
+"""Decides which ray belongs to which object, offline and live, by gates, assignment, existence and place recognition.
 
-It changes no pose and holds no factor: `graph` does, and `live.mapper` holds the state of a live map.
+It leaves poses and factors to `graph`, and the state of a live map to `live.mapper`.
 """

@@ -1,4 +1,4 @@
-"""Align a stretch of rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
+"""Align rays with known landmarks by a planar correction (correlative matching after Olson, ICRA 2009)."""
 
 import numpy as np
 
@@ -8,20 +8,20 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 _GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
-_MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y; larger costs time.
+_MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y. A larger value costs time.
 _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m); later association corrects the rest.
 _LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
 _MIN_LEVEL = 0.1  # The least cosine of a ray's elevation by which its heading noise is divided.
-_AT_ONCE = 2_000_000  # The most distances computed together; larger needs more memory.
+_AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations, because the range may be wrong.
 
 
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
-    """Return the planar correction (4, 4) in map that aligns the rays of these cameras with the landmarks.
+    """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
 
     Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray. positions,
     labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
-    standard deviations of x, y (m) and yaw (rad) in map, which define the prior and bound the grid.
+    standard deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -41,7 +41,7 @@ def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, cen
 def _misfit(
     rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
 ) -> Floats:
-    """Return the cost (H,) of all rays under corrections (H, 3)."""
+    """Return the sum (H,) of the costs of all rays under each correction (H, 3)."""
     origin, direction = rays.in_map(map_T_camera)
     offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
     cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])

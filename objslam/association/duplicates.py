@@ -5,11 +5,12 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""The largest share of frames that may show both duplicates because of wrong boxes; larger merges separate objects."""
+"""The largest share of frames in which wrong boxes show one object as two. A larger share merges separate objects."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
-    """Return the pairs a < b (P,) of objects (N,) of one label within `farthest` m, and the offsets (P, 3) m from b to a."""
+    """Return the pairs a < b (P,) of objects with one label that are less than `farthest` m apart, and the offsets (P, 3) m
+    from b to a."""
     a, b = np.triu_indices(len(position), 1)
     apart = position[a] - position[b]
     near = (label[a] == label[b]) & (np.linalg.norm(apart, axis=1) < farthest)
@@ -17,5 +18,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. `together` frames show both, and `frames` frames show the rarer object."""
+    """Return whether two objects differ, if `together` of the `frames` that show the rarer one show both."""
     return together > TOGETHER * frames

@@ -1,4 +1,5 @@
-"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion."""
+"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
+landmark that is no object, because rays of different things meet there."""
 
 from dataclasses import dataclass
 
@@ -10,33 +11,34 @@ from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
-_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations of rates; larger means more alike.
-_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one; larger drops fewer objects.
+_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger ones mean more similar rates.
+_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one. More drops fewer objects.
 _POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
-_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets; larger keeps more weak objects.
+_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets. A larger value keeps more weak objects.
 _EXPECTED_STRAYS = 5.0  # The number of stray boxes that each class is assumed to have besides the observed ones.
 _LOG_SIZE = 0.7  # The standard deviation of ln size within a class, which is a factor of 2.
 _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms, which is a factor of 100.
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance, which only keeps them finite.
-_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one; larger drops fewer objects.
+_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Beta distributions of the detection rates in each class: mean (L,), and concentration, the sum of the parameters."""
+    """Beta distributions of the detection rates in each class. mean: (L,). concentration: the sum of the two parameters,
+    the same for all classes."""
 
     mean: Floats
     concentration: float
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
-        """Return -2 ln of the probability (N,) that objects of these labels (N,) have these detections and misses."""
+        """Return -2 ln of the probability (N,) that objects with these labels are `seen` times in `expected` frames."""
         return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
 
     def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
-        """Return the log odds (N,) of an object of its class over a phantom, from its number of detections."""
+        """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses."""
         rate = self.mean[label]
         phantom = rate * _PHANTOM_SHARE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
@@ -45,10 +47,9 @@ class Rates:
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
-    """Estimate the rate of each class as the median over its boxes, drawn to the rate of all classes if they are few.
-
-    The concentration is the lowest one that is not clearly less likely than the best. Any object may be a phantom.
-    """
+    """Estimate the rate of each class as the median over its boxes. If they are few, it is near the rate of all classes. The
+    concentration is the lowest one that is not clearly less likely than the best one. Their likelihoods allow for any object
+    to be a phantom."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
@@ -60,7 +61,7 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
 
 
 def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
-    """Return ln of the probability of one sequence of detections and misses with a beta-distributed rate."""
+    """Return ln of the probability (N,) of a sequence of detections and misses if the rate is beta distributed."""
     from scipy.special import betaln
 
     a, b = concentration * rate, concentration * (1 - rate)
@@ -68,7 +69,7 @@ def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: floa
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:
-    """Return the value (count,) of each group below which half of its weight lies, or 0 for a group without weight."""
+    """Return the weighted median (count,) of each group: half of the weight lies below it. It is 0 without weight."""
     result = np.zeros(count)
     order = np.lexsort((values, group))
     total = np.cumsum(weight[order])
@@ -91,8 +92,8 @@ def existence(state: State, gate: float) -> Floats:
 def chance_odds(state: State, gate: float) -> Floats:
     """Return the log odds (N,) that the rays of each landmark do not meet by chance.
 
-    Any two stray rays of a class define a point. The number of other strays in its gate is Poisson distributed. Strays are
-    the rays without landmark, and the rays of landmarks with no more rays than this one.
+    Any two stray rays of a class define a point. The number of further strays in the gate of the point is Poisson
+    distributed. Strays are the rays without a landmark, and the rays of landmarks with no more rays than this one.
     """
     from scipy.stats import poisson
 
@@ -109,7 +110,7 @@ def prior_odds(state: State) -> Floats:
 
 
 def stray_share(state: State, gate: float) -> Floats:
-    """Return the share (N,) of boxes at random places in the images that would pass each landmark within its gate."""
+    """Return the share (N,) of boxes at random pixels of the images whose rays would pass each landmark within its gate."""
     angle2 = state.variance / np.maximum(state.distance, 1e-3) ** 2
     area = np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1)
     looks = np.maximum(state.history.inside, state.history.expected)
@@ -117,7 +118,7 @@ def stray_share(state: State, gate: float) -> Floats:
 
 
 def size_odds(state: State) -> Floats:
-    """Return the log odds (N,), at most 0, of an object of its class over a phantom, from its size.
+    """Return the log odds (N,), at most 0, of an object of the class over a phantom, from the landmark's size.
 
     Crossing rays of different objects give a wrong distance, and so a wrong size.
     """
@@ -128,7 +129,7 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """Return the number of rays (N,) of all landmarks of the same class with no more rays than each landmark."""
+    """Return for each landmark the total number (N,) of rays of those landmarks of its class that have no more rays."""
     rank = label * (int(number.max(initial=0)) + 1) + number
     order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))
@@ -139,9 +140,9 @@ def _no_stronger(number: Ints, label: Ints) -> Ints:
 def rest_odds(state: State) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
-    Rays of a slow object may meet for a while, but a moving point explains them much better. The odds are by BIC, from the
-    share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes, which
-    looks like motion. So only a few rays count, and motion within the object's size does not count.
+    Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
+    the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes.
+    This looks like motion. So only a few rays count, and motion within the object's size does not count.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]

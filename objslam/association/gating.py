@@ -11,19 +11,18 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import skew
 
 TRACK_GAIN = 2.0
-"""The cost reduction of a match if most other boxes of the ray's track have its landmark; larger trusts the tracker more."""
-_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together; larger needs more memory.
-_FEW_PAIRS = 1 << 12  # The number of pairs up to which computing all exact costs is faster than a bound first.
-_TABLE = 1 << 22  # The most entries of a dense table of gains; larger tables are sparse.
+"""The cost reduction of a match if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
+more."""
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
+_FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
+_TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Possible matches (E,), sorted by ray, then by landmark.
-
-    deviation: squared deviation of the bearing, in variances (2 degrees of freedom). vague: ln of the area in which the
-    landmark may appear, divided by the area of the ray's own noise. cost: the sum of deviation, vague and the range cost.
-    """
+    """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
+    degrees of freedom). vague: 2 ln of the ratio between the area in which the landmark may appear and the area of the ray's
+    own noise. cost: the sum of deviation, vague and the range cost."""
 
     ray: Ints
     landmark: Ints
@@ -44,9 +43,9 @@ def tangent_basis(direction: Floats) -> Floats:
 
 
 def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
-    """Return all pairs of a ray and a landmark that accepts its label, with a squared bearing deviation within the gate.
+    """Return the pairs of a ray and a landmark that accepts its label whose squared bearing deviation is at most `gate`.
 
-    pose: (R, 6, 6) covariance of each ray's camera, rotations about the map axes (rad) before the position (m).
+    pose: (R, 6, 6) covariance of the camera pose of each ray, rotations about the map axes (rad) before the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]
@@ -73,7 +72,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return pairs that pass a bound on their deviation. The bound takes only matrix products, which are fast."""
+    """Return the rays and the landmarks of the pairs that may be within the gate, by a lower bound on their deviation. The
+    bound takes only matrix products, which are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -81,7 +81,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn, move = np.zeros((2, len(obs.label)))
-    if pose is not None:  # Twice its diagonal blocks bound a covariance with any correlation between them.
+    if pose is not None:  # Twice the diagonal blocks of a covariance bound it, whatever their correlation.
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
@@ -104,7 +104,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
 
 
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
-    """Return the landmark (R,) of each ray, -1 for none, with the least total cost.
+    """Return the landmark (R,) of each ray, or -1, in the assignment with the least total cost.
 
     A landmark gets at most one ray per frame. Each frame is solved separately. Parts of a frame that share no ray and no
     landmark are also solved separately. Only a part with several rays and several landmarks needs the Hungarian method.
@@ -166,7 +166,8 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """Return the cost reduction (E,) of the edges whose landmark most other boxes of the ray's track have.
+    """Return the cost reduction (E,) of each edge. It is 0 unless most other boxes of the ray's track, and at least two,
+    have the landmark of the edge.
 
     track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """
@@ -189,5 +190,5 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
 
 
 def gate_limit(share: float) -> float:
-    """Return the squared deviation (chi-squared, 2 degrees of freedom) below which this share of correct matches lies."""
+    """Return the squared deviation (chi-squared, 2 degrees of freedom) below which a `share` of correct matches lies."""
     return float(-2 * np.log1p(-share))

@@ -1,7 +1,7 @@
 """Global association at known poses: assign rays to an unknown number of objects.
 
 A search finds points where rays of one label meet, and the best points become landmarks. Then landmarks are merged, fused
-across labels and dropped, each time in favour of the cheaper explanation of the boxes and the misses.
+across labels or dropped, if this explains the boxes and the misses at a lower cost.
 """
 
 from dataclasses import dataclass, replace
@@ -23,22 +23,23 @@ from objslam.core.statistics import grouped_quantile
 from objslam.core.torch_threads import torch_device
 from objslam.core.types import Association, Keyframes, Rays
 
-_TURNS = 8  # The most searches among the unassigned rays; fewer suffice once a search finds nothing.
+_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _ROUNDS = 12  # The most rounds of merging, and of merging and dropping, which could otherwise repeat without end.
-_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change; larger converges further.
+_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change. A larger value converges further.
 _SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames; later searches use other frames.
 _FRAMES = 12  # The fewest frames that a search uses, because an object is where rays of several frames meet.
-_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many; larger costs time.
-_MIN_SUPPORT = 2.5  # The least support of a point in a search, in rays that fit perfectly.
-_ABOVE_CHANCE = 3.0  # The least standard deviations by which a point's support must exceed the support by strays.
-_CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search; larger drops weak objects.
-_PARALLAX = np.radians(2.0)  # The least angle (rad) between two rays that define a point; larger finds fewer, surer points.
+_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many. A larger value costs time.
+_MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
+_ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
+_CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
+_PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger one finds fewer, surer points.
 _FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 
 
 @dataclass(frozen=True)
 class _Task:
-    """Constants of one association. gate: squared deviation. device: of torch. seed: of the random ray pairs."""
+    """Constants of one association. gate: the largest squared deviation of a match. device: the torch device. seed: the seed
+    of the random ray pairs."""
 
     gate: float
     settings: config.AssociationSettings
@@ -60,15 +61,15 @@ def associate_globally(
 ) -> Association:
     """Assign rays to objects at known camera poses.
 
-    Objects are sorted by label, then by their first frame. Rays that no static object explains get none. The result does not
-    depend on the order of rays and keyframes.
+    Objects are sorted by label, then by their first frame. Rays that no static object explains get no object. The result
+    does not depend on the order of rays and keyframes.
 
     Args:
         keyframes: all observed frames. Frames without a box count as misses.
         map_T_camera: (K, 4, 4) of the keyframes.
         sigma: (R,) rad, the noise of the rays' angles, including the noise of the poses.
         position_sigma: m, the noise of the rays' origins.
-        guess: an initial association of these rays, and the positions (N, 3) m of its objects. NaN drops an object.
+        guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
     margins = settings.rays.border, settings.rays.border_share
@@ -103,7 +104,7 @@ def associate_globally(
 
 
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
-    """For each label, add landmarks where unassigned rays agree."""
+    """Add landmarks where unassigned rays of one label agree."""
     from objslam.association.hypothesis_search import Search, discover
 
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
@@ -130,7 +131,7 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
 
 
 def _add_distant(task: _Task, state: State) -> State:
-    """Add landmarks where rays without parallax agree, which see distant objects or come from a robot that hardly moves."""
+    """Add landmarks where rays without parallax agree. They see distant objects, or come from a robot that hardly moves."""
     known = state.count
     state = _alternate(task, _discover(task, state, _TURNS, 0.0), 2)
     index, direction = state.owner, state.obs.direction[state.assigned]
@@ -159,7 +160,7 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
 
 
 def _plausible(task: _Task, state: State) -> Bools:
-    """Return which landmarks (N,) have enough rays and are not where parallel rays meet."""
+    """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
     near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
     return np.asarray((state.ray_count >= task.settings.min_rays) & near)
 
@@ -182,7 +183,7 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
-    """Drop landmarks until all are likely enough to exist, and return their probabilities (N,) of existence as well."""
+    """Drop landmarks until all others are likely enough to exist. Also return the probability (N,) that each exists."""
     while True:
         likely = existence(state, task.gate)
         left = _drop(task, state, likely)
@@ -194,7 +195,7 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
-    Of two neighbours only the weaker one is dropped, because it may hold boxes of the stronger one.
+    If both of two neighbours fail, only the weaker one is dropped, because it may hold boxes of the stronger one.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():
@@ -208,7 +209,8 @@ def _drop(task: _Task, state: State, likely: Floats) -> State:
 
 
 def _result(state: State, existence: Floats, ray: Ints) -> Association:
-    """Return the objects in their final order, with existence (N,). ray: (R,) the ray of each observation."""
+    """Return the association with its objects in their final order. existence: (N,) probability of each landmark. ray: (R,)
+    the ray of each observation."""
     counts, label = state.label_count, state.label
     first = np.full(len(label), len(ray))
     np.minimum.at(first, state.owner, state.assigned)

@@ -1,4 +1,4 @@
-"""Search points that many rays of one label agree on, from pairs of rays, in torch."""
+"""Search for points on which many rays of one label agree, from pairs of rays, in torch."""
 
 from dataclasses import dataclass
 
@@ -12,18 +12,19 @@ from objslam.core.torch_threads import one_torch_thread
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
 _DRAWS_EACH = 8  # The ray pairs drawn for each hypothesis, because most pairs do not meet.
-_REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis; larger costs time.
-_MIN_LEFT = 0.6  # The least share of its support that a hypothesis must keep; with less it waits for the next search.
-_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision; a larger one would lose millimetres.
+_REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
+_MIN_LEFT = 0.6  # The share of its support that better points must leave to a point. Else it waits for the next search.
+_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. A larger one would lose millimetres.
 _RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
-_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away; larger trusts ranges more.
+_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
 @dataclass(frozen=True)
 class Search:
-    """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: squared
-    deviation. parallax: least angle (rad) of a pair, or 0 to also try distances along single rays. device: of torch."""
+    """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: largest squared
+    deviation of a ray that supports a point. parallax: least angle (rad) between the rays of a pair, or 0 to also try
+    distances along single rays. device: the torch device."""
 
     hypotheses: int
     support: float
@@ -34,10 +35,10 @@ class Search:
 
 @one_torch_thread()
 def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Return points (N, 3) m that rays of one label agree on, the best supported first.
+    """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
-    Each hypothesis is scored against all rays at once. In each frame only the best ray counts, from 1 for a perfect fit to 0
-    at the gate. The support of a point excludes the rays of better points.
+    Each hypothesis is scored against all rays at once. In each frame only the best ray counts: 1 for a perfect fit, 0 at the
+    gate. The support of a point excludes the rays of better points.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:
@@ -61,7 +62,8 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Return points (H, 3) where two rays of different frames meet, where ranges end, and along rays without parallax."""
+    """Return points (H, 3) where two rays of different frames meet, where ranges end, and, if `search.parallax` is 0, along
+    single rays."""
     first, second = _draw(obs, _DRAWS_EACH * search.hypotheses, rng)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
@@ -80,10 +82,9 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw pairs of rays. Half of the second rays come from the first ray's track if it has one, the others from any frame.
-
-    The number of rays in between is uniform in its logarithm, because near frames more often show the same object.
-    """
+    """Draw pairs of rays, and return their indices. If the first ray has a track, the second ray comes from it with
+    probability 0.5. Otherwise it comes from any frame. Then the number of rays in between is uniform in its logarithm,
+    because near frames more often show the same object."""
     n = len(obs)
     first = rng.integers(n, size=count)
     reach = np.exp(rng.uniform(0.0, np.log(max(n, 2)), count)).astype(np.int64)
@@ -98,7 +99,7 @@ def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints
 
 
 class _Scorer:
-    """Rays of one label, sorted so that the best ray of each frame is a running maximum over slices.
+    """A scorer of points by rays of one label, sorted so that the best ray of a frame is a running maximum over slices.
 
     Slice k holds the k-th ray of every frame with more than k rays. Frames with more rays come first.
     """
@@ -134,7 +135,8 @@ class _Scorer:
         return self._tensor(points - self.centre)
 
     def supports(self, points: Tensor) -> Tensor:
-        """Return supports (H, R) of points by rays: 1 for a perfect fit, less with the squared deviation, 0 at the gate."""
+        """Return the support (H, R) of each point by each ray. It falls with the squared deviation, from 1 for a perfect fit
+        to 0 at the gate. A wrong range also reduces it."""
         p = torch.cat([points, points.square().sum(1, keepdim=True), torch.ones_like(points[:, :1])], 1)
         out = torch.empty((len(p), self.ahead.shape[1]), dtype=self.dtype, device=self.device)
         step = max(1, _PAIRS_AT_ONCE // self.ahead.shape[1])
@@ -149,7 +151,7 @@ class _Scorer:
         return out
 
     def per_frame(self, support: Tensor) -> Tensor:
-        """Return the sums (H,) over the frames of the best support (H, R) in each frame."""
+        """Return the best support (H, R) in each frame, summed over the frames (H,)."""
         best, at = support[:, : self.slices[0]].clone(), self.slices[0]
         for width in self.slices[1:]:
             torch.maximum(best[:, :width], support[:, at : at + width], out=best[:, :width])
@@ -157,7 +159,7 @@ class _Scorer:
         return best.sum(dim=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
-        """Move points (H, 3) to the least-squares solution of their supporters, except along directions that stay free."""
+        """Move points (H, 3) to the least-squares solution of their rays, but not along directions that these do not fix."""
         information = (support @ self.across).reshape(-1, 3, 3)
         damping = (1e-3 * information.diagonal(dim1=1, dim2=2).sum(dim=1) + 1e-6)[:, None]
         information = information + damping[:, :, None] * torch.eye(3, dtype=self.dtype, device=self.device)

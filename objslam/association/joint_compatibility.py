@@ -1,6 +1,7 @@
-"""Joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
+"""Test the joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-Unknown objects may lie in their wide gates. So one pose error must explain the offsets of all landmarks together.
+The gates of such landmarks are wide and may contain unknown objects. So one pose error must explain the offsets of all
+landmarks together.
 """
 
 import numpy as np
@@ -12,7 +13,7 @@ from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import skew
 
-_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object; larger trusts fewer landmarks.
+_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds trust fewer.
 _MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
@@ -23,8 +24,8 @@ def jointly_compatible(
     """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
     A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay. doubt: (6, 6)
-    covariance of the camera's pose relative to the landmarks, in the camera frame. unknown: (n,) expected number of unknown
-    objects of the label per steradian along each ray.
+    covariance of the camera's pose relative to the landmarks, in camera coordinates. unknown: (n,) expected number of
+    unknown objects per steradian along each ray that have the label of the ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)
@@ -53,10 +54,11 @@ def jointly_compatible(
 
 
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
-    """Return the expected number of unknown objects (n,) per steradian along each ray, of the label of landmark rows (n,).
+    """Return the expected number (n,) of unknown objects per steradian along each ray that have the label of its landmark.
 
-    novelty: the recent number of boxes of unknown objects per box of a known one. Unknown objects are assumed in the same
-    ratio to known ones, evenly spread over the room, and visible up to its end or the farthest distance of a seen landmark.
+    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. There
+    are assumed to be as many unknown objects per known one, spread evenly over the room. They are visible up to the end of
+    the room, but not beyond the greatest distance at which a landmark was seen.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -13,14 +13,14 @@ from objslam.core.statistics import grouped_median
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object."""
 _MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
-_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log; larger fuses labels sooner.
+_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log. A larger one fuses labels sooner.
 
 
 def fused_labels(state: State, gate: float) -> Bools:
-    """Return which labels each landmark accepts (N, L): its own, and labels whose unassigned boxes the landmark explains.
+    """Return which labels (N, L) each landmark accepts: its own, and labels whose unassigned boxes it explains.
 
-    Explained boxes have the landmark's size and lie on it in frames without a box of its own. They must be more than strays
-    would be, and fewer than its own boxes.
+    An explained box lies on the landmark, in a frame in which the landmark has no box of its own. The explained boxes of a
+    label must have the landmark's size. They must be more than strays would be, and fewer than the landmark's own boxes.
     """
     from scipy.stats import poisson
 

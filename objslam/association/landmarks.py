@@ -17,7 +17,7 @@ from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_CLASS, RAYLEIGH_M
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Objects as points. position: (N, 3) m. covariance: (N, 3, 3) m^2. noise: (N,) factor on the stated noise of their
+    """Objects as points. position: (N, 3) m. covariance: (N, 3, 3) m^2. noise: (N,) factor on the nominal noise of their
     rays. accepts: (N, L) whether a box of a label may belong to them."""
 
     position: Floats
@@ -27,7 +27,7 @@ class Landmarks:
 
     @classmethod
     def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
-        """Create landmarks at exact positions that accept one label (N,) each, of `labels` labels."""
+        """Create landmarks at exact positions. Each accepts one label (N,). labels: the number of all labels."""
         accepts = np.zeros((len(position), labels), dtype=bool)
         accepts[np.arange(len(position)), label] = True
         return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
@@ -37,18 +37,17 @@ class Landmarks:
         return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
 
     def and_also(self, other: Self) -> Self:
-        """Append the other landmarks."""
+        """Return these landmarks, followed by the other ones."""
         return type(self)(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class PredictedLandmarks:
-    """Prediction for the next frame of a session: n places, first of its landmarks, then of its candidates.
-
+    """Predicted positions in the next frame of a live session: first of its landmarks, then of its candidates, n in all.
     landmarks: the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays
-    share only a label. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) of the odometry at the last
-    observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was seen.
-    """
+    have only a label in common. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry
+    at the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark
+    was seen."""
 
     landmarks: int
     id: Ints
@@ -62,7 +61,7 @@ class PredictedLandmarks:
 
 @dataclass(frozen=True)
 class State:
-    """Landmarks, and matched (R,), the landmark of each observation, -1 for none. view: the observed frames.
+    """Landmarks and their observations. matched: (R,) the landmark of each observation, or -1. view: the observed frames.
 
     Derived values are computed on first use and cached. P of the R rays have a landmark.
     """
@@ -99,7 +98,8 @@ class State:
 
     @cached_property
     def deviation(self) -> Floats:
-        """Deviation (P,) of each assigned ray from its landmark, in stated standard deviations."""
+        """Deviation (P,) of each assigned ray from its landmark, in standard deviations of its nominal noise; `BEHIND` for a
+        landmark behind the camera."""
         return np.minimum(normalised_residuals(self.obs, self.landmarks.position[self.owner], of=self.assigned), BEHIND)
 
     @cached_property
@@ -121,12 +121,12 @@ class State:
 
     @cached_property
     def unassigned(self) -> Ints:
-        """Number (L,) of rays of each label without landmark."""
+        """Number (L,) of rays without a landmark, for each label."""
         return np.bincount(self.obs.label[self.matched < 0], minlength=self.landmarks.accepts.shape[1])
 
     @cached_property
     def class_noise(self) -> Floats:
-        """Ratio (L,) of the actual to the stated noise of the rays of each label, drawn to 1 if they are few."""
+        """Ratio (L,) of the actual to the nominal noise of the rays of each class. It is nearly 1 if they are few."""
         labels, label = len(self.unassigned), self.label[self.owner]
         number = np.bincount(label, minlength=labels)
         middle = np.nan_to_num(grouped_median(self.deviation, label, labels)) / RAYLEIGH_MEDIAN
@@ -134,7 +134,8 @@ class State:
 
     @cached_property
     def noise(self) -> Floats:
-        """Ratio (N,) of the actual to the stated noise of each landmark's rays, drawn to the ratio of its class."""
+        """Ratio (N,) of the actual to the nominal noise of each landmark's rays. If they are few, it is nearly the ratio of
+        the class."""
         middle = np.nan_to_num(grouped_median(self.deviation, self.owner, self.count)) / RAYLEIGH_MEDIAN
         own, number = np.minimum(middle, NOISE_FACTORS[1]), self.ray_count
         pooled = number * own + POOLED_WITH_CLASS * self.class_noise[self.label]
@@ -142,13 +143,13 @@ class State:
 
     @cached_property
     def size(self) -> Floats:
-        """Size (N,) m, the median over a landmark's boxes of the geometric mean of width and height; 0 without boxes."""
+        """Size (N,) m, the geometric mean of width and height, as the median over a landmark's boxes. 0 without boxes."""
         size = np.sqrt(self.obs.size[self.assigned].prod(axis=1)) * self.distance
         return np.nan_to_num(grouped_median(size, self.owner, self.count))
 
     @cached_property
     def ray_sigma(self) -> Floats:
-        """Median standard deviation (N,) m of each landmark's rays at its distance, 0 without rays."""
+        """Median standard deviation (N,) m of the offsets between each landmark and its rays. 0 without rays."""
         return np.nan_to_num(grouped_median(np.sqrt(self.variance), self.owner, self.count))
 
     @cached_property
@@ -157,7 +158,7 @@ class State:
         return detection_history(self.obs, self.matched, self.landmarks.position, self.label, self.view)
 
     def keep(self, which: Bools) -> State:
-        """Keep some landmarks (N,) bool, and unassign the rays of all others."""
+        """Keep the landmarks in the mask `which` (N,), and unassign the rays of all others."""
         if which.all():
             return self
         number = np.append(np.cumsum(which) - 1, -1)

@@ -1,4 +1,4 @@
-"""Decide whether two landmarks are one object, by the cheaper explanation of their rays, common frames and misses."""
+"""Decide whether two landmarks are one object, by which explanation of their rays, common frames and misses is cheaper."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,24 @@ from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
-_OBJECT_COST = 10.0  # The cost of one more object in squared deviations, on top of BIC's ln of the rays for each coordinate.
-_SHARED_SPACE = (0.35, 0.5)  # The shares of the smaller size and of the larger size within which two objects fill one space.
-_MOST_APART = 0.1  # One object looks like two in at most this share of the rarer object's frames, or of the expected frames.
-_MIN_EXPECTED = 5.0  # The fewest expected common frames of two objects for which a missing common frame counts.
+_OBJECT_COST = 10.0
+"""The cost of one more object in squared deviations. BIC's cost is added: ln of the number of rays for each coordinate."""
+_SHARED_SPACE = (0.35, 0.5)
+"""Two objects fill one space within a distance of the first share of the smaller size, or the second of the larger size."""
+_MOST_APART = 0.1
+"""The largest share of frames in which one object may look like two. The frames are those of the rarer landmark, or those
+that should show both landmarks."""
+_MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is taken to be at least this.
 _DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
-_NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with; larger costs time in dense scenes.
-_REACH_GATES = 2.0  # The gates within which landmarks are compared, because little parallax gives one object two distances.
+_NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
+_REACH_GATES = 2.0  # Landmarks within this many gates are compared, because little parallax gives one object two distances.
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of landmarks a < b (P,), and the rays of both as indices of ray and pair (Q,)."""
+    """P pairs of landmarks a < b, and the rays of all pairs in one flat list of Q rays. a, b: (P,) the landmarks. ray, pair:
+    (Q,) the indices of each ray and of its pair. For each pair, the rays of a come before the rays of b. So a ray is listed
+    once for each pair of its landmark."""
 
     a: Ints
     b: Ints
@@ -34,7 +40,7 @@ class _Pairs:
 
 
 def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
-    """Return the landmark (N,) that each landmark merges into: itself, or the one with more rays if a pair is one object.
+    """Return the landmark (N,) into which each one merges: itself, or the one with more rays if a pair is one object.
 
     across_labels: compare pairs of different labels instead of pairs with one label.
     """
@@ -67,7 +73,8 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
 
 
 def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
-    """Return pairs of landmarks a < b (P,) that may be one object: near for their rays or sizes, or on one line of sight."""
+    """Return the pairs of landmarks a < b (P,) that may be one object. They are near, compared with the noise of
+    their rays or with their sizes, or they lie on one line of sight."""
     from scipy.spatial import cKDTree
 
     count, position = state.count, state.landmarks.position
@@ -82,7 +89,8 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 
 def _on_one_line(state: State, gate: float) -> Ints:
-    """Return pairs (P, 2) for which half of the first one's rays pass the second, from little parallax or a phantom."""
+    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second landmark. The reason is
+    little parallax or a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -102,7 +110,7 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 
 def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
-    """Return the -2 ln likelihood (P,) that one object saves over two, in fit, boxes, misses and number of objects."""
+    """Return by how much one object instead of two lowers -2 ln likelihood (P,), in fit, boxes, misses and object number."""
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]
@@ -130,13 +138,14 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
 
 
 def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) -> Floats:
-    """Return -2 ln likelihood of each ray (R,) for its point, up to a constant, and at most the cost of a stray ray."""
+    """Return -2 ln likelihood of each ray (R,) for its point, up to a constant. It is at most `gate`, as for a stray ray."""
     off2, distance = squared_offsets(r, position)
     return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 
 
 def _common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
-    """Count the frames (P,) with both landmarks: both detected, both expected, a detected and b expected, the reverse."""
+    """Return four counts (P,) of frames: both landmarks detected, both expected, a detected and b expected, a expected
+    and b detected."""
     from scipy.sparse import csr_array
 
     shape = len(history.inside), int(history.frame.max(initial=0)) + 1
@@ -158,7 +167,7 @@ def _seen_apart(obs: Observations, pairs: _Pairs, matched: Ints) -> Ints:
 
 
 def overlap(one: Floats, two: Floats) -> Floats:
-    """Return the intersection over union (B,) of boxes (B, 4)."""
+    """Return the intersection over union (B,) of each pair of boxes (B, 4)."""
     low, high = np.maximum(one[:, :2], two[:, :2]), np.minimum(one[:, 2:], two[:, 2:])
     common = np.maximum(high - low, 0.0).prod(axis=1)
     total = (one[:, 2:] - one[:, :2]).prod(axis=1) + (two[:, 2:] - two[:, :2]).prod(axis=1) - common

@@ -1,4 +1,4 @@
-"""Nearest-neighbour association of rays with known landmarks by predicted bearing, or of each label with one object."""
+"""Associate rays with known landmarks by predicted bearing (nearest neighbour), or each label with one object."""
 
 import numpy as np
 
@@ -21,15 +21,15 @@ def assign(
     pose_covariance: Floats | None = None,
     gate: float = 0.999,
 ) -> Ints:
-    """Return the most likely landmark (R,) of each ray, -1 for none, with at most one ray per landmark and frame.
+    """Return the most likely landmark (R,) of each ray, -1 for none. A landmark gets at most one ray per frame.
 
-    A known range adds to the cost of a match, but a wrong range adds little.
+    A known range changes the cost of a match, but a wrong range adds little.
 
     Args:
-        positions, covariances: (N, 3) m, NaN to leave a landmark out, and (N, 3, 3) m^2.
+        positions: (N, 3) m, NaN to leave a landmark out. covariances: (N, 3, 3) m^2.
         accepts: (N, L) whether a box of a label may belong to the landmark.
-        map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, of the rays.
-        pose_covariance: (K, 6, 6) in the camera frames, rotation first, as in GTSAM's marginals.
+        map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, noise of the rays.
+        pose_covariance: (K, 6, 6) of the cameras, in camera coordinates, rotation first, as in GTSAM's marginals.
         gate: the share of correct matches that the bearing gate accepts.
     """
     origin, direction = rays.in_map(map_T_camera)
@@ -51,7 +51,8 @@ def assign(
 def associate_by_label(rays: Rays) -> Association:
     """Make one object for each label with a ray, in the order of label_names.
 
-    In each frame the box with the highest score gets the object, the first one if scores are equal. All others get none.
+    In each frame, the box with the highest score of its label gets the object. If scores are equal, it is the first box. All
+    other boxes get no object.
     """
     labels = np.unique(rays.label)
     best = np.lexsort((np.arange(len(rays)), -rays.score, rays.label, rays.keyframe))

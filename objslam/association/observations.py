@@ -12,17 +12,16 @@ from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
-"""The least distance (m) of an object from a camera; larger loses objects right in front of the camera."""
+"""The least distance (m) of an object from a camera. A larger value loses objects right in front of the camera."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """R boxes as lines in the map, sorted by frame, then by the content of the box, independent of the input order.
-
-    frame: (R,) index in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma: (R,) rad
-    along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown. range_sigma: (R,)
-    m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px. track: (R,) -1 if unknown.
-    """
+    """R boxes as lines in the map, sorted by frame, then by the values of the box. So the input order has no effect. frame:
+    (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma: (R,)
+    rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown.
+    range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px. track: (R,)
+    id of the track, -1 if unknown."""
 
     frame: Ints
     label: Ints
@@ -83,7 +82,7 @@ def observe(
 ) -> tuple[Observations, Ints, Ints]:
     """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
-    Frames are sorted by time and camera, and boxes within a frame by label and box. So nothing depends on the input order.
+    Frames are sorted by time and camera, boxes in a frame by label and coordinates. So the input order has no effect.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]
@@ -115,10 +114,10 @@ def extents(
     keyframes: Keyframes,
     cameras: tuple[Camera, ...],
 ) -> Floats:
-    """Return the median width and height (N, 2) m of objects at positions (N, 3) m over their rays.
+    """Return the width and height (N, 2) m of each object at its position (N, 3) m, as medians over its rays.
 
-    They are NaN without rays or position, and if half of the rays come from a camera that observes no sizes.
-    map_T_camera: (K, 4, 4) of the keyframes.
+    They are NaN if an object has no ray or no position, or if at least half of its rays are from cameras that observe no
+    sizes. map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)
     index = association.object[held]

@@ -1,7 +1,7 @@
-"""Place recognition: find one constellation of landmarks in another by their relative positions.
+"""Place recognition: find one constellation of landmarks in another by the landmarks' relative positions.
 
 Several landmarks that fit under one shift and turn within the drift are evidence for the place. The evidence is the Bayes
-factor of "these landmarks are those" over "all of them are new".
+factor of "the landmarks here are those there" over "all landmarks here are new".
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
 _BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
-_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment; few are enough from a close start.
-_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there, any two of which form a hypothesis.
-_HYPOTHESES = 2000  # The most hypotheses from two pairs, those with the longest bases first; larger costs time.
-_VERIFIED = 20  # The most hypotheses, by a quick score, that get a best assignment; larger costs time.
-_GAINS_AT_ONCE = 200_000  # The most gains computed together; larger needs more memory.
+_REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
+_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Any two pairs form a hypothesis.
+_HYPOTHESES = 2000  # The most hypotheses from two pairs, with the longest bases. A larger number costs time.
+_VERIFIED = 20  # The hypotheses with the best quick scores that get a best assignment. A larger number costs time.
+_GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
 _MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
 
 
 @dataclass(frozen=True)
 class Constellation:
-    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 within it. label: (N,)."""
+    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 relative to it. label: (N,)."""
 
     position: Floats
     covariance: Floats
@@ -39,13 +39,13 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Return landmarks with larger covariances farther from the pivot (2,) m, because neighbourhoods bend over distance."""
+    """Return the landmarks. Their covariances grow with the distance from the pivot (2,) m, because neighbourhoods bend."""
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 
 
 def label_densities(position: Floats, label: Ints) -> Floats:
-    """Return the number (N,) of landmarks with each landmark's label per m^2, over the area that contains landmarks."""
+    """Return for each landmark the number (N,) of landmarks of its label per m^2 of the area that contains all landmarks."""
     extent = position[:, :2].max(axis=0) - position[:, :2].min(axis=0) + 2 * _MARGIN
     return np.asarray(np.bincount(label)[label] / float(np.prod(extent)))
 
@@ -55,7 +55,7 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: how much the evidence exceeds the best other place.
+    second. evidence: log Bayes factor over "all are new". lead: how much the evidence exceeds that of the best other place.
     """
 
     correction: Floats
@@ -72,11 +72,11 @@ class Recognition:
 def recognise_place(
     here: Constellation, there: Constellation, pivot: Floats, prior: Floats, density: Floats, possible: Bools
 ) -> Recognition | None:
-    """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M), None if nothing fits.
+    """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M). None if none fits.
 
     pivot: (2,) m, the point about which the correction turns. prior: (3, 3) covariance of the correction in x, y (m) and yaw
-    (rad), with mean zero. density: (N,) landmarks `there` per m^2 with the label of each landmark `here`. possible: (N, M)
-    which pairs may be the same landmark.
+    (rad), with mean zero. density: (N,) number of landmarks `there` per m^2 that have the label of each landmark `here`.
+    possible: (N, M) which pairs may be the same landmark.
     """
     centre = np.append(pivot, 0.0)
     total = here.covariance[:, None] + there.covariance
@@ -111,9 +111,9 @@ def recognise_place(
 
 @dataclass(frozen=True)
 class _Problem:
-    """A matching problem. offset, target: (N, 3) and (M, 3) m, landmarks here and there from the pivot. information:
-    (N, M, 3, 3) of each pair. spread: (N, M) m, its standard deviation. peak: (N, M) its largest gain. weight: (3, 3)
-    inverse of the prior."""
+    """A matching problem. offset, target: (N, 3) and (M, 3) m, landmarks here and there relative to the pivot. information:
+    (N, M, 3, 3) m^-2 of the difference between two landmarks. spread: (N, M) m, its horizontal standard deviation. peak:
+    (N, M) the largest gain of each pair. weight: (3, 3) inverse of the prior."""
 
     offset: Floats
     target: Floats
@@ -138,10 +138,8 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift.
-
-    Of too many pairs it keeps those whose landmark here has the fewest partners, because they are the most distinctive.
-    """
+    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift. If there are too many pairs, those
+    remain whose landmark here has the fewest partners. They are the most distinctive."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -153,7 +151,7 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2): each candidate twice, and every two candidates that fit each other."""
+    """Return hypotheses (H, 2, 2) of two candidates each: every candidate with itself, and every two that fit each other."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])
@@ -175,7 +173,7 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
     information = problem.information[a, b]
     alone = a[:, 0] == a[:, 1]
     information[alone] /= 2  # A single candidate is in its seed twice.
-    # A base of two gives the heading in closed form, so Gauss-Newton starts near the solution.
+    # Two landmarks give the heading in closed form, so Gauss-Newton starts near the solution.
     base, other = problem.offset[a[:, 1]] - problem.offset[a[:, 0]], problem.target[b[:, 1]] - problem.target[b[:, 0]]
     angle = np.arctan2(other[:, 1], other[:, 0]) - np.arctan2(base[:, 1], base[:, 0])
     x = np.zeros((len(seeds), 3))
@@ -186,7 +184,7 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
 
 
 def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """Take one step for the corrections (..., 3) from pairs a, b (..., P), and return the Hessian (..., 3, 3) as well."""
+    """Return the corrections (..., 3) after one Gauss-Newton step for pairs a, b (..., P), and the Hessian (..., 3, 3)."""
     at, jacobian = _moved(problem.offset[a], x)
     weighted = np.swapaxes(jacobian, -1, -2) @ information
     hessian = problem.weight + (weighted @ jacobian).sum(axis=-3)
@@ -195,7 +193,8 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: F
 
 
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner among candidates (C,), a sorted."""
+    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) the candidates, sorted
+    by a."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
     first = np.flatnonzero(np.diff(a, prepend=-1))
     size = max(1, _GAINS_AT_ONCE // len(a))
@@ -207,14 +206,15 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the log likelihood ratio (..., C) of pairs over new landmarks for corrections (..., 3), -inf beyond a gate."""
+    """Return the log likelihood ratio (..., C) of "one landmark" over "a new one" for each pair under corrections (..., 3).
+    It is -inf for a pair outside a gate."""
     miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
 def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """Return the log Bayes factor of a refined correction (3,), the correction, and its best assignment (P, 2)."""
+    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2), or None."""
     gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
         gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)

@@ -7,23 +7,25 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HALF_RAY, grouped_quantiles
 
 RANGE_GAIN = 6.0
-"""The cost reduction of a match by a perfect range, because another object's range may lie anywhere within some metres."""
+"""The amount by which a perfect range reduces the cost of a match, because another object would rarely have this range."""
 RANGE_LOSS = 4.0
 """The most that a wrong range adds to the cost of a match, because about one correct box in ten has a wrong range."""
 BEHIND = 1e6
 """The finite number of standard deviations that stands for a point behind the camera."""
-_HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations; larger lets wrong ranges pull harder.
+_HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. A larger one lets wrong ranges pull harder.
 _DAMPING = 1e-6  # The share of the information added in all directions, so that unobserved directions stay unchanged.
-_ITERATIONS = 6  # The Gauss-Newton steps of a refinement; few are enough, because association refines repeatedly.
+_ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
-    """Return the variance (E,) m^2 per perpendicular axis of the offsets of points at `distance` (E,) m from rays `of`."""
+    """Return the variance (E,) m^2, along each perpendicular axis, of the offset of a point from its ray. distance: (E,) m
+    of the points. noise: factor on the nominal noise. of: (E,) the rays, by default all."""
     return np.asarray(noise**2 * ((obs.sigma[of] * distance) ** 2 + obs.position_sigma**2))
 
 
 def squared_offsets(obs: Observations, position: Floats, of: Ints | slice = slice(None)) -> tuple[Floats, Floats]:
-    """Return the squared offset (E,) of each point, (E, 3) or (3,), from its ray, inf if behind, and its distance (E,) m."""
+    """Return the squared offset (E,) m^2 of each point from its ray, and its distance (E,) m from the camera. The offset is
+    inf for a point behind the camera. position: (E, 3) or (3,) m. of: (E,) the ray of each point, by default all rays."""
     to = position - obs.origin[of]
     depth = np.einsum("ri,ri->r", to, obs.direction[of])
     distance2 = np.einsum("ri,ri->r", to, to)
@@ -31,10 +33,8 @@ def squared_offsets(obs: Observations, position: Floats, of: Ints | slice = slic
 
 
 def normalised_residuals(obs: Observations, position: Floats, slack: float = 0.0, of: Ints | slice = slice(None)) -> Floats:
-    """Return the offset of each point, (E, 3) or (3,), from its ray in standard deviations (E,), inf if behind.
-
-    slack: m, standard deviation of the origins in addition to their own.
-    """
+    """Return the offset (E,) of each point from its ray in standard deviations. It is inf for a point behind the camera.
+    position, of: as in `squared_offsets`. slack: m, standard deviation of the origins in addition to their own."""
     off2, distance = squared_offsets(obs, position, of)
     return np.asarray(np.sqrt(off2 / (variance(obs, distance, 1.0, of) + slack**2)))
 
@@ -51,7 +51,9 @@ def information(obs: Observations, point: Floats) -> Floats:
 def range_costs(
     obs: Observations, distance: Floats, variance_along: Floats | float = 0.0, of: Ints | slice = slice(None)
 ) -> Floats:
-    """Return the costs (E,) that the ranges of rays `of` (E,) add for points at `distance` (E,) m, 0 without a range."""
+    """Return the cost (E,) of each ray's measured range, if its point is at `distance` (E,) m. It lies between -`RANGE_GAIN`
+    and `RANGE_LOSS`, and is 0 for a ray without a range. variance_along: (E,) m^2 of the point along the ray. of: (E,) the
+    ray of each point, by default all rays."""
     measured = obs.range[of]
     if not np.isfinite(measured).any():
         return np.zeros(len(distance))
@@ -98,7 +100,7 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
     """Refine a few points faster than `refine`, and return positions (N, 3) m and covariances (N, 3, 3) m^2.
 
     obs: all rays of the first point, then all rays of the second point, and so on. number: (N,) number of rays of each
-    point, at least 1. start: (N, 3) m. damping: (N, 3, 3) m^-2, information that keeps a point at its place in each step.
+    point, at least 1. start: (N, 3) m. damping: (N, 3, 3) m^-2, information that keeps a point at its position in each step.
     steps: number of Gauss-Newton steps.
     """
     index, begin, position = np.repeat(np.arange(len(number)), number), np.cumsum(number) - number, start
@@ -118,7 +120,7 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
 def velocity_gain(
     obs: Observations, ray: Ints, index: Ints, position: Floats, noise: Floats, stamps: Floats
 ) -> tuple[Floats, Floats]:
-    """Fit a velocity to each point. Return the share (N,) of squared deviations that it explains, and its motion (N,) in m.
+    """Fit a velocity to each point. Return the share (N,) of the squared deviations that it explains, and the motion (N,) m.
 
     Pairs and points are as in `refine`. stamps: (P,) s of the rays.
     """

@@ -1,4 +1,4 @@
-"""RANSAC triangulation of one object for a live session, as `triangulation` does for a whole log.
+"""Triangulate one object of a live session by RANSAC, as `triangulation` does for all objects of a log.
 
 Both use a consensus of ray pairs. This module uses numpy, because a call of torch takes too long for a frame.
 """
@@ -13,7 +13,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import widest_angle
 from objslam.core.statistics import OUTLIER_RAY
 
-_MOST_PAIRS = 300  # The most ray pairs that are tried; larger costs time.
+_MOST_PAIRS = 300  # The most ray pairs that are tried. A larger value costs time.
 _MOST_RAYS = 60  # The most rays from which pairs and the parallax are taken.
 _MIN_ANGLE = np.radians(1.0)  # The least angle (rad) between the two rays of a pair.
 _FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis, so that unobserved directions are known to 100 m.
@@ -30,7 +30,7 @@ class PointFit:
 
 
 def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -> PointFit | None:
-    """Fit the point on which most rays agree, None if no two agree. slack: m, standard deviation added to the origins."""
+    """Fit the point on which most rays agree. None if no two agree. slack: m, standard deviation added to the origins."""
     start = _consensus(obs, rng, slack)
     if start is None:
         return None

@@ -11,21 +11,19 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
 
-_PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together; larger needs more memory.
+_PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
 _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances; outside them a miss tells nothing.
-_CORE_SHARE = 0.8  # The share of a class's boxes, strongest objects first, that sets its distances; others may be phantoms.
+_CORE_SHARE = 0.8  # The share of a class's boxes, of its strongest objects, that sets its distances. Others may be phantoms.
 _FRONT_SHARE = 0.95  # The least share of an object's boxes from one half space for the object to have a front.
-_CLOSER = (0.3, 0.1)  # The least depth gap of an occluder to the object, in m and as a share of the distance.
-_FILLED = 0.6  # The share of a box's width and height that its object certainly fills; larger occludes more.
+_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it, in m and as a share of its distance.
+_FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
 
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """Observed frames: stamps (F,) s, cameras, the camera (F,) of each frame, map_T_camera (F, 4, 4).
-
-    A usable box is at least margin (px) and margin_share of its size away from the image edge. A negative margin allows any
-    box.
-    """
+    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera: (F, 4,
+    4). A usable box is at least `margin` px and the share `margin_share` of its size away from the image edge. A negative
+    margin allows any box."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -45,8 +43,8 @@ class CameraFrames:
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, at most as far away
-    as the farthest box of the object or of its class.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains the box of each object. A frame counts
+    up to the greatest usual distance of the class or the greatest distance of the object's own boxes.
     """
 
     object: Ints
@@ -131,7 +129,8 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return object, frame, distance (V,) and pixel (V, 2) of the object boxes inside images, within reach (N,) m."""
+    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box that lies inside an image. reach:
+    (N,) m, the distance up to which each object counts."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]
@@ -151,7 +150,7 @@ def _in_image(
 
 
 def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, reach: Floats) -> Bools:
-    """Return whether the box of a closer object covers the pixel (V,). reach: (R,) m, distances of the boxes' objects."""
+    """Return whether the box of a closer object covers each pixel (V, 2). reach: (R,) m, the distance of its object."""
     hidden = np.zeros(len(frame), dtype=bool)
     useful = np.flatnonzero(np.isfinite(reach))
     frames = np.arange(int(max(frame.max(initial=0), obs.frame.max(initial=0))) + 2)

@@ -23,7 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Map objects in 3D from the log of a robot: from poses and detector boxes to positions with covariances.",
+    help="Build a 3D map of objects from the log of a robot. Poses and detector boxes become positions with covariances.",
 )
 app.command()(run)
 app.command()(live)
@@ -58,8 +58,8 @@ def _options(
 
 
 def main() -> NoReturn:
-    """Run a command. Exit codes: 0 success, 1 failure, 2 usage error. An error is one line on stderr unless --debug is
-    set."""
+    """Run a command. Exit codes: 0 success, 1 failure, 2 usage error, 130 Ctrl-C. An error is printed as one line on
+    stderr, or with --debug as a traceback."""
     debug = "--debug" in sys.argv
     try:
         app()
@@ -74,7 +74,7 @@ def main() -> NoReturn:
     except MemoryError:
         say("objslam: out of memory", stderr=True)
         sys.exit(1)
-    except Exception as error:  # hides the traceback of an internal error from the user
+    except Exception as error:  # Hides the traceback of an internal error from the user.
         if debug:
             raise
         said = f"{type(error).__name__}: {one_line(error)}"

@@ -5,7 +5,7 @@ from objslam.cli.options import Config, Set, settings_of
 
 
 def config_dump(config: Config = None, set_: Set = None) -> None:
-    """Print all settings as YAML, with the changes by --config and --set."""
+    """Print all settings as YAML. They include the changes by --config and --set."""
     from objslam.config import dump_settings
 
     say(dump_settings(settings_of(None, config, set_)), end="")

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar if stderr is a terminal. Yield a function of the stage name, the finished items and the total."""
+    """Show a progress bar if stderr is a terminal. Yield a function that updates the bar.
+    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -32,7 +33,7 @@ def report(ledger: Ledger) -> None:
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console as wide as the terminal, or of 120 columns without a terminal."""
+    """Return a console with the width of the terminal, or with 120 columns if stdout is not a terminal."""
     from rich.console import Console
 
     return Console(stderr=stderr, highlight=False, width=None if sys.stdout.isatty() else 120)

@@ -17,12 +17,12 @@ def demo(
     out: Out = Path("demo_out"),
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random room and drive.")] = 0,
     boxes: Annotated[
-        bool, typer.Option("--boxes", help="Simulate detector boxes instead of rendered images, which takes seconds only.")
+        bool, typer.Option("--boxes", help="Simulate detector boxes without rendering images. This takes only seconds.")
     ] = False,
 ) -> None:
-    """Simulate a drive, map it with fixed poses and with joint estimation, and compare both maps with the truth.
+    """Simulate a drive. Map it once with fixed poses and once with joint estimation. Compare both maps with the truth.
 
-    The drive is rendered as RGB-D images of a furnished room with seven objects of the detector shipped with objslam.
+    The drive is rendered as RGB-D images of a furnished room. The detector shipped with objslam knows its seven objects.
     """
     from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError
@@ -33,7 +33,7 @@ def demo(
 
     prepare_output(out)
     log, model = out / "log", None
-    mark = out / ".objslam-demo"  # marks a log that the demo may replace
+    mark = out / ".objslam-demo"  # This file marks a log that the demo may replace.
     if log.exists() and not mark.exists():
         raise OutputError(
             "this log is not from a demo and is not replaced", where=str(log), hint="choose another folder with -o"
@@ -50,7 +50,7 @@ def demo(
     say(f"wrote the simulated drive: {log}")
     for mode, poses in (("fixed", "localization"), ("joint", "odometry")):
         ledger = Ledger()
-        # The median error of the box centres of the shipped detector is 0.9 px.
+        # The box centres of the shipped detector have a median error of 0.9 px.
         changes = [f"poses.use={poses}", *(["rays.pixel_sigma=1.5"] if model else [])]
         settings = settings_of(mode, None, changes)
         shown = " ".join(["objslam run", str(log), "-o", str(out / mode), "--mode", mode, *(f"--set {c}" for c in changes)])

@@ -18,12 +18,12 @@ def evaluate_result(
     out: Annotated[Path, typer.Argument(help="A result folder.")],
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", help="objects.json, or a groundtruth or log folder. Default: the truth of the log."),
+        typer.Option("--truth", help="objects.json, or a groundtruth, log or result folder. Default: the truth of the log."),
     ] = None,
     align: Align = "none",
     radius: Radius = 0.5,
 ) -> None:
-    """Compare a result with the ground truth: matched, missed and false objects, position errors, path error."""
+    """Compare a result with the ground truth: matched, missed and false objects, errors of the positions and of the path."""
     print_evaluation(out, truth, align, radius)
 
 

@@ -10,8 +10,8 @@ from objslam.output.export.formats import FORMATS
 
 _HELP = " ".join(f"{known.name}: {known.help}." for known in FORMATS.values())
 _DATUM_HELP = (
-    f"{', '.join(known.name for known in FORMATS.values() if known.takes_datum)}: latitude, longitude of the map origin "
-    "(WGS 84, degrees) and heading of the x axis (degrees clockwise of north). By default, coordinates are in m on the map."
+    f"{', '.join(known.name for known in FORMATS.values() if known.takes_datum)}: latitude and longitude of the map origin "
+    "(WGS 84, degrees), and heading of the x axis (degrees clockwise of north). Without it, coordinates are in m in the map."
 )
 
 
@@ -19,7 +19,8 @@ def export(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A result folder.")],
     to: Annotated[str, typer.Option("--to", metavar="|".join(FORMATS), help=_HELP)],
     file: Annotated[
-        Path | None, typer.Option("-o", "--out", help="The file to write. Default: the usual file of the format in OUT.")
+        Path | None,
+        typer.Option("-o", "--out", help="The file to write. Default: the usual file name of the format, in OUT."),
     ] = None,
     datum: Annotated[str | None, typer.Option("--datum", metavar="LAT,LON,HEADING", help=_DATUM_HELP)] = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The command `objslam info`, which describes a recording and what a run needs from it."""
+"""The command `objslam info`, which describes a recording and what is missing in it for a run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from objslam.core.camera import Camera
     from objslam.sources.summary import Contents, Timing
 
-_EPOCH = 1e8  # The timestamp in s above which timestamps count from 1970. No drive takes 3 years, no recording is from 1973.
+_EPOCH = 1e8  # Larger timestamps (s) count from 1970, because no drive takes 3 years. No recording is older than 1973.
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
 
 
@@ -28,7 +28,7 @@ def info(
     *,
     options: SourceOptions,
 ) -> None:
-    """Describe a recording: streams, rates, gaps, times, the role of each topic, and missing parts for a run."""
+    """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
     from objslam.core.diagnostics import Ledger
     from objslam.sources.summary import contents
 
@@ -106,7 +106,7 @@ def _span(start: float, end: float) -> str:
 
 
 def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print columns of text without truncation."""
+    """Print rows of text in aligned columns. Long texts are not cut."""
     widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
     for row in (names, *rows):
         cells = (c.rjust(w) if name in _NUMERIC else c.ljust(w) for c, w, name in zip(row, widths, names, strict=True))

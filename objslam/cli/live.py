@@ -25,10 +25,10 @@ Speed = Annotated[float, typer.Option("--speed", min=0.0, help="Speed factor of 
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[
-    bool, typer.Option("--publish", help="Publish objects, markers and path over DDS for RViz and Nav2, every --interval.")
+    bool, typer.Option("--publish", help="At each --interval, publish objects, markers and path over DDS for RViz and Nav2.")
 ]
 View = Annotated[
-    str | None, typer.Option("--view", help="Show the map: window, web (a local browser), FILE.rrd, or a viewer's address.")
+    str | None, typer.Option("--view", help="Where to show the map: window, web (browser), FILE.rrd, or viewer address.")
 ]
 WithJournal = Annotated[bool, typer.Option("--journal/--no-journal", help="Record all messages on the disk.")]
 
@@ -68,7 +68,7 @@ def live(
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
     settings = settings_of("joint", config, set_)
     _say_what_is_not_used(source, options, speed, publish)
-    # The recording is read first, because it may be the journal in OUT.
+    # The recording is read first, because it may be the journal in OUT, which is renamed below.
     recording = None if source in ADAPTERS else _read(Path(source), options)
     with output_folder(out), ExitStack() as stack:
         if journal:
@@ -106,7 +106,7 @@ def live(
 
 
 def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publish: bool) -> None:
-    """Warn of options without effect for a source. `sources.read` warns of the options of recordings."""
+    """Warn of the given options that have no effect on a source. `sources.read` checks the options for recordings."""
     adapter = ADAPTERS.get(source)
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
     for flag in unused(options, LiveOptions, taken) + (["--speed"] if adapter and speed != 1.0 else []):
@@ -126,7 +126,7 @@ def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """Check the journal for --resume. Without --resume, rename it, and restore it if the new session has no message."""
+    """With `resume`, check that a journal exists. Else rename it, and restore it if the new session gets no message."""
     from objslam.errors import OutputError
     from objslam.sources.journal.file import put_back, set_aside
 

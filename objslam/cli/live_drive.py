@@ -1,4 +1,4 @@
-"""The main loop of `objslam live`. It runs the source, updates objects.json, and writes the map in the end, even after
+"""The main loop of `objslam live`. It runs the source, updates objects.json, and writes the map at the end, even after
 errors."""
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _POLL = 0.1  # The time in s between two checks for the end of the source.
 
 
 class LatestObjects:
-    """Write objects.json during a session. The first write removes an older result."""
+    """The writer of objects.json during a session. Its first write removes an older result."""
 
     def __init__(self, out: Path) -> None:
         self._out, self._begun = out, False
@@ -46,8 +46,9 @@ class LatestObjects:
 
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
-    """Run the adapter until it ends, the session ends, or the user presses Ctrl-C. Update the status line and objects.json.
-    Return an error of a view or of the disk, so that `finish` can write the map before it raises the error."""
+    """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
+    the views and the status line. An error of the disk or of a view also ends the loop. It is returned instead of raised,
+    so that `finish` can write the map first."""
     from objslam.live.session import low_latency
 
     low_latency.configure()
@@ -89,8 +90,8 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 def finish(
     session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
 ) -> None:
-    """End the session, write its result, and print a summary. Then raise the error that ended the session or a view early.
-    An error of the session becomes an ObjslamError. If there is no result, objects.json holds the last snapshot."""
+    """End the session, write its result, and print a summary. Then raise the error of the session or `broken`, if any.
+    An error of the session becomes an ObjslamError. If there is no result, the last snapshot is written to objects.json."""
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
 
@@ -102,7 +103,7 @@ def finish(
         if session.failure is None:
             raise
         report(session.counters.ledger)
-        raise _ended_early(session.failure, out, "the map is in objects.json only, if at all") from error
+        raise _ended_early(session.failure, out, "there is no result, but objects.json may hold the last map") from error
     removed = write_result(result, out, truth)
     last = session.snapshot()
     report(session.counters.ledger)

@@ -12,12 +12,13 @@ from objslam.cli.console import console, say
 if TYPE_CHECKING:
     from objslam.core.snapshot import Snapshot
 
-_LINES = 10.0  # The time in s between status lines without a terminal.
+_LINES = 10.0  # The time in s between two status lines if stderr is not a terminal.
 
 
 @contextmanager
 def status_line() -> Iterator[Callable[[Snapshot], None]]:
-    """Yield a function that updates the status line on stderr, or prints a line every ten seconds without a terminal."""
+    """Yield a function that shows a snapshot in the status line on stderr. If stderr is not a terminal, the function prints
+    at most one line in ten seconds."""
     from rich.live import Live as Line
 
     screen = console(stderr=True)
@@ -38,7 +39,7 @@ def status_line() -> Iterator[Callable[[Snapshot], None]]:
 
 
 class _Rates:
-    """Format the status line with the message rates since the previous status line."""
+    """The formatter of the status line. Message rates are averages since the previous status line."""
 
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
@@ -61,6 +62,6 @@ class _Rates:
 
 
 def times(snapshot: Snapshot, then: str) -> str:
-    """Return the update times followed by `then`, or an empty text if no update was measured."""
+    """Return a text of median and 99th percentile of the update times, then `then`. It is empty if no update was timed."""
     median, most = snapshot.update
     return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""

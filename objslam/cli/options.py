@@ -25,10 +25,10 @@ Mode = Annotated[
 ]
 Align = Annotated[
     Literal["none", "se2", "sim2"],
-    typer.Option("--align", help="Align the map with the truth: not, by a rigid motion in the plane, or also by a scale."),
+    typer.Option("--align", help="Align the map with the truth. se2: a rigid motion in the plane. sim2: also a scale."),
 ]
 Radius = Annotated[
-    float, typer.Option("--radius", min=0.0, help="Maximum distance in m between an object and its true object.")
+    float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
 
@@ -41,7 +41,8 @@ def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the parameter `options` of a command by one flag for each field of its class that has an `Option`."""
+    """Return the command with flags in place of its parameter `options`. Each field with an `Option` in the class of
+    `options` becomes one flag."""
     signature = inspect.signature(command, eval_str=True)
     kind = signature.parameters["options"].annotation
     declared = flags(kind)
@@ -70,7 +71,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.Parameter:
-    """Return the typer parameter of an option with this default."""
+    """Return the typer parameter for an option that has the value `default` if it is not given."""
     if isinstance(default, tuple):  # typer repeats an option only if its type is a list
         type_, default = GenericAlias(list, get_args(type_)[0]) | None, None
     elif _is_negated(option, default):
@@ -80,5 +81,5 @@ def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.P
 
 
 def _is_negated(option: Option, default: Any) -> bool:
-    """Return whether the flag stands for the opposite of its default True, as in --without-range."""
+    """Return whether the flag sets a value to False that is True by default, as --without-range does."""
     return default is True and "/" not in option.flag

@@ -11,9 +11,9 @@ from objslam.cli.console import progress_bar, say
 def report_result(
     out: Annotated[Path, typer.Argument(help="A result folder.")],
     log: Annotated[
-        Path | None, typer.Option("--log", help="The log with the images. Default: the path of the log during the run.")
+        Path | None, typer.Option("--log", help="The log with the images. Default: the log that the run read.")
     ] = None,
-    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Number of image crops of each object.")] = 4,
+    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Number of image crops shown for each object.")] = 4,
 ) -> None:
     """Write report.html with the map, objects, residuals, evaluation and settings of a result. The page works offline."""
     from objslam.output.report import write_report

@@ -1,4 +1,4 @@
-"""The command `objslam run`, which maps a log into a result folder."""
+"""The command `objslam run`, which maps the objects of a log and writes a result folder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(
 
 
 def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
-    """Map the objects of a log, write the result folder, and print a summary."""
+    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log."""
     import time
 
     from objslam.mapping import pipeline
@@ -65,7 +65,7 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
-    """Print the objects, the counts followed by `more`, the removed files of the previous result, and the result folder."""
+    """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
     from rich.table import Table
 
     table = Table(title="objects")

@@ -20,7 +20,8 @@ def view(
         bool, typer.Option("--web", help="Serve the viewer to a browser on this machine, without a window.")
     ] = False,
     screenshot: Annotated[
-        Path | None, typer.Option("--screenshot", metavar="FILE.png", help="Write a picture instead. It needs no display.")
+        Path | None,
+        typer.Option("--screenshot", metavar="FILE.png", help="Write a picture and open no viewer. This needs no display."),
     ] = None,
     at: Annotated[
         float, typer.Option("--at", min=0.0, max=1.0, help="Time of the picture as a share of the drive, from 0 to 1.")
@@ -30,7 +31,7 @@ def view(
     from objslam.errors import ConfigError
     from objslam.output.viewer import application
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the viewer together with this process
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM then ends the viewer together with this process.
     if web and screenshot is not None:
         raise ConfigError("--web and --screenshot cannot be combined", hint="leave out one of them")
     with tempfile.TemporaryDirectory(prefix="objslam-view-") as folder:

@@ -24,7 +24,8 @@ class Detector(Section):
     and scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score,
     class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
     outputs: dict[Role, str] | None = None
-    """Output name of each role. ssd has boxes, labels, scores. detr has boxes, logits. Other layouts have predictions."""
+    """Name of the model output for each role. The roles are boxes, labels and scores for ssd, boxes and logits for detr, and
+    predictions for other layouts."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
     """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
     one name per line, or is YAML with the key `names`. It lies beside the settings file or beside the model."""
@@ -46,7 +47,7 @@ class Detector(Section):
     """How an image is fitted into the input. letterbox keeps the aspect ratio and pads all sides. corner keeps the aspect
     ratio and pads right and bottom. stretch changes the aspect ratio. none keeps the image size."""
     pad: Annotated[int, Field(ge=0, le=255)] | None = None
-    """Grey value of the padding. null is 114."""
+    """Grey value of the padding. null uses 114."""
     colour: Colour | None = None
     """Order of the colour channels of the input."""
     divide_by: Positive | None = None

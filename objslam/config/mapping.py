@@ -13,10 +13,10 @@ class Poses(Section):
     """Configure which poses of a log are used."""
 
     use: Literal["auto", "odometry", "localization"] = "auto"
-    """Poses to use if a log has both kinds. auto uses localisation, and in joint mode also the odometry between its
-    poses."""
+    """Poses to use if a log has odometry and localisation. auto uses the localisation. In joint mode, auto also uses the
+    odometry between localised poses."""
     max_gap: Positive = 1.1
-    """Maximum gap of the path in s. A frame in a longer gap is dropped and counted."""
+    """Maximum time in s between two consecutive poses of the path. A frame in a longer gap is dropped and counted."""
 
 
 class RayNoise(Section):
@@ -33,7 +33,7 @@ class RayNoise(Section):
     """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object,
     so the box is dropped and counted. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
-    """Distance from the image edge as a share of the box width or height within which a box also counts as cut off.
+    """Distance from the image edge within which a box also counts as cut off, as a share of the box width or height.
     Detectors often end a cut box short of the edge."""
 
 
@@ -46,8 +46,8 @@ class Depth(Section):
     sigma_per_m: NotNegative = 0.02
     """Part of the range noise that grows with the distance, in m per m."""
     bias: NotNegative = 0.05
-    """Standard deviation in m of the error shared by all ranges of one object. Ranges end on the surface of the object, or
-    have a calibration error. Averaging does not reduce this error."""
+    """Standard deviation in m of the error that all ranges of one object share, because they end on its surface or have a
+    calibration error. Averaging does not reduce this error."""
 
 
 class Odometry(Section):
@@ -56,8 +56,8 @@ class Odometry(Section):
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""
     y_per_m: NotNegative = 0.005
-    """Sideways standard deviation in m after 1 m, small for wheels. An omnidirectional base may need the value of
-    x_per_m."""
+    """Standard deviation across the driving direction in m after 1 m of driving. It is small for wheels. An omnidirectional
+    base may need the value of x_per_m."""
     xy_per_rad: NotNegative = 0.005
     """Standard deviation of the position in m after 1 rad of turning in place."""
     yaw_per_m: NotNegative = 0.02
@@ -65,13 +65,13 @@ class Odometry(Section):
     yaw_per_rad: NotNegative = 0.05
     """Standard deviation of the heading in rad after 1 rad of turning."""
     floor_xy: Positive = 1e-3
-    """Standard deviation of the position in m per keyframe step that also remains for a robot at rest."""
+    """Standard deviation of the position in m that each keyframe step has even if the robot is at rest."""
     floor_yaw: Positive = 1e-3
-    """Standard deviation of the heading in rad per keyframe step that also remains for a robot at rest."""
+    """Standard deviation of the heading in rad that each keyframe step has even if the robot is at rest."""
 
 
 class Planar(Section):
-    """Configure the deviation of each step from a planar path, because a real floor is not perfectly flat."""
+    """Configure how far each step may deviate from a planar path. A real floor is not perfectly flat."""
 
     z: Positive = 1e-3
     """Standard deviation of the height in m."""
@@ -95,7 +95,7 @@ class AssociationSettings(Section):
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """Number of points from ray pairs tested per label in one pass. A larger value finds rarer objects and takes longer."""
+    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects but is slow."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5
@@ -106,9 +106,10 @@ class AssociationSettings(Section):
     duplicate_distance: Positive = 1.0
     """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
     loop_evidence: Positive = 7.0
-    """Minimum log odds that current landmarks match those of an earlier place. A larger value closes fewer loops."""
+    """Minimum log odds that the current landmarks are landmarks of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """Minimum lead in log odds of the best place over the next to close a loop. A larger value separates similar places."""
+    """Minimum lead in log odds of the best place over the second-best place. A smaller lead closes no loop. A larger value
+    separates similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 
@@ -118,29 +119,31 @@ class Triangulation(Section):
 
     device: Device = "auto"
     consensus: bool = True
-    """Start from the point with the largest consensus of ray pairs, so that outliers do not shift an object."""
+    """Use only the rays of an object that agree on one point, so that outliers do not shift the object."""
     hypotheses: Count = 256
     """Number of ray pairs tested per object."""
     min_parallax_deg: NotNegative = 3.0
     """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
     max_rel_sigma: Positive = 0.5
-    """Maximum standard deviation of a position as a share of the distance. A less certain object is unresolved."""
+    """Maximum standard deviation of a position as a share of its distance from the cameras. A less certain
+    object is unresolved."""
 
 
 class Fixed(Section):
-    """Configure the estimation of objects with fixed poses."""
+    """Configure the estimation of objects when the robot's poses are given and not estimated."""
 
     loss: Loss = "l1"
 
 
 class Joint(Section):
-    """Configure the joint estimation of poses and objects."""
+    """Configure the joint estimation of the robot's poses and the objects."""
 
     loss: Loss = "huber"
     factor: Literal["bearing", "point_to_line"] = "bearing"
-    """Factor of a ray. point_to_line is Eq. 1. With free poses it shrinks the map, because this reduces all distances."""
+    """Factor of a ray. bearing measures the angle between the ray and its object. point_to_line measures the distance, as
+    Eq. 1 does. With free poses it shrinks the map, because a smaller map has smaller distances."""
     min_parallax_deg: NotNegative = 8.0
-    """Minimum parallax in degrees between its rays before a landmark enters the growing graph."""
+    """Minimum parallax in degrees that the rays of a landmark must have before the landmark enters the growing graph."""
     prior_sigma: Positive = 20.0
     """Standard deviation in m of a weak prior on each landmark. The prior keeps the graph determined."""
     grow_step: Annotated[int, Field(ge=2)] = 60
@@ -157,13 +160,13 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m since the last keyframe for a new keyframe. The first ten frames at rest are keyframes too."""
+    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames at rest are keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
-    """Camera rotation in degrees since the last keyframe that makes a frame a keyframe. A frame is also a keyframe if the
-    keyframes at the current place lack one of its labels."""
+    """Camera rotation in degrees from the last keyframe to a new keyframe. A frame also becomes a keyframe if it shows a
+    label that no keyframe at the current place shows."""
     max_keyframes: Annotated[int, Field(ge=50)] = 1500
     """Maximum number of keyframes, to bound memory and time. Above it, a quarter of the older keyframes is removed with
-    their boxes, and the odometry across each removed keyframe is composed."""
+    their boxes, and the odometry before and after each removed keyframe is joined."""
     max_lag: Positive = 0.35
     """Maximum waiting time of a frame in s. A frame that waits longer is dropped and counted."""
     max_late: Positive = 2.0
@@ -171,20 +174,20 @@ class Live(Section):
     max_frames_waiting: Count = 64
     """Maximum number of waiting frames. Above it, the oldest frame is dropped and counted."""
     max_speed: Positive = 5.0
-    """Speed in m/s above which odometry counts as a jump. A turn above four times this number in rad/s is also a jump. After
-    a jump, odometry continues from the last pose."""
+    """Speed in m/s above which odometry counts as a jump. A turn rate in rad/s above four times this number is also a
+    jump. After a jump, odometry continues from the last pose."""
     min_rays: Annotated[int, Field(ge=3)] = 5
-    """Consistent boxes before an object enters the graph. It exceeds association.min_rays, because only current poses are
-    known."""
+    """Minimum number of consistent boxes before an object enters the graph. It exceeds association.min_rays, because a live
+    session knows only the current poses."""
     ghost_share: Share = 0.1
-    """Share of detections in frames that should show an object. Below it, the object is dropped. A larger value drops true
-    objects too."""
+    """Minimum share of detections among the frames that should show an object. An object with a smaller share is dropped. A
+    larger value drops true objects too."""
     ghost_frames: Count = 40
-    """Frames that should show an object before it can be dropped as false. A larger value keeps false objects longer."""
+    """Number of frames that should show an object before it can be dropped. A larger value keeps false objects longer."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
-    """Maximum number of boxes for a repeated offline association at the end of a session, which takes a few seconds."""
+    """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
     forget: Positive = 5.0
-    """Time in s without observation after which a track of fewer than min_rays boxes is dropped. Its boxes stay
+    """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""
 
 
@@ -201,8 +204,8 @@ class Reconstruction(Section):
     voxel: Positive = 0.02
     """Edge length of a voxel in m."""
     truncation: Positive = 0.06
-    """Distance in m from a surface within which depths are averaged. It exceeds the depth error and 2 voxels, not the
-    thickness of things."""
+    """Distance in m from a surface within which depths are averaged. It should exceed the depth error and 2 voxels,
+    but not the thickness of things."""
     max_depth: Positive = 4.0
     """Maximum depth in m. Larger depths are ignored."""
     min_views: Count = 3
@@ -220,7 +223,7 @@ class Output(Section):
 
     recording: bool = True
     images: Annotated[int, Field(ge=0)] = 1000
-    """Maximum number of images of each camera in the recording, evenly spread. 0 records no images."""
+    """Maximum number of images of each camera in the recording. They are spread evenly. 0 records no images."""
     image_width: Annotated[int, Field(ge=16)] = 480
     """Maximum width in px of an image in the recording. A wider image is reduced by an integer factor."""
     picture: bool = True

@@ -1,4 +1,4 @@
-"""The class of all settings, which loads from YAML files and overrides and is dumped as YAML."""
+"""The class of all settings. Settings are loaded from a YAML file and from overrides, and are written as YAML."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,8 +37,8 @@ class Settings(Section):
 
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
-    """Load settings from a YAML file and from `key=value` overrides (dotted keys, YAML values), which replace values of the
-    file. ConfigError names the file or the override, the key and the problem."""
+    """Load settings from a YAML file and from overrides. An override `key=value` has a dotted key and a YAML value, and
+    replaces a value of the file. A ConfigError names the file or the override, the key and the problem."""
     data: dict[str, Any] = {}
     if file is not None:
         data = _read_yaml(file)
@@ -80,7 +80,7 @@ def _read_yaml(file: Path) -> dict[str, Any]:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a path is an accessible file. Any text is allowed as a path."""
+    """Return whether a path is an accessible file. A text that cannot be a path gives False."""
     try:
         return path.is_file()
     except OSError:  # the name is too long, or the folder is not accessible
@@ -110,7 +110,7 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
 
 
 def _meant(key: str) -> str:
-    """Return the setting closest to a mistyped key as a question, or an empty text."""
+    """Return the question whether the setting closest to a mistyped key is meant. Return an empty text if none is close."""
     import difflib
 
     def names(section: type[BaseModel], prefix: str) -> Iterator[str]:

@@ -19,18 +19,19 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 """The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # The grid of angles in the search for the fold of a lens model, and its refinements.
-_ALONG = 200  # The pieces of each side of the image in the solid angle. More pieces are more exact and slower.
+_STEPS, _FINER = 2000, 4  # The numbers of angles and of refinements of the grid that finds the fold of a lens model.
+_ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are more exact and slower.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera with the keys of ROS camera_info, and its pose on the robot.
+    """A calibrated camera with the fields of ROS camera_info, and its pose on the robot.
 
-    matrix: (3, 3) px. distortion: (D,). base_T_camera: (4, 4), the optical frame in base. depth_scale: units per metre.
-    sees_size: whether its boxes have the size of the objects. Boxes around bare bearings have no meaningful size.
+    matrix: (3, 3) px. distortion: (D,) coefficients. base_T_camera: (4, 4) the pose of the optical frame in base.
+    depth_scale: the units of a depth image per metre. sees_size: whether the boxes show how large the objects are. A box
+    that only marks a bearing does not.
     """
 
     name: str
@@ -60,15 +61,16 @@ class Camera:
 
     @cached_property
     def fisheye(self) -> bool:
-        """Whether the image radius grows with the angle to the optical axis, instead of its tangent."""
+        """Whether the image radius of a point grows with its angle to the optical axis, not with the angle's tangent."""
         return self.distortion_model == "equidistant"
 
     @cached_property
     def lens_angle(self) -> float:
-        """The angle to the optical axis, rad, at which the lens model folds back, at most 90 degrees.
+        """The angle to the optical axis, rad, at which the lens model folds back. It is at most 90 degrees.
 
-        Beyond this angle the model projects invisible points into the image. A fisheye may see beyond 90 degrees, but OpenCV
-        calibrates it with points of z > 0 only. The calibration does not say how much of the image corners the lens fills.
+        Beyond the fold, a larger angle gives a smaller image radius, so the model projects invisible points into the image.
+        A fisheye lens may see beyond 90 degrees, but OpenCV calibrates it with points of z > 0 only. The lens may leave the
+        image corners dark, which the calibration does not tell.
         """
         if not self.distortion.any():
             return np.pi / 2
@@ -83,7 +85,7 @@ class Camera:
 
     @cached_property
     def view_angle(self) -> float:
-        """The largest angle between the optical axis and a point on the image edge, rad, at most `lens_angle`."""
+        """The largest angle, rad, between the optical axis and a point on the image edge. It is at most `lens_angle`."""
         directions, valid = undistort(self, _edge(0.0, self.width - 1, self.height - 1, 32))
         return float(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)).max()) if valid.all() else self.lens_angle
 
@@ -91,7 +93,8 @@ class Camera:
     def solid_angle(self) -> float:
         """The solid angle of the image, sr.
 
-        It is the sum of the spherical triangles between the optical axis and the image edge, or the bounding cone.
+        It is the sum of spherical triangles between the optical axis and the pieces of the image edge. Where the edge is
+        outside the lens field, sectors of the cone with the angle `lens_angle` replace the triangles.
         """
         edge = _edge(-0.5, self.width - 0.5, self.height - 0.5, _ALONG)
         here, valid = undistort(self, edge)
@@ -109,11 +112,11 @@ class Camera:
 
 
 def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
-    """Return the unit directions (N, 3) in the camera frame of raw pixels (N, 2), and which (N,) are valid.
+    """Return for each of the raw pixels (N, 2) the unit direction (N, 3) in the camera frame, and whether it is valid (N,).
 
-    A direction is valid inside the lens field. cv2.undistortPoints, iterated to convergence, inverts plumb_bob and
-    rational_polynomial. Their directions must also project to within 0.1 px of the pixel. Newton's method inverts
-    equidistant (Kannala-Brandt).
+    A direction is valid if it is `in_field`. For plumb_bob and rational_polynomial it must also project to within 0.1 px of
+    its pixel. cv2.undistortPoints, iterated to convergence, inverts these two models. Newton's method inverts the pixels
+    that OpenCV misses, and the model equidistant (Kannala-Brandt).
     """
     import cv2
 
@@ -140,7 +143,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def _misses(camera: Camera, flat: Floats, pixels: Floats) -> Floats:
-    """Return the distance (N,), px, between pixels (N, 2) and the projections of flat (N, 2) at z = 1; inf if not finite."""
+    """Return the distances (N,), px, of pixels from projections of `flat` (N, 2) at z = 1. Non-finite points give inf."""
     import cv2
 
     homogeneous = np.column_stack([flat, np.ones(len(flat))])
@@ -150,9 +153,9 @@ def _misses(camera: Camera, flat: Floats, pixels: Floats) -> Floats:
 
 
 def _undistort_newton(camera: Camera, pixels: Floats) -> Floats:
-    """Return the points (N, 2) at z = 1 of raw pixels (N, 2) by damped Newton steps.
+    """Return the points (N, 2) at z = 1 that project to raw pixels (N, 2), by damped Newton steps.
 
-    OpenCV's fixed-point iteration diverges far from the axis of a lens with a strong decentring or prism.
+    OpenCV's fixed-point iteration diverges far from the axis of a lens with a strong decentring or prism term.
     """
     import cv2
 
@@ -162,7 +165,7 @@ def _undistort_newton(camera: Camera, pixels: Floats) -> Floats:
     for _ in range(_TURNS):
         homogeneous = np.column_stack([flat, np.ones(len(flat))])
         again, by = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
-        slope = by[:, 3:5].reshape(-1, 2, 2)  # by the x and y of the translation, which moves the point
+        slope = by[:, 3:5].reshape(-1, 2, 2)  # derivatives by a translation in x and y, which moves the point
         step = (np.linalg.pinv(slope) @ (pixels - again[:, 0])[..., None])[..., 0]
         trial = flat + factor[:, None] * step
         closer = _misses(camera, trial, pixels)
@@ -195,7 +198,7 @@ def _undistort_fisheye(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def project(camera: Camera, points: Floats) -> Floats:
-    """Return the raw (distorted) pixels (N, 2) of points (N, 3), m, in the camera frame and in front of the camera.
+    """Return the raw (distorted) pixels (N, 2) of points (N, 3), m, that are in front of the camera, in the camera frame.
 
     A pixel has no meaning if its point is outside the lens field, which `in_field` tests.
     """
@@ -214,7 +217,7 @@ def project(camera: Camera, points: Floats) -> Floats:
 
 
 def in_field(camera: Camera, points: Floats) -> Bools:
-    """Return which points (N, 3), m, in the camera frame are in front of the camera and inside its `lens_angle`."""
+    """Return which points (N, 3), m, in the camera frame, are in front of the camera and inside its `lens_angle`."""
     x, y, z = points.T
     ahead: Bools = z > 0
     if camera.lens_angle < np.pi / 2:
@@ -223,10 +226,10 @@ def in_field(camera: Camera, points: Floats) -> Bools:
 
 
 def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Floats | None = None) -> tuple[Ints, Floats]:
-    """Return the indices (n,) and raw pixels (n, 2) of the points (N, 3), m, in the camera frame that the image shows.
+    """Return the indices (n,) and raw pixels (n, 2) of those points (N, 3) that the image shows.
 
-    The image shows a point inside the lens field if its pixel is between low and high, (2,) or (N, 2), px. The default is
-    the whole image.
+    The points are in m, in the camera frame. The image shows a point if it is `in_field` and its pixel is between `low` and
+    `high`. low, high: (2,) or (N, 2) px, the whole image by default.
     """
     low = np.zeros(2) if low is None else low
     high = camera.size - 1 if high is None else high
@@ -239,19 +242,22 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return the depth (N,), m, of points (N, 3) that scales their image size: z, or the distance for a fisheye."""
+    """Return for points (N, 3) the depth (N,), m, that divides their size in the image: z, or the distance for a fisheye."""
     return np.asarray(np.linalg.norm(points, axis=1) if camera.fisheye else points[:, 2])
 
 
 def _fisheye_radius(camera: Camera) -> Floats:
-    """Return the image radius in focal lengths as a polynomial (10,) of the angle, rad, lowest power first."""
+    """Return the polynomial (10,), lowest power first, that turns an angle (rad) into an image radius (focal lengths)."""
     radius = np.zeros(10)
     radius[1::2] = 1.0, *camera.distortion
     return radius
 
 
 def _growth(camera: Camera, angle: Floats) -> Floats:
-    """Return the derivative (A,) of the image radius by the angle (A,), rad, or its tangent. It is <= 0 beyond the fold."""
+    """Return how fast (A,) the image radius grows at angles (A,), rad. Beyond the fold this is <= 0.
+
+    It is the derivative by the angle for a fisheye, else the least derivative by the tangent in any direction of the image.
+    """
     with np.errstate(all="ignore"):  # A wrong calibration may overflow.
         if camera.fisheye:
             return np.asarray(polyval(angle, polyder(_fisheye_radius(camera))))
@@ -268,7 +274,7 @@ def _growth(camera: Camera, angle: Floats) -> Floats:
 
 
 def _edge(low: float, right: float, bottom: float, pieces: int) -> Floats:
-    """Return pixels (4 * pieces, 2) around the edge of the image, from the corner (low, low)."""
+    """Return pixels (4 * pieces, 2) around the rectangle from corner (low, low) to (right, bottom), (low, low) first."""
     along = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
     corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
     return np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])

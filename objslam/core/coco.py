@@ -1,4 +1,4 @@
-"""The 80 class names of COCO, in the order of their numbers in COCO detectors (Lin et al., ECCV 2014)."""
+"""The 80 class names of COCO (Lin et al., ECCV 2014). COCO detectors number the classes in this order."""
 
 COCO_NAMES: tuple[str, ...] = tuple(
     """

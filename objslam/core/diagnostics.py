@@ -6,19 +6,19 @@ from dataclasses import dataclass, field
 
 from objslam.errors import one_line
 
-_EXAMPLES = 3  # The number of places that are kept for each reason. A larger number makes the lines longer.
+_EXAMPLES = 3  # The most examples that are kept for each reason. A larger number makes the lines longer.
 
 
 @dataclass
 class Ledger:
-    """Counts of drops by reason, the first places of each reason, and warnings of one line each."""
+    """Counts of dropped data by reason, examples of where each reason occurred first, and warnings of one line each."""
 
     dropped: dict[str, int] = field(default_factory=dict)
     examples: dict[str, list[str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None) -> None:
-        """Add `count` drops to a reason. where: the place as file:line or stamp, kept for the first few drops only."""
+        """Count `count` more drops for a reason. where: the file:line or stamp, kept for the first few drops only."""
         if count <= 0:
             return
         reason = one_line(reason)
@@ -34,7 +34,7 @@ class Ledger:
             self.warnings.append(message)
 
     def add(self, other: Ledger) -> None:
-        """Add the counts and warnings of another ledger, with the first place of each reason."""
+        """Add the counts and warnings of another ledger, with the first example of each reason."""
         for reason, count in other.dropped.items():
             self.drop(reason, count, next(iter(other.examples.get(reason, [])), None))
         for message in other.warnings:

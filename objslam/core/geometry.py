@@ -64,7 +64,7 @@ def split_se2(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether poses (N, 4, 4) keep one height, roll and pitch, as an SE(2) path with a constant offset does."""
+    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset."""
     _, remainder = split_se2(poses)
     return bool(len(poses) == 0 or np.abs(remainder - remainder[:1]).max() <= tolerance)
 
@@ -76,7 +76,7 @@ def log_se3(pose: Floats) -> Floats:
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """Return the norms (N,), rad, and (N,), m, of the two halves of `log_se3` of poses (N, 4, 4)."""
+    """Return for `log_se3` of poses (N, 4, 4) the norms of the rotation half (N,), rad, and the translation half (N,), m."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))
@@ -87,10 +87,10 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
-    """Return `twist_lengths` of the single step between two poses (4, 4), ten times faster."""
+    """Return the two norms of `twist_lengths` for the step from one pose (4, 4) to another. This is ten times faster."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
-    x, y, z = dx - ax, ey - by, fz - cz  # The step and the axis are in the common frame of both poses.
+    x, y, z = dx - ax, ey - by, fz - cz  # The step and the axis are in the frame in which both poses are given.
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
     # Half the sum of the cross products of the axes before and after is the rotation axis times the sine of the angle.
     u = (b0 * f0 - c0 * e0 + b1 * f1 - c1 * e1 + b2 * f2 - c2 * e2) / 2
@@ -122,7 +122,7 @@ def skew(v: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles, whether they need a series expansion, and angles that are safe as divisors."""
+    """Return the rotation angles, whether each needs a series because it is small, and the angles with 1 for small ones."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)
@@ -154,11 +154,11 @@ def adjoint(pose: Floats) -> Floats:
 
 
 def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) -> tuple[Floats, Bools]:
-    """Interpolate poses by a constant twist between the two neighbours, without extrapolation. Planar poses stay planar.
+    """Interpolate poses between two neighbours by a constant twist, and extrapolate nothing. Planar poses stay planar.
 
     stamps: (N,) s, increasing. poses: (N, 4, 4) at the stamps. query: (Q,) s. max_gap: s, the longest gap between two
-    neighbours. Returns poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or in a longer gap gives
-    the identity and is not valid.
+    neighbours. Returns the poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or inside a longer gap
+    gives the identity and is not valid.
     """
     result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
     if len(stamps) == 0:
@@ -177,10 +177,11 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
 
 
 def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "se3"]) -> tuple[Floats, float]:
-    """Return the pose (4, 4) and scale that align source points (N, 3) with target points (N, 3) (Umeyama 1991).
+    """Return the pose (R, t) (4, 4) and the scale that align source points (N, 3) with target points (N, 3) (Umeyama 1991).
 
-    The least-squares alignment is scale * R @ source + t. `se2` estimates yaw and the whole translation. `sim2` adds a
-    scale. `se3` estimates the full rotation. Fewer than 2 points (3 for se3) align the translation only.
+    Then scale * R @ source + t is nearest to target in least squares. The kind `none` gives the identity. `se2` estimates
+    the yaw and the whole translation. `sim2` adds a scale. `se3` estimates the full rotation. With fewer than 2 points (3
+    for `se3`), only the translation is estimated.
     """
     if kind == "none" or len(source) == 0:
         return np.eye(4), 1.0
@@ -204,7 +205,7 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 def widest_angle(directions: Floats) -> float:
     """Return the widest angle (rad) between any two lines with unit directions (N, 3).
 
-    Two opposite directions have the angle 0. More than 400 lines are reduced to the extremes along their main axes.
+    Two opposite directions have the angle 0. Of more than 400 lines, only the extremes along the main axes are compared.
     """
     if len(directions) < 2:
         return 0.0

@@ -20,9 +20,10 @@ _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keep
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
-    position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. extent: width and height, m. ray: origin (3,)
-    and direction (3,) of a ray through the best guess of an unresolved object. labels: share of each label among the boxes.
-    existence: probability that the object exists. labels and existence are None if all boxes of a label are one object.
+    position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
+    the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
+    rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
+    existence are None if all boxes of a label are one object.
     """
 
     id: int
@@ -49,7 +50,7 @@ class MapObject:
 
 @dataclass(frozen=True)
 class ObjectMap:
-    """The objects of one map, in the frame `frame`.
+    """The objects of one map, in the coordinate frame that `frame` names.
 
     Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to ignore heights.
     """
@@ -65,7 +66,7 @@ class ObjectMap:
         return tuple(o for o in self.objects if o.status == "ok")
 
     def nearest(self, point: ArrayLike, label: str | None = None) -> MapObject | None:
-        """Return the object nearest to a point, of one label or of any. None if the map has no such object."""
+        """Return the nearest object to a point, among those with `label` or among all. None if there is no such object."""
         return next((o for _, o in self._by_distance(point, label)), None)
 
     def in_radius(self, point: ArrayLike, radius: float, label: str | None = None) -> tuple[MapObject, ...]:
@@ -73,7 +74,7 @@ class ObjectMap:
         return tuple(o for distance, o in self._by_distance(point, label) if distance <= radius)
 
     def in_box(self, low: ArrayLike, high: ArrayLike, label: str | None = None) -> tuple[MapObject, ...]:
-        """Return the objects inside or on a box along the axes of the map, given by its lowest and highest corner."""
+        """Return the objects inside or on a box that has its sides along the axes, with `low` and `high` as corners."""
         lower, upper = _point(low), _point(high)
         if lower.shape != upper.shape:
             raise ValueError("both corners must have two coordinates, or both three")
@@ -84,10 +85,10 @@ class ObjectMap:
     def merge(self, other: ObjectMap) -> Self:
         """Merge another map into this one, and fuse the objects that both maps have.
 
-        Two objects of one label are the same if the Mahalanobis distance of their positions is below the 99 % quantile. The
-        Hungarian method pairs them one-to-one with the least sum of squares. A fused position is weighted by information,
-        like two independent measurements. Objects keep the ids of this map. Objects of the other map alone get new ids.
-        Frames of different names raise ValueError.
+        Two objects of one label may be the same if the Mahalanobis distance of their positions is below the 99 % quantile.
+        The Hungarian method pairs them one-to-one with the least sum of squares. The two positions of a pair are fused like
+        two independent measurements, weighted by their information. Objects of this map keep their ids. Objects that only
+        the other map has get new ids. ValueError if the two coordinate frames have different names.
         """
         if self.frame != other.frame:
             raise ValueError(f"the maps are in two frames, {self.frame!r} and {other.frame!r}: transform one map first")
@@ -116,7 +117,7 @@ def _point(values: ArrayLike) -> Floats:
 
 
 def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) -> list[tuple[int, int]]:
-    """Return the pairs of indices of objects that are the same."""
+    """Return a pair for each object that both have: its index in `ours` and its index in `theirs`."""
     from scipy.optimize import linear_sum_assignment
 
     mine, its = (
@@ -135,7 +136,7 @@ def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) ->
 
 
 def _mahalanobis(ours: list[MapObject], theirs: list[MapObject]) -> Floats:
-    """Return the squared Mahalanobis distances (N, M) between the positions of objects."""
+    """Return the squared Mahalanobis distances (N, M) between the positions of our objects and their objects."""
     apart = np.array([o.position for o in ours])[:, None] - np.array([o.position for o in theirs])
     own, their = (np.array([o.covariance for o in objects]) for objects in (ours, theirs))
     spread = own[:, None] + their + _FLOOR**2 * np.eye(3)
@@ -144,7 +145,7 @@ def _mahalanobis(ours: list[MapObject], theirs: list[MapObject]) -> Floats:
 
 
 def _fuse(a: MapObject, b: MapObject) -> MapObject:
-    """Fuse two measurements of one object, with the id and label of the first."""
+    """Fuse two measurements of one object. The result has the id and the label of the first."""
     assert a.covariance is not None
     assert b.covariance is not None
     # This gain is equivalent to adding information, and it also works with a singular covariance.

@@ -15,12 +15,13 @@ from objslam.core.types import Association, Images, Keyframes, Rays, Surface, Tr
 class RunResult:
     """The result of a run with K keyframes and R rays.
 
-    keyframes: before the estimation. map_T_base: (K, 4, 4) after the estimation. The mode `fixed` keeps the poses.
-    association: its objects are indices into map.objects. origins, directions: (R, 3) rays in map at the solved poses.
-    residual: (R,) rad, the angle between each ray and its object, NaN without an object. weight: (R,) robust weight in
-    [0, 1]. summary: the content of summary.json. path, path_after: the path of the log at its full rate, before and after
-    the estimation. trace: the rounds of the estimation. images: of each camera. surface: of the room, if the log has depth
-    images. surface_before: the surface at the poses before the estimation, if the settings ask for it.
+    keyframes: the keyframes with their poses before the estimation. map_T_base: (K, 4, 4) their poses after the estimation.
+    The mode `fixed` does not change them. association: its objects are indices into map.objects. origins, directions: (R, 3)
+    the rays in map at the solved poses. residual: (R,) rad, the angle between each ray and its object, NaN without an
+    object. weight: (R,) robust weight in [0, 1]. summary: the content of summary.json. path, path_after: the path of the log
+    at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image files of each
+    camera. surface: the surroundings, None without depth images. surface_before: the same at the poses before the
+    estimation, if the settings ask for it.
     """
 
     map: ObjectMap

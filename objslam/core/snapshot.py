@@ -15,8 +15,8 @@ from objslam.core.types import Trajectory
 class CameraFrame:
     """The boxes of one camera at one keyframe.
 
-    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) the id of each box's object, or -1. rejected: (B,)
-    whether the robust loss rejected the box. image: (H, W, 3) uint8 BGR or JPEG bytes, None without an image.
+    stamp: s. map_T_camera: (4, 4). boxes: (B, 4) raw px. objects: (B,) the id of the object in each box, or -1. rejected:
+    (B,) whether the robust loss rejected the box. image: (H, W, 3) uint8 BGR, or the bytes of a JPEG file, or None.
     """
 
     stamp: float
@@ -32,11 +32,12 @@ class CameraFrame:
 class Snapshot:
     """The state of a session at one moment.
 
-    stamp: of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns them. path:
-    map_T_base of all keyframes. keyframes, rebuilds: the number of keyframes, and of rebuilds of the graph. lag: s from the
-    arrival of the newest message to its place in the map. update: median and 99th percentile of the time from push to
-    updated map, s. counters: accepted messages by kind. dropped: drops by reason. frames: the newest keyframe of each
-    camera, without its image.
+    stamp: the time of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns
+    them. path: map_T_base of all keyframes. keyframes, rebuilds: how many keyframes there are, and how often the graph was
+    rebuilt. lag: the time, s, from the arrival of the newest message until the map contains it. update: the median and the
+    99th percentile of the time, s, from the push of a message to the updated map. counters: how many messages of each kind
+    were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
+    image.
     """
 
     stamp: float

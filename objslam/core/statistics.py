@@ -1,6 +1,7 @@
-"""Statistical thresholds that several rooms share, and medians of groups.
+"""Statistical thresholds that several packages share, and medians of groups.
 
-Deviations are in standard deviations. The deviation of a ray is the norm of two components across the ray.
+A deviation is a residual divided by its standard deviation, or the norm of several such residuals. The deviation of a ray is
+the norm of the two residuals across the ray. The nominal noise of a ray is the standard deviation that the settings give it.
 """
 
 import math
@@ -10,31 +11,32 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 SAME_POINT = 11.345
-"""The squared Mahalanobis distance of 99 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
-larger distance takes more pairs for one point."""
+"""The squared Mahalanobis distance between two estimates of one point is below this value in 99 % of all cases (chi-squared,
+3 degrees of freedom). A larger value takes more pairs of estimates for one point."""
 SAME_POINT_WIDE = 16.266
-"""The squared Mahalanobis distance of 99.9 % of the pairs of estimates of one point (chi-squared, 3 degrees of freedom). A
-larger distance lets more pairs compete."""
+"""The squared Mahalanobis distance between two estimates of one point is below this value in 99.9 % of all cases
+(chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-This is the share of a single number within 3 standard deviations. A larger deviation tries less likely motions."""
+It is also the share of a single Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
 """The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
 cost of a ray that fits no object. A larger deviation gives stray rays more influence on the solution."""
 OUTLIER_RAY = 4.0
-"""The deviation above which a ray is rejected, as 3e-4 of an object's own rays are (Rayleigh, exp(-4^2 / 2)). A larger
+"""The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""The limit on the deviation of one ray in the noise of its object. A larger limit lets a false box raise the noise more."""
+"""The largest deviation that one ray adds to the measured noise of its object. A larger deviation lets a false box raise
+this noise more."""
 HALF_RAY = 6.0
-"""The squared deviation at which a ray has half its weight in a fit of points (Cauchy's weight, about `CAUCHY_K` squared).
-A larger deviation gives stray rays more influence."""
+"""The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
+squared). A larger deviation gives stray rays more influence."""
 HUBER_K = 1.345
-"""The deviation above which Huber's loss grows linearly: 95 % efficient on Gaussian noise (Huber, Robust Statistics, 1981).
-A larger deviation is more efficient and less robust."""
+"""The deviation above which Huber's loss grows linearly. This loss is 95 % efficient on Gaussian noise (Huber, Robust
+Statistics, 1981). A larger deviation is more efficient and less robust."""
 CAUCHY_K = 2.385
-"""The scale of Cauchy's loss in deviations: 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger scale is more
-efficient and less robust."""
+"""The deviation that scales Cauchy's loss. This loss is 95 % efficient on Gaussian noise (Holland & Welsch 1977). A larger
+deviation is more efficient and less robust."""
 RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 """The median norm of a standard Gaussian in the plane. It scales the median residual of rays to a standard deviation."""
 RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
@@ -42,21 +44,24 @@ RAYLEIGH_MEAN = math.sqrt(math.pi / 2)
 NORMAL_MEDIAN = 0.6745
 """The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
 NOISE_FACTORS = (1.0, 3.0)
-"""The least and the largest factor on the nominal noise of an object's rays in association. The least factor is 1, because
-box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
+"""The limits on the factor by which association multiplies the nominal noise of an object's rays. The lower limit is 1,
+because box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
 MOST_NOISE_FACTOR = 5.0
-"""The largest factor on the nominal noise of an object's rays in outlier rejection, since the box centres of a large object
-vary. A larger factor keeps more rays of noisy objects."""
+"""The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is this large, because
+the box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
-"""The number of rays at which an object's noise weighs as much as its class's, offline. More trust the class for longer."""
+"""The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. The
+noise of a class and the nominal noise are weighted likewise. A larger number keeps objects near the noise of their class for
+longer."""
 POOLED_WITH_PROMISE = 20.0
-"""The number of rays at which an object's noise weighs as much as the nominal noise, live. More trust the latter longer."""
+"""The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
+keeps objects near the nominal noise for longer."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
-    """Return the factor (N,) >= 1 on the nominal ray noise of each group, from the median of its deviations (R,).
+    """Return for each group (N,) the factor >= 1 on the nominal noise of its rays, from the median of their deviations (R,).
 
-    index: (R,) group of each ray. A group with fewer rays than `fewest` has the factor 1.
+    index: (R,) the group of each ray. A group with fewer rays than `fewest` has the factor 1.
     """
     number = np.bincount(index, minlength=count)
     median = np.where(number >= fewest, grouped_median(deviations, index, count), 0.0)
@@ -64,9 +69,9 @@ def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) 
 
 
 def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
-    """Return the upper median of the values in each group. NaN for a group without values.
+    """Return the upper median of the values in each group. A group without values gives NaN.
 
-    index: (R,) the group of each value. Values (R,) give medians (N,). Values (R, D) give the medians of each column (N, D).
+    index: (R,) the group of each value. Values (R,) give medians (N,). Values (R, D) give a median for each column (N, D).
     """
     if values.ndim == 1:
         return grouped_quantile(values, index, count, 0.5)
@@ -74,12 +79,12 @@ def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
 
 
 def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> Floats:
-    """Return the value (N,) in each group that exceeds a `share` of the group's values. NaN for a group without values."""
+    """Return for each group (N,) the value at the given share of its sorted values. A group without values gives NaN."""
     return grouped_quantiles(values, index, count, (share,))[0]
 
 
 def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[float, ...]) -> list[Floats]:
-    """Return the result of `grouped_quantile` for each share."""
+    """Return one result of `grouped_quantile` for each share."""
     ordered = values[np.lexsort((values, index))]
     number = np.bincount(index, minlength=count)
     some = number > 0

@@ -14,12 +14,11 @@ FEWEST_RAYS = 2
 
 
 def is_resolved(sigma: Any, reach: Any, rays: Any, parallax: Any, ranged: Any, limits: config.Triangulation) -> Any:
-    """Return whether the position of each object (N,) is reliable. Takes arrays, tensors, or numbers for one object.
+    """Return whether the position of each object (N,) is reliable. Arguments are arrays, tensors, or scalars for one object.
 
-    sigma: (N,) m, the largest standard deviation of the position relative to a camera that saw the object, without the drift
-    of the map up to this camera. inf or NaN if the rays do not determine the position. reach: (N,) m, as `reach` returns it.
-    rays: (N,) number of inliers. parallax: (N,) rad, the widest angle between these rays. ranged: (N,) whether measured
-    ranges replace the parallax.
+    sigma: (N,) m, as `Estimate.seen_sigma`, but inf or NaN if the rays do not determine the position. reach: (N,) m, as the
+    function `reach` returns it. rays: (N,) number of inliers. parallax: (N,) rad, the widest angle between these rays.
+    ranged: (N,) whether measured ranges replace the parallax.
     """
     wide = ranged | (parallax >= math.radians(limits.min_parallax_deg))
     return wide & (rays >= FEWEST_RAYS) & (sigma <= limits.max_rel_sigma * reach)
@@ -31,5 +30,5 @@ def status_of(sigma: float, reach: float, rays: int, parallax: float, ranged: bo
 
 
 def reach(position: Floats, origins: Floats) -> float:
-    """Return the median distance, m, of a position (3,) from the origins (R, 3) of its rays. NaN without rays."""
+    """Return the median distance, m, of a position (3,) from the origins (R, 3) of its rays. Without rays it is NaN."""
     return float(np.median(np.linalg.norm(position - origins, axis=1))) if len(origins) else math.nan

@@ -1,4 +1,4 @@
-"""The number of threads and the device of torch."""
+"""The number of threads and the device that torch uses."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,8 @@ from objslam.errors import ConfigError
 def one_torch_thread() -> Iterator[None]:
     """Restrict torch to one thread, because a thread pool waits actively while other processes need the cores.
 
-    On two cores, one of them busy, a run took 4 s with one thread and up to 18 s with two. The batches are small anyway.
+    On two cores, one of which was busy, a run took 4 s with one thread and up to 18 s with two. One thread is enough,
+    because the batches are small.
     """
     import torch
 

@@ -37,7 +37,7 @@ class Round:
     """One association and the estimate from it.
 
     why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
-    poses, `merge` for merged visits to one place. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
+    poses, `merge` for merged copies of one object. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
     """
 
     why: Why
@@ -50,14 +50,14 @@ class Round:
 
 @dataclass
 class Trace:
-    """Collects the rounds of an estimation. base_T_camera: (K, 4, 4) of the keyframes."""
+    """A collector of the rounds of an estimation. base_T_camera: (K, 4, 4) the camera on the robot at each keyframe."""
 
     base_T_camera: Floats
     rounds: list[Round] = field(default_factory=list)
     _iterations: list[Iteration] = field(default_factory=list)
 
     def iteration(self, stage: Stage, cost: float, map_T_camera: Floats, positions: Floats) -> None:
-        """Add one step with the camera poses (k, 4, 4) of the first k keyframes and the objects (N, 3)."""
+        """Add one step of a solver, with the camera poses (k, 4, 4) of the first k keyframes and object positions (N, 3)."""
         path = (map_T_camera @ inverse(self.base_T_camera[: len(map_T_camera)]))[:, :3, 3]
         self._iterations.append(Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32)))
 

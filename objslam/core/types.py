@@ -1,7 +1,7 @@
 """The data types of the pipeline: frozen dataclasses of arrays that check their shapes when they are made.
 
-Frames follow REP 103/105: `map`, `odom`, `base` (x forward, y left, z up), `camera` (optical: x right, y down, z
-forward). `a_T_b` is the pose of b in a: it takes b coordinates to a coordinates. SI units, radians, seconds.
+Coordinate frames follow REP 103/105: `map`, `odom`, `base` (x forward, y left, z up), `camera` (optical: x right, y down, z
+forward). `a_T_b` is the pose of b in a. It turns coordinates in b into coordinates in a. Units are SI, angles in radians.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 
 MAX_BOXES = 10_000
-"""The most boxes of a frame. A frame with more is rejected, since no detector finds so many and association is too slow."""
+"""The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
 
 
 def _need(condition: Any, message: str) -> None:
@@ -26,7 +26,7 @@ def _need(condition: Any, message: str) -> None:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of one frame in another frame over time.
+    """Poses of one coordinate frame in another over time.
 
     stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. Other values raise ValueError.
     """
@@ -49,13 +49,13 @@ _BOX_COLUMNS = ("frame", "label", "scores", "depths", "track_ids")  # The fields
 
 @dataclass(frozen=True)
 class Detections:
-    """All boxes of one camera. Frames without a box are kept, because they show what the camera did not see.
+    """All boxes of one camera. A frame is one image. Frames without a box are kept: they show what the camera did not see.
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: whether no box is cut off by the edge of the
-    image. Then box centres are valid up to the edge. This holds for fiducials, which need all their corners. Wrong shapes,
-    indices or orders raise ValueError.
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if the edge of the image cuts no box off.
+    Then box centres are valid up to the edge. This holds for fiducials, because a detector needs all their corners.
+    ValueError if a shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -84,7 +84,7 @@ class Detections:
 
     @property
     def stamps(self) -> Floats:
-        """(M,) the stamp of each box's frame, s."""
+        """(M,) s, the stamp of the frame of each box."""
         return self.frame_stamps[self.frame]
 
     def take(self, boxes: Bools | Ints) -> Self:
@@ -109,7 +109,7 @@ class Images:
 class CameraLog:
     """The data of one camera.
 
-    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds throughout.
+    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds all the time.
     """
 
     camera: Camera
@@ -140,7 +140,7 @@ class Truth:
 class Log:
     """The log of a robot, with odometry, localisation or both.
 
-    odometry: odom_T_base. localization: map_T_base. path: the absolute path of the recording. None without a recording.
+    odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
     """
 
     name: str
@@ -153,15 +153,15 @@ class Log:
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Camera frames of any camera with a pose before estimation, in the order of time.
+    """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
     stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of
-    this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4), the initial path by localisation, or by odometry without
-    localisation. localized_every: number of keyframes (>= 1) that share one absolute pose measurement by interpolation, 0 if
-    map_T_base is odometry. odom_T_base: (K, 4, 4) in a frame that starts with the odometry, None without odometry. drift:
-    (K, 6, 6) covariance that the odometry has accumulated since its start, in the frame of odom_T_base. stretch: (K,) number
-    of the odometry's stretch without a gap, None if all keyframes are on one stretch. -1 marks a keyframe without odometry,
-    whose odom_T_base and drift have no meaning.
+    this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
+    localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
+    absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
+    None without odometry. drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the same
+    coordinate frame. stretch: (K,) gaps split the odometry into stretches, and this is their number at each keyframe. None
+    means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats
@@ -186,7 +186,8 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        It did not across a gap, since the robot may have been moved. Without localisation it counts across gaps, too.
+        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, it counts
+        as measured all the same. Without odometry, no motion is measured.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:
@@ -202,11 +203,12 @@ class Keyframes:
 
 @dataclass(frozen=True)
 class Rays:
-    """Bearing rays, one for each box, from the keyframe through the undistorted centre of the box.
+    """Bearing rays, one for each box. A ray runs from the camera at a keyframe through the undistorted centre of the box.
 
-    keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, camera frame. sigma: (R,) rad, standard
-    deviation of the angle along each of the two axes across the ray. range: (R,) m along the ray, NaN if unknown.
-    range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id: (R,) -1 if unknown.
+    keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, in the camera frame. sigma: (R,) rad, the
+    nominal noise: the standard deviation of the angle along each of the two axes across the ray. range: (R,) m along the
+    ray, NaN if unknown. range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id:
+    (R,) -1 if unknown.
     """
 
     keyframe: Ints
@@ -242,8 +244,9 @@ def _rows(data: Keyframes | Rays, rows: Bools | Ints) -> dict[str, Any]:
 class Association:
     """The object of each ray.
 
-    object: (R,) index of the object, or -1. label: (N,) index into the rays' label_names. label_weights: (N, L) share of
-    each label in an object's boxes, None if unknown. existence: (N,) probability that the object exists, None if unknown.
+    object: (R,) index of the object, or -1. label: (N,) the label of each object, as an index into label_names of the rays.
+    label_weights: (N, L) the share of each label among the boxes of each object, None if unknown. existence: (N,) the
+    probability that the object exists, None if unknown.
     """
 
     object: Ints
@@ -261,7 +264,7 @@ class Association:
 class Surface:
     """A triangle mesh in map.
 
-    vertices: (V, 3) m. normals: (V, 3). colours: (V, 3) RGB, None if unknown. triangles: (T, 3) indices of vertices.
+    vertices: (V, 3) m. normals: (V, 3). colours: (V, 3) RGB, None if unknown. triangles: (T, 3) indices into vertices.
     """
 
     vertices: NDArray[np.float32]
@@ -271,7 +274,7 @@ class Surface:
 
 
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
-    """Return the distinct names in sorted order, and the index of each name (len(names),) into them."""
+    """Return the distinct names in sorted order, and for each of the names (len(names),) its index among them."""
     table = tuple(sorted(set(names)))
     index = {name: i for i, name in enumerate(table)}
     return table, np.array([index[name] for name in names], dtype=np.int64)

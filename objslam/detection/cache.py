@@ -1,9 +1,9 @@
 """A cache on disk of the boxes that a detector found, so that a second run does not detect again.
 
-Each detector has one file, named by its key (model and recipe). Each line holds a checksum and one image as JSON: the
-SHA-256 of the image content and the boxes. The content identifies an image even if the log is moved, copied or rendered
-again. Each line is appended in one write, so processes can share the file. A line without its checksum is incomplete and is
-skipped.
+Each detector has one file, named by its key (model and recipe). Each line holds a checksum and the results of one image as
+JSON: the SHA-256 of the image file, the image size and the boxes. The SHA-256 identifies an image even if the log is moved,
+copied or rendered again. Each line is appended in one write, so processes can share the file. A line whose checksum does not
+match is dropped.
 """
 
 import errno
@@ -22,7 +22,7 @@ from objslam.detection.detector import Boxes
 
 @dataclass(frozen=True)
 class Entry:
-    """Hold the size of an image in px and its boxes."""
+    """The cached results of one image: its size in px and its boxes."""
 
     width: int
     height: int
@@ -30,11 +30,11 @@ class Entry:
 
 
 class DetectionCache:
-    """Store the entries of one detector, as a context manager. One thread may read while another thread writes."""
+    """The cache file of one detector, as a context manager. One thread may read while another thread writes."""
 
     def __init__(self, folder: Path, key: str, ledger: Ledger) -> None:
-        """Open the cache of the detector with this key. Drop and count damaged lines. If the cache cannot be opened or
-        written, warn in the ledger and continue without the cache."""
+        """Open the cache of the detector with this key. Damaged lines are dropped and counted. If the cache cannot be opened
+        or written, the ledger gets a warning and nothing more is written."""
         self._file = folder / f"{key}.jsonl"
         self._ledger = ledger
         self._lines: dict[str, bytes] = {}

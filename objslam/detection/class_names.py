@@ -12,7 +12,7 @@ from objslam import config
 from objslam.core.coco import COCO_NAMES
 from objslam.errors import ConfigError, DetectorError
 
-_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers without a class among the 91 of COCO.
+_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # Those of COCO's 91 class numbers that have no class.
 _BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
 _MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
 
@@ -32,8 +32,8 @@ def is_background(name: str) -> bool:
 
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
-    """Return the class names that the setting `detector.names` defines: a list, coco, coco91 or a file. A file is looked up
-    as given, then beside the model. ConfigError if the file is missing, unreadable or has a wrong name."""
+    """Return the class names of the setting `detector.names`: a list, coco, coco91 or a file. A file is looked up as given,
+    then in the model's folder. Raises ConfigError if the file is missing or unreadable or a name is empty or unprintable."""
     if given is None:
         return None
     if isinstance(given, tuple):
@@ -63,7 +63,7 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
 
 def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
     """Parse the names in a model's metadata, a list or dictionary in Python or JSON. Return None if there is no text.
-    DetectorError if the text is something else."""
+    Raises DetectorError if the text is something else."""
     if not text:
         return None
     try:

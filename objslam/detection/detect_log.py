@@ -1,4 +1,4 @@
-"""Detection in a log: each rgb image becomes a frame with boxes."""
+"""Detection in a log: the detector finds the boxes in each rgb image."""
 
 import hashlib
 import time
@@ -24,7 +24,7 @@ from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 
-_AHEAD = 8  # The number of images decoded ahead of the network in addition to a batch.
+_AHEAD = 8  # The number of images, in addition to a batch, that are decoded before the network needs them.
 
 Progress = Callable[[str, int, int], None]
 """A callback with the name of the stage, the number of finished items, and the total (0 if unknown)."""
@@ -39,11 +39,11 @@ def detect_log(
     cache: Path | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Log:
-    """Return the log with detections from the rgb images, which replace the detections of the log.
+    """Run the detector on the rgb images, and return the log with the boxes found. Cameras without rgb images are unchanged.
 
     An image is dropped and counted if it cannot be read or decoded, or if its size is not the camera's. With `depth.use`, a
-    box gets its depth from a depth image if the camera has depth images. `cache` is the folder of a `DetectionCache`, if
-    any. LogError if no image can be used. DetectorError if the network fails.
+    box gets its depth from a depth image if the camera has depth images. `cache` is the folder of the `DetectionCache`. None
+    uses no cache. Raises LogError if no image can be used, and DetectorError if the network fails.
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
@@ -83,7 +83,10 @@ def detect_log(
 
 @dataclass(frozen=True)
 class Frame:
-    """Hold one image file: its pixels, its boxes from the cache, or its problem with the place of the problem."""
+    """One image file. image: its pixels, if the cache has no boxes of it. known: its boxes from the cache, if any.
+
+    problem: the reason why the image cannot be used, if any. where: the place of the problem. digest: SHA-256 of the file.
+    """
 
     digest: str = ""
     image: Array | None = None
@@ -93,7 +96,7 @@ class Frame:
 
 
 def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Frame:
-    """Read an image file, and decode it to 8 bit BGR without EXIF rotation unless the cache has its boxes."""
+    """Read an image file. If the cache has no boxes of it, decode it to 8 bit BGR without EXIF rotation."""
     try:
         data = read_bytes(path)
     except LogError as error:

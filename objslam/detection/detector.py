@@ -20,11 +20,11 @@ from objslam.detection.preprocess import Fit, fill, fit
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_DECODING = 1  # The version of the decoding. A changed decoding raises it, so that old cache files are ignored.
+_DECODING = 1  # The version of the decoding. Increase it with each change of the decoding, so that old caches are not used.
 
 
 class Boxes(NamedTuple):
-    """Hold the boxes (N, 4) x1, y1, x2, y2 in px of the raw image, labels and scores (N,) of one image, best score first."""
+    """The N boxes of one image, the best score first. boxes: (N, 4) x1, y1, x2, y2 in px of the raw image. scores: (N,)."""
 
     boxes: Floats
     labels: tuple[str, ...]
@@ -33,7 +33,7 @@ class Boxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Detector:
-    """Hold a network with its recipe, the number of images per batch, and warnings about the model for the user."""
+    """A network with its recipe. batch: the number of images in one run. warnings: about the model, for the user."""
 
     network: Network
     recipe: Recipe
@@ -42,13 +42,13 @@ class Detector:
 
     @property
     def key(self) -> str:
-        """Return a hash of the model and its recipe. Two detectors with one key find the same boxes in an image."""
+        """The SHA-256 of the model and its recipe. Two detectors with the same key find the same boxes in an image."""
         text = f"{_DECODING}\n{self.network.digest}\n{self.recipe.as_text()}"
         return hashlib.sha256(text.encode()).hexdigest()
 
     def detect(self, images: Sequence[Array]) -> list[Boxes]:
-        """Return the boxes of each image (H, W, 3), uint8, BGR. ValueError if an image has another form. DetectorError if
-        the network fails or its outputs cannot be boxes."""
+        """Return the boxes of each image (H, W, 3), uint8, BGR. Raises ValueError if an image has another shape or type, and
+        DetectorError if the network fails or its outputs cannot be boxes."""
         for image in images:
             if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
                 raise ValueError(f"an image must be (H, W, 3) uint8, got {image.shape} {image.dtype}")
@@ -62,13 +62,14 @@ class Detector:
         return results
 
     def prepare(self, images: Sequence[Array]) -> tuple[Array, Fit]:
-        """Return the network input for at most a batch of images of one size, and the place of the images in the input."""
+        """Return the network input for images of one size, at most `batch`, and the `Fit`: where the resized image lies in
+        the input."""
         height, width = images[0].shape[:2]
         where = fit(self.recipe, width, height)
         return fill(self.recipe, images, where, self.network.image.batch or len(images)), where
 
     def read(self, outputs: Sequence[Array], where: Fit, count: int) -> list[Boxes]:
-        """Return the boxes of the first `count` images from the outputs of the network."""
+        """Return the boxes of the first `count` images of a batch from the network's outputs. where: from `prepare`."""
         named = _by_role(self.network, self.recipe, outputs)
         if not _has_batch(named):
             return [self._boxes(named, where)]
@@ -90,10 +91,10 @@ class Detector:
 
 
 def load_detector(model: Path, settings: config.Detector) -> Detector:
-    """Load an ONNX detector, run it once, and determine its recipe. ConfigError if the settings do not fit the model.
+    """Load an ONNX detector, run it once, and determine its recipe. Raises ConfigError if the settings do not fit the model.
 
-    DetectorError if the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of an unknown
-    layout. Its message lists the outputs and says how to describe them.
+    Raises DetectorError if the file is no ONNX model, needs other inputs than an image, cannot run, or has outputs of an
+    unknown layout. In this last case, the message lists the outputs and says how to describe them.
     """
     network = open_network(model, settings)
     settings = with_description(network, settings)

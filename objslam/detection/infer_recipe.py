@@ -19,17 +19,17 @@ DESCRIPTION = "objslam.detector"
 """The metadata key of a model's own description, which is JSON with keys of the `detector` settings."""
 
 _USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
-_SIZE = 640  # The width and height of a free input in px if settings and metadata have no size.
+_SIZE = 640  # The width and height of an input of free size, px, if the settings and the metadata have no size.
 _LARGEST = 8192  # The largest width or height in px that is accepted from the metadata.
-_STRIDE = 32  # The stride of a free input in px if the metadata has no stride.
-_PAD = 114  # The grey value of the padding if the settings have none.
+_STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
+_PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
 _UNNAMED = "the model names no classes: they are numbered (set detector.names)"
 
 
 def with_description(network: Network, settings: config.Detector) -> config.Detector:
-    """Return the settings with unset values taken from the model's own description in its metadata, if it has one.
-    DetectorError if the description is invalid."""
+    """Return the settings, with unset values filled in from the model's own description. The description is optional. It is
+    in the model's metadata. Raises DetectorError if it is invalid."""
     text = network.metadata.get(DESCRIPTION)
     if text is None:
         return settings
@@ -45,8 +45,8 @@ def with_description(network: Network, settings: config.Detector) -> config.Dete
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
-    """Return the input size of the model, or of the settings, or of the training in the metadata, or 640 px, in this order.
-    ConfigError if the settings have another size than the model."""
+    """Return the size of the network input. A side that the model leaves free comes from the settings, else from the size of
+    training in the metadata, else it is 640 px. Raises ConfigError if the settings have another size than the model."""
     image = network.image
     width, height = settings.size or _training_size(network.metadata) or (_SIZE, _SIZE)
     if settings.size is not None and (width, height) != (image.width or width, image.height or height):
@@ -65,8 +65,8 @@ def input_size(network: Network, settings: config.Detector) -> InputSize:
 def settle(
     network: Network, settings: config.Detector, size: InputSize, outputs: Sequence[Output]
 ) -> tuple[Recipe, str | None]:
-    """Infer the recipe from the outputs for one image of this size, with a warning if the names are a guess. ConfigError or
-    DetectorError if the layout is unknown, the task is no detection, or the names do not match the model."""
+    """Infer the recipe from the outputs for an image of this size. Return it, and a warning if class names are a guess or
+    missing. Raises ConfigError or DetectorError if the layout, the task, the settings or the names do not fit."""
     task = network.metadata.get("task", "detect")
     if task in ("classify", "obb"):
         message = f"the model's task is {task}, which gives no axis-aligned boxes"
@@ -113,7 +113,7 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """Return the habits of the layout, changed for models of the layout with other habits."""
+    """Return the habits of the layout. For families of models with other habits, they are changed."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
         habits = replace(habits, resize="none")  # such models resize the image themselves
@@ -148,7 +148,8 @@ def _is_tensorflow(roles: Roles) -> bool:
 def _fit_names(
     network: Network, known: tuple[str, ...] | None, channels: int | None, *, softmax: bool, exact: bool
 ) -> tuple[tuple[str, ...], str | None]:
-    """Return the class names. With names from the metadata, further channels (masks, key points) are no classes."""
+    """Return the class names, and a warning if they are a guess or missing. If the metadata has fewer names than the output
+    has channels, the further channels are no classes but masks or key points."""
     if channels is None:
         return known or (), None if known else _UNNAMED
     room = channels - softmax
@@ -164,7 +165,7 @@ def _fit_names(
 
 
 def _taken(classes: tuple[str, ...] | None, names: tuple[str, ...], network: Network) -> tuple[int, ...] | None:
-    """Return the indices of the classes to keep. Without `classes` keep all except the background."""
+    """Return the indices of the classes to keep, or None to keep all. Without `classes`, only the background is left out."""
     if not names:
         numbers = [re.fullmatch("class_([0-9]{1,9})", name) for name in classes or ()]
         if not all(numbers):

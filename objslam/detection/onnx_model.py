@@ -23,13 +23,13 @@ _KINDS: dict[str, type[np.generic]] = {
 }
 _PIXELS = ("float", "float16", "double", "uint8")
 _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
-_FED = {_MASK: 3, _SIZES: 2}  # The ranks of the inputs that exported DETR models need in addition to the image.
+_FED = {_MASK: 3, _SIZES: 2}  # The numbers of axes of the inputs that exported DETR models need besides the image.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
 @dataclass(frozen=True)
 class Tensor:
-    """Hold the declaration of an input or output: name, shape (None for a free size), and kind of the values."""
+    """The declaration of an input or output: its name, its shape (None for a free size), and the type of its values."""
 
     name: str
     shape: tuple[int | None, ...]
@@ -41,8 +41,8 @@ class Tensor:
 
 @dataclass(frozen=True)
 class ImageInput:
-    """Hold the layout of the image input, HWC if `channels_last` is True, else CHW. A size of None is free. A batch of 0
-    means that the input has no batch axis."""
+    """The layout of the image input, HWC if `channels_last` is True, else CHW. A size of None is free. A batch of 0 means
+    that the input has no batch axis."""
 
     tensor: Tensor
     batch: int | None
@@ -53,7 +53,7 @@ class ImageInput:
 
 @dataclass(frozen=True)
 class Network:
-    """Hold a session with the path, SHA-256 digest, metadata, image input, further inputs and outputs of its model."""
+    """An ONNX model in an onnxruntime session. digest: the SHA-256 of the model. extras: the inputs besides the image."""
 
     path: Path
     session: Any
@@ -64,7 +64,7 @@ class Network:
     outputs: tuple[Tensor, ...]
 
     def run(self, blob: Array) -> list[Array]:
-        """Run the model on images (B, 3, H, W) and return its outputs in its order. DetectorError if the run fails."""
+        """Run the model on images (B, 3, H, W). Return the arrays of `outputs`. Raises DetectorError if the run fails."""
         count, _, height, width = blob.shape
         array = blob.transpose(0, 2, 3, 1) if self.image.channels_last else blob
         if self.image.batch == 0:
@@ -80,8 +80,8 @@ class Network:
 
 
 def open_network(path: Path, settings: config.Detector) -> Network:
-    """Load an ONNX model on the device and with the threads of the settings. DetectorError if the file is missing, is no
-    ONNX model, or needs more inputs than an image. ConfigError if the device is cuda and onnxruntime has no CUDA."""
+    """Load an ONNX model. The settings give the device and the number of threads. Raises DetectorError if the file is
+    missing, is no ONNX model, or needs other inputs than an image, and ConfigError if cuda is set but missing."""
     import onnxruntime
 
     try:
@@ -113,7 +113,7 @@ def open_network(path: Path, settings: config.Detector) -> Network:
 
 
 def _digest(path: Path) -> str:
-    """Hash the model and the files beside it whose names begin with its name, where exporters store large weights."""
+    """Hash the model and the files beside it whose names begin with its name. Exporters store large weights in these."""
     total = hashlib.sha256()
     beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
     for part in (path, *beside):
@@ -148,7 +148,8 @@ def _as_image(tensor: Tensor) -> ImageInput | None:
 
 
 def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
-    """Return a mask of the whole image, or the input size as original size, so that boxes are in pixels of the input."""
+    """Return the value of an input besides the image. A pixel mask keeps the whole image. As the size of the original image,
+    the model gets the size of the network input, so that its boxes are in px of the input."""
     kind = _KINDS[tensor.kind]
     if tensor.name == _SIZES:
         return np.tile(np.array([width, height], dtype=kind), (count, 1))

@@ -13,7 +13,7 @@ from objslam.core.arrays import Array
 from objslam.errors import ConfigError, DetectorError
 
 STRIDES = (8, 16, 32)  # The strides in px of the three grids on which most YOLO models predict.
-_FEW = 1000  # The maximum number of boxes of a network that selects its boxes. A grid has thousands of boxes.
+_FEW = 1000  # The largest number of boxes of a network that itself selects boxes. A grid has thousands of boxes.
 _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
     "ssd": (frozenset({"boxes", "labels", "scores"}), frozenset({"boxes", "labels"})),
     "detr": (frozenset({"boxes", "logits"}), frozenset({"predictions"})),
@@ -21,12 +21,12 @@ _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
 _SINGLE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
 
 Roles = Mapping[Role, str]
-"""The output name of each role."""
+"""The name of the output that has each role."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """Hold the name and values of one output for one image."""
+    """One output of a model for one image: its name and its values."""
 
     name: str
     values: Array
@@ -37,7 +37,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Facts:
-    """Hold the facts that distinguish layouts: input size in px, number of class names (None if unknown), and metadata."""
+    """The facts that distinguish layouts. height, width: of the input, px. classes: the number of names, None if unknown."""
 
     height: int
     width: int
@@ -46,14 +46,15 @@ class Facts:
 
     @property
     def ultralytics_detr(self) -> bool:
-        """Return whether the metadata of Ultralytics describe a DETR model. Its single output has the class scores of each
-        box. Since version 8.4, with the metadata key `head`, the output has the best score and class of each box instead."""
+        """Whether the metadata describes a DETR model of Ultralytics. Its only output has all class scores of each box.
+        Since version 8.4, which adds the metadata key `head`, the output has only the best score and class of each box."""
         return "detr" in self.metadata.get("description", "").lower()
 
 
 def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts, model: Path) -> tuple[Layout, Roles]:
-    """Return the layout and the output name of each role. The settings override the recognition. ConfigError if the settings
-    name a missing output or roles that form no layout. DetectorError with the outputs and a remedy if no layout fits."""
+    """Return the layout and the output name of each role. The settings override the recognition. Raises ConfigError if the
+    settings name a missing output or roles that form no layout. Raises DetectorError if no layout fits the outputs. Its
+    message lists the outputs and says how to describe them."""
     layout = settings.layout
     roles: Roles | None = settings.outputs
     if roles is not None:
@@ -80,7 +81,7 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
 
 
 def rows_are_boxes(values: Array, classes: int | None) -> bool:
-    """Return whether a row of predictions (..., A, B) is a box. In YOLOv8 a column is a box."""
+    """Return whether each row of the predictions (..., A, B) is a box. Otherwise each column is a box, as in YOLOv8."""
     rows, columns = values.shape[-2:]
     if classes is not None and (rows == 4 + classes) != (columns == 4 + classes):
         return bool(columns == 4 + classes)
@@ -88,7 +89,7 @@ def rows_are_boxes(values: Array, classes: int | None) -> bool:
 
 
 def count_classes(layout: Layout, named: Mapping[Role, Array], facts: Facts) -> int | None:
-    """Return the number of classes that the outputs have scores for, or None if they have class numbers only."""
+    """Return the number of class scores that the outputs have for each box, or None if they have class numbers only."""
     if layout in ("ssd", "end_to_end"):
         return None
     if "logits" in named:
@@ -144,7 +145,8 @@ def _detr_roles(outputs: Sequence[Output]) -> Roles | None:
 
 
 def _single(outputs: Sequence[Output]) -> Output | None:
-    """Return the single output with predictions. Other outputs must have no row per box (masks, raw heads)."""
+    """Return the only output with predictions, or None if there is not exactly one. Other outputs (masks, raw heads) are
+    allowed if they do not have a row for each box. If one does, return None."""
     lists = [o for o in outputs if o.values.dtype.kind == "f" and (_is_numbered(o) or _is_list(o))]
     if len(lists) != 1:
         return None

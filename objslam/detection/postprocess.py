@@ -11,14 +11,14 @@ from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # The largest absolute coordinate of boxes in fractions. Boxes in px below it are too small to matter.
+_FRACTION = 1.5  # Boxes without a larger absolute coordinate are in fractions. In px, such boxes are too small to matter.
 _CANDIDATES = 1000  # The maximum number of boxes in non-maximum suppression, whose time grows with the square of it.
 _Outputs = Mapping[Role, Array]
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Hold boxes (N, 4) with their scores (N,) and class numbers `label` (N,)."""
+    """Boxes (N, 4) with their scores (N,). label: (N,) the class numbers, or indices into the names."""
 
     boxes: Floats
     scores: Floats
@@ -27,8 +27,8 @@ class Candidates:
 
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
-    is an index into the names, or a class number without names. The outputs have no batch axis. DetectorError if a score is
-    no probability or a class has no name."""
+    is an index into the names, or a class number if there are no names. The outputs have no batch axis. Raises DetectorError
+    if a score is above 1 or a class has no name."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:
@@ -47,7 +47,8 @@ def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candid
 
 
 def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
-    """Return the indices of the boxes (N, 4) left by non-maximum suppression per label above `iou`, best first."""
+    """Return the indices of the boxes (N, 4) that non-maximum suppression keeps, the best first. It removes a box whose IoU
+    with a better box of the same label is above `iou`."""
     import cv2
 
     if len(boxes) == 0:
@@ -117,13 +118,14 @@ _DECODERS: dict[Layout, Callable[[Recipe, _Outputs, int, int], Candidates]] = {
 
 
 def _likely(recipe: Recipe, rows: Array) -> tuple[Array, Ints]:
-    """Return the few rows with sufficient objectness (column 4) and their indices, so that further work is small."""
+    """Return the rows whose objectness (column 4) is at least `min_score`, and their indices. Only they need more work."""
     likely = np.flatnonzero(_probability(rows[:, 4], recipe) >= recipe.min_score)
     return rows[likely], likely
 
 
 def _best_class(recipe: Recipe, boxes: Array, values: Array, objectness: Array | None = None) -> Candidates:
-    """Return each box whose best class has a sufficient score, from class values (N, C) times objectness (N,)."""
+    """Return the boxes whose best class has a score of at least `min_score`. values: (N, C) the outputs for the classes.
+    objectness: (N,) a factor of the scores, if any."""
     values = values[:, : recipe.channels]
     if recipe.activation == "softmax":
         weights = np.exp(values - values.max(axis=1, keepdims=True))
@@ -162,7 +164,7 @@ def _corners(recipe: Recipe, boxes: Floats, width: int, height: int) -> Floats:
 
 
 def _name_indices(recipe: Recipe, label: Ints) -> Ints:
-    """Return the index of each class number in the names, -1 for the background. Without names return the numbers."""
+    """Return the index in the names of each class number, -1 for background. Raises DetectorError if a class has no name."""
     indices = label - recipe.first_label
     beyond = indices >= len(recipe.names)
     if recipe.names and beyond.any():

@@ -12,7 +12,8 @@ from objslam.errors import ConfigError
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold the place (left, top, content_width, content_height) in the network input of an image of width x height px."""
+    """Where the resized image lies in the network input, px. width, height: of the raw image. content_width, content_height:
+    of the resized image."""
 
     width: int
     height: int
@@ -31,11 +32,12 @@ class Fit:
 
 
 def fit(recipe: Recipe, width: int, height: int) -> Fit:
-    """Compute the place of an image of this size in the input. ConfigError if the image does not fit."""
+    """Compute where a resized image lies in the input. width, height: of the raw image, px. Raises ConfigError if the recipe
+    does not resize and the model takes another size."""
     size = recipe.size
     if recipe.resize == "none":
         if (width if size.free_width else size.width, height if size.free_height else size.height) != (width, height):
-            message = f"detector.resize is none, but the model takes {size.width}x{size.height}, images are {width}x{height}"
+            message = f"detector.resize is none, but the model takes {size.width}x{size.height}, not {width}x{height}"
             raise ConfigError(message, hint="set letterbox, corner or stretch")
         return Fit(width, height, width, height, 0, 0, width, height)
     if recipe.resize == "stretch":
@@ -51,7 +53,8 @@ def fit(recipe: Recipe, width: int, height: int) -> Fit:
 
 
 def fill(recipe: Recipe, images: Sequence[Array], where: Fit, count: int) -> Array:
-    """Convert images (H, W, 3), uint8 BGR, of one size to values (count, 3, H, W). Missing images become grey."""
+    """Convert images (H, W, 3), uint8 BGR, of one size to the network input (count, 3, H, W). If there are fewer images than
+    `count`, the rest of the input is grey."""
     import cv2
 
     gain = 1.0 / (recipe.divide_by * np.array(recipe.std))

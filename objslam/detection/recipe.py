@@ -13,7 +13,7 @@ UNIT_STD: Three = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Habits:
-    """Hold the properties shared by the models of a layout. The settings and the model's own description override them."""
+    """The properties that models of a layout usually have. The settings and the model's own description override them."""
 
     resize: Resize
     colour: Colour
@@ -28,7 +28,7 @@ class Habits:
 
 _YOLO = Habits("letterbox", "rgb", 255.0, "cxcywh", "pixels", nms=True)
 _YOLOX = Habits("corner", "bgr", 1.0, "cxcywh", "pixels", nms=True)
-_IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # Mean and std of the channels of ImageNet.
+_IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # The mean and std of ImageNet's channels.
 HABITS: dict[Layout, Habits] = {
     "ssd": Habits("stretch", "rgb", 255.0, "xyxy", None, nms=False),
     "yolov8": _YOLO,
@@ -42,8 +42,8 @@ HABITS: dict[Layout, Habits] = {
 
 @dataclass(frozen=True)
 class InputSize:
-    """Hold the size of the network input in px, which is the maximum along an axis of free size. An input of free size
-    shrinks to its image, and each of its sides is then a multiple of `stride`."""
+    """The size of the network input, px. For a free side, it is the largest length. The input then shrinks along this side
+    to the resized image, rounded up to a multiple of `stride`."""
 
     width: int
     height: int
@@ -54,7 +54,7 @@ class InputSize:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Habits):
-    """Hold the detector settings of a model with every value determined."""
+    """The detector settings of a model, with every value determined."""
 
     layout: Layout
     outputs: Roles

@@ -1,2 +1,2 @@
-"""Align and match a result with the ground truth, and compute its errors as numbers and as a table. The folder `results`
-reads the results, and the folder `output` draws them."""
+"""The comparison of a result with the ground truth: alignment, matches, and errors as numbers and as a table. The folder
+`results` reads the results, and the folder `output` draws them."""

@@ -14,17 +14,17 @@ from objslam.core.types import Trajectory, Truth, TruthObject
 Alignment = Literal["none", "se2", "sim2"]
 """The alignment of a map with the truth: none, se2 (yaw and translation), or sim2 (yaw, translation and scale)."""
 
-_MAX_CORRESPONDENCES = 2000  # The number of correspondences above which their pairs are sampled.
+_MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pairs of them are sampled.
 _DRAWN_PAIRS = 200_000  # The number of sampled pairs of correspondences.
 _MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
-_MAX_REFINED = 12  # The number of best initial transforms to refine. More are more reliable and take longer.
+_MAX_REFINED = 12  # This many of the best initial transforms are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 searches.
 
 
 @dataclass(frozen=True)
 class Transform:
-    """Hold the transform scale * rotation @ point + translation as a pose (4, 4) and a scale."""
+    """The transform from a point to scale * rotation @ point + translation. `pose` (4, 4) has rotation and translation."""
 
     pose: Floats
     scale: float = 1.0
@@ -39,7 +39,7 @@ IDENTITY = Transform(np.eye(4))
 
 
 def correspondences(objects: Sequence[MapObject], truth: Sequence[TruthObject]) -> tuple[Floats, Floats, Bools]:
-    """Return the positions in m of map objects (N, 3) and true objects (M, 3), and whether a pair shares a label (N, M)."""
+    """Return positions (N, 3) of map objects and (M, 3) of true objects, m, and a mask (N, M): True if labels are equal."""
     source = np.array([o.position for o in objects]).reshape(-1, 3)
     target = np.array([t.position for t in truth]).reshape(-1, 3)
     same = np.array([[o.label == t.label for t in truth] for o in objects], dtype=bool)
@@ -56,7 +56,7 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
         same: (N, M), True if two points may be a pair.
         radius: maximum distance of a pair in m.
     Returns:
-        The indices of the pairs in source (increasing) and in target.
+        For each pair, the index of its point in `source` (increasing), and the index of its point in `target`.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -76,13 +76,15 @@ def align_objects(
     """Align map objects with true objects by iterative closest point (ICP) with one-to-one matches.
 
     From each initial transform, points are matched within the radius and aligned with their matches, until the matches
-    converge. The best transform has the minimal sum of min(distance, radius)^2 over the true objects.
+    converge. The function returns the transform from map to truth with the smallest sum of min(distance, radius)^2 over
+    the true objects. The distance is from a true object to its match.
 
     Args:
         source, target: map objects (N, 3) and true objects (M, 3) in m.
         same: (N, M), True if two objects may be the same.
-        start: initial transform. None aligns each pair of map objects with each possible pair of true objects of similar
-            distance. At most 3,000 of these alignments are sampled, with a fixed seed.
+        radius: maximum distance of a match in m.
+        start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
+            with the same labels and a similar distance. At most 3,000 of these alignments are sampled, with a fixed seed.
     """
     if kind == "none" or not same.any():
         return IDENTITY
@@ -114,7 +116,7 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Return initial transforms that each align one pair of correspondences, ordered by cost."""
+    """Return the best initial transforms. Each aligns two map objects, or one if no two fit, with true objects."""
     i, k = np.nonzero(same)
     if len(i) <= _MAX_CORRESPONDENCES:
         first, second = np.triu_indices(len(i), 1)
@@ -148,15 +150,17 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
 
 
 def _nearest_cost(transform: Transform, source: Floats, target: Floats, same: Bools, radius: float) -> float:
-    """Return the sum over the true objects of min(distance to the nearest possible map object, radius)^2."""
+    """Return the sum of min(distance, radius)^2 over the true objects, with the distance to the nearest possible match."""
     squared = ((transform.apply(source)[:, None] - target[None]) ** 2).sum(axis=2)
     return float(np.minimum(np.where(same, squared, np.inf).min(axis=0), radius**2).sum())
 
 
 def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
-    """Return the truth in the frame of the map, for drawing. A map from odometry alone has its own frame. The truth is
-    aligned in the plane if fewer than half of the possible matches are within the radius (m) and the alignment increases
-    their number."""
+    """Return the ground truth in the coordinate frame of the map, so that both can be drawn together.
+
+    A map from odometry alone has its own frame. The truth is aligned with the map in the plane if fewer than half of the
+    possible matches are within the radius (m) and the alignment adds matches. Otherwise, it is returned unchanged.
+    """
     source, target, same = correspondences(objects.resolved(), truth.objects)
     matched = len(match_points(source, target, same, radius)[0])
     if 2 * matched >= min(len(source), len(target)):

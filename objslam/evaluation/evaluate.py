@@ -18,14 +18,14 @@ from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, 
 from objslam.results.read import load_map, load_trajectory, load_truth
 
 MAX_TRUTH_GAP = 1.0
-"""The longest interpolated gap between two true poses in s. A pose in a longer gap has no truth."""
+"""The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
 INSIDE_95 = 5.991
 """The squared Mahalanobis distance within which 95 % of honest errors lie (chi-squared, 2 degrees of freedom)."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Hold a map object, its true object, and the offset (3,) map minus truth in m after the alignment.
+    """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
     squared: squared Mahalanobis distance of the offset in x and y, by the covariance of the object. None without one.
     """
@@ -37,14 +37,18 @@ class Match:
 
     @property
     def error(self) -> float:
-        """Return the distance between map object and true object in m."""
+        """Return the distance between the map object and the true object in m."""
         return float(np.linalg.norm(self.offset))
 
 
 @dataclass(frozen=True)
 class ObjectScores:
-    """Hold the matched, missed and false objects. A match is one-to-one, has one label, and is within the radius. An
-    unresolved object has no reliable position. It is counted, but is neither matched nor false."""
+    """The matched, missed and false objects of a map, and the number of its unresolved objects.
+
+    A match is a map object and a true object of one label within the radius. Each object has at most one match. A missed
+    object is a true object without a match, and a false object is a resolved map object without a match. An unresolved
+    object has no reliable position, so it is neither matched nor false. `transform` is the alignment from map to truth.
+    """
 
     matches: tuple[Match, ...]
     missed: tuple[TruthObject, ...]
@@ -70,17 +74,17 @@ class ObjectScores:
 
 @dataclass(frozen=True)
 class PathScores:
-    """Hold the absolute trajectory error (ATE; Sturm et al., IROS 2012) at the timestamps of the path with truth."""
+    """The absolute trajectory error (ATE; Sturm et al., IROS 2012) at those timestamps of the path that have a true pose."""
 
     errors: Floats  # The translation errors (N,) in m after the alignment of the path.
-    errors_with_map: Floats | None  # The translation errors (N,) in m after the alignment of the objects, if any.
-    outside: int  # The number of timestamps without truth.
+    errors_with_map: Floats | None  # Errors (N,) in m after the alignment of the objects; None if no true objects exist.
+    outside: int  # The number of timestamps without a true pose.
     transform: Transform  # The alignment of the path.
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Hold the evaluation of a result. A part is None if there is nothing to compare."""
+    """The evaluation of a result. `objects` or `path` is None if the ground truth has nothing to compare it with."""
 
     objects: ObjectScores | None
     path: PathScores | None
@@ -91,7 +95,7 @@ class Evaluation:
     """The path of the ground truth, or None if it is the truth of the log."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of evaluation.json in m and deg. A missing value is None."""
+        """Return the content of evaluation.json. Values are in m and deg. A missing value is None."""
         return {
             "truth": self.truth,
             "align": self.align,
@@ -115,8 +119,8 @@ def evaluate(
 
     Args:
         trajectory: poses map_T_base.
-        align: kind of the alignment. Objects are aligned by their matches, and the path by its own poses.
-        radius: maximum distance of a match in m. Only objects of one label can match.
+        align: kind of the alignment. Objects are aligned by their matches, and the path by its poses.
+        radius: maximum distance of a match in m. Only objects with the same label can match.
     Raises:
         LogError: there is no truth to compare with.
         ConfigError: the radius is not positive.
@@ -141,8 +145,11 @@ def evaluate(
 
 
 def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
-    """Compare the result folder `out` with the truth in the path `truth` (see `load_truth`), or with the truth of its log.
-    LogError if there is no truth, OutputError if the result cannot be read, ConfigError if the radius is not positive."""
+    """Compare the result folder `out` with the ground truth at the path `truth` (see `load_truth`).
+
+    By default, the ground truth of the result's log is used. LogError if there is no truth, OutputError if the result cannot
+    be read, ConfigError if the radius is not positive.
+    """
     _check_radius(radius)
     map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
     if known is None:
@@ -169,7 +176,7 @@ def _check_radius(radius: float) -> None:
 def _score_objects(
     map: ObjectMap, truth: tuple[TruthObject, ...], kind: Alignment, radius: float, on_path: Transform | None
 ) -> ObjectScores:
-    # The order makes the matches independent of the order in the files.
+    # Sorted objects make the matches independent of the order in the files.
     mapped = sorted(map.resolved(), key=lambda o: (o.label, o.id))
     true = sorted(truth, key=lambda o: (o.label, o.id))
     ours, theirs, same = correspondences(mapped, true)

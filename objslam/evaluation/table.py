@@ -28,7 +28,7 @@ _PATH_ROWS = (
     ("ate", "ATE (RMSE)", " m"),
     ("ate_median", "ATE median", " m"),
     ("ate_max", "ATE max", " m"),
-    ("ate_in_map_alignment", "ATE in the objects' alignment", " m"),
+    ("ate_in_map_alignment", "ATE after the objects' alignment", " m"),
     ("path_poses", "poses compared", ""),
     ("path_poses_without_truth", "poses without truth", ""),
 )
@@ -36,7 +36,7 @@ _PATH_ROWS = (
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """Return the scores, the objects by decreasing error, and the warnings."""
+    """Return a table of the scores, a table of the objects by decreasing error, and the warnings."""
     from rich.console import Group
     from rich.markup import escape
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""Turn boxes into bearing rays: the undistorted centre of a box gives a direction from its keyframe's camera."""
+"""Turn boxes into bearing rays. The undistorted centre of a box gives the direction from the camera at a keyframe."""
 
 import numpy as np
 
@@ -9,15 +9,16 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
 MAX_OF_LABEL = 1000
-"""The most boxes of one label in a frame that are used. A larger number takes more memory and time in a crowd."""
+"""The most boxes that are used of one label in one frame. A larger number takes more memory and time in a crowd."""
 
 
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
     """Return one ray for each usable box of the keyframes, in the order of the keyframes.
 
-    The ledger counts the other boxes. A box is not usable if its score is too low, its centre is outside the image, or the
-    lens model has no inverse at its centre. A box that the image's edge cuts off is usable only if the detections are
-    `whole`. In each frame, only the `MAX_OF_LABEL` boxes of a label with the highest scores are used.
+    The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
+    the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
+    rays.border is negative or the detections are `whole`. In each frame, at most `MAX_OF_LABEL` boxes of one label are used,
+    those with the highest scores.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -74,9 +75,10 @@ def box_rays(
 
 
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
-    """Return increasing indices of the boxes (M,) that are used: the `MAX_OF_LABEL` best of each label in a frame.
+    """Return the increasing indices of the boxes that are used: for each label in each frame the `MAX_OF_LABEL` best.
 
-    A box is better if its score is higher. Among equal scores the first box is better. The ledger counts the other boxes.
+    frame, label, scores: (M,) of each box. A box is better if its score is higher. Among equal scores the first box is
+    better. The ledger counts the other boxes.
     """
     count = len(frame)
     if count <= MAX_OF_LABEL:
@@ -114,8 +116,8 @@ def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Se
     """Return the standard deviations (n,), rad, of rays in unit directions (n, 3) through the centres of boxes (n, 4)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
     pixels = np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
-    # A small angle moves a pinhole image by f / cos(a)^2 along the radius and by f / cos(a) across it. Here a is the angle
-    # off the axis. The geometric mean of the two gives one sigma for the ray. A fisheye image moves by f everywhere.
+    # For each radian of ray angle, a pinhole image moves by f / cos(a)^2 along the radius and by f / cos(a) across it. Here
+    # a is the angle off the axis. The geometric mean gives one sigma for the ray. A fisheye image moves by f everywhere.
     if camera.fisheye:
         return pixels / camera.focal
     return pixels / camera.focal * directions[:, 2] ** 1.5

@@ -16,18 +16,19 @@ from objslam.io.images import decode_depth
 from objslam.io.text import read_bytes
 
 _CENTRE_SHARE = 0.5
-"""The share of a box's width and height in which depth is read. A larger share includes background at the box's edge."""
+"""The share of a box's width, and of its height, in which depth is read. A larger share includes background at the edge."""
 _MIN_VALID_SHARE = 0.1
 """The least share of valid pixels for a depth to be read. A larger share leaves more boxes without a depth."""
 MAX_IMAGE_LAG = 0.02
-"""The greatest time (s) between the colour and the depth image of one frame. Some cameras stamp the two images apart."""
+"""The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two
+images different stamps. A longer time pairs images of different moments."""
 
 
 def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledger: Ledger) -> Detections:
-    """Return the detections with the depth (m) of each box, from the depth image nearest in time.
+    """Return the detections with the depth (m) of each box, from the depth image that is nearest in time.
 
-    An unknown depth is NaN. The depth images must be registered to the camera's image. The ledger counts images
-    that cannot be used, and frames without a depth image within 20 ms.
+    An unknown depth is NaN. The depth images must be registered to the camera's image. The ledger counts depth images that
+    cannot be used, and frames with boxes that have no depth image within 20 ms.
     """
     depths = np.full(len(detections), np.nan)
     frames, start, count = np.unique(detections.frame, return_index=True, return_counts=True)
@@ -60,7 +61,7 @@ def box_depth(image: NDArray[Any], box: Floats) -> float:
 
 
 def nearest_stamps(stamps: Floats, query: Floats) -> NDArray[np.int64]:
-    """Return for each query stamp (Q,) the index of the nearest among increasing stamps (N,)."""
+    """Return for each stamp in `query` (Q,) the index of the nearest one among the increasing `stamps` (N,)."""
     after = np.clip(np.searchsorted(stamps, query), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(stamps[before] - query) <= np.abs(stamps[after] - query), before, after)
@@ -69,7 +70,7 @@ def nearest_stamps(stamps: Floats, query: Floats) -> NDArray[np.int64]:
 def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | None:
     """Read a depth image (H, W) in its own units.
 
-    If it cannot be decoded or does not have the camera's size, the ledger counts it and the result is None.
+    If the image cannot be decoded or does not have the camera's size, the ledger counts it, and the result is None.
     """
     try:
         image = decode_depth(read_bytes(path))

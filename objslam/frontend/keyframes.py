@@ -15,9 +15,9 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     """Return the frames of all cameras that lie on the robot's path, in the order of time.
 
     The path is the localisation if the log has one, else the odometry. In joint mode a frame must also lie on the odometry,
-    because the odometry gives the motion between keyframes. Nothing is extrapolated. The ledger counts frames outside a path
-    or in a gap longer than poses.max_gap, and their boxes. LogError if the log has no path, no detection frame, or no frame
-    on the path.
+    because the odometry gives the motion between keyframes. Nothing is extrapolated. The ledger counts the frames and boxes
+    that are outside the path or in one of its gaps longer than poses.max_gap. If a camera moves on the robot, the same holds
+    for its mount. LogError if the log has no path, no detection frame, or no frame on the path.
     """
     path = log.localization or log.odometry
     if path is None:
@@ -85,7 +85,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
 def _on_path(
     path: Trajectory, stamps: Floats, wanted: Bools, boxes: Floats, max_gap: float, ledger: Ledger, what: str
 ) -> tuple[Floats, Bools]:
-    """Return the poses of a path at the stamps, and which stamps have a pose. Count wanted frames without one, and boxes."""
+    """Return the poses of a path at the stamps, and which stamps have one. The ledger counts `wanted` frames without one."""
     poses, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
     outside = (stamps < path.stamps[0]) | (stamps > path.stamps[-1])
     lost = wanted & ~valid

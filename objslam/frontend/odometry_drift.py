@@ -1,4 +1,4 @@
-"""The covariance that odometry accumulates along its path."""
+"""The drift of odometry, which is the covariance that it accumulates along its path."""
 
 from typing import TypeVar
 
@@ -13,11 +13,11 @@ Length = TypeVar("Length", float, Floats)
 
 
 def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> Floats:
-    """Return the covariance (Q, 6, 6) that the odometry has accumulated at each of the stamps (Q,), rotation first.
+    """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), rotation first.
 
-    The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, and the steps
-    are summed there. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. Moved back to
-    base at j, this covariance contains the lever arms of the heading.
+    The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, where the
+    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. Moved into base
+    at j, this covariance shows how an error of the heading shifts the later positions.
     """
     if len(odometry) == 1:
         return np.zeros((len(stamps), 6, 6))
@@ -46,7 +46,7 @@ def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats
 
 
 def add_step(drift: Floats, before: Floats, after: Floats, settings: Odometry, planar: bool) -> Floats:
-    """Add the noise of the step between two poses (4, 4) to a covariance (6, 6). The noise is that of `step_drift`.
+    """Return a covariance (6, 6) to which the noise of the step between two poses (4, 4) is added, as by `step_drift`.
 
     A session calls this function for every pose. It avoids numpy, and takes a tenth of the time of `step_drift`.
     """
@@ -67,7 +67,7 @@ def add_step(drift: Floats, before: Floats, after: Floats, settings: Odometry, p
 
 
 def _step_variances(turn: Length, way: Length, settings: Odometry) -> tuple[Length, Length, Length]:
-    """Return the variances of yaw (rad^2), x and y (m^2) after a turn (rad) and a way (m)."""
+    """Return the variances of yaw (rad^2), x (m^2) and y (m^2) after a turn (rad) over a way (m)."""
     angle = settings.yaw_per_m**2 * way + settings.yaw_per_rad**2 * turn
     x = settings.x_per_m**2 * way + settings.xy_per_rad**2 * turn
     y = settings.y_per_m**2 * way + settings.xy_per_rad**2 * turn

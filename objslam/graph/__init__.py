@@ -1,4 +1,4 @@
-"""The factor graph, batch and incremental: variables, factors, optimisers and marginals, the only folder that knows GTSAM.
+"""The factor graph, batch and incremental, with its variables, factors, optimisers and marginals.
 
-The alternation of association and solve is in `mapping`.
+Only this folder uses GTSAM, and the alternation of association and solve is in `mapping`.
 """

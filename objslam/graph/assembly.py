@@ -1,4 +1,4 @@
-"""Choose the factors for the measurements of a log, for the initialisations, outlier rejection and the final solve."""
+"""Choose the factors of a log's measurements. The initialisations, outlier rejection and the final solve use them."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -23,7 +23,7 @@ from objslam.graph.factors.rays import ray_factors
 class Measurements:
     """The measurements of a log.
 
-    motion (K-1, 4, 4) and covariance (K-1, 6, 6): camera motions by odometry, None without odometry.
+    motion, covariance: (K-1, 4, 4), (K-1, 6, 6) the camera motions by odometry, None without odometry.
     """
 
     keyframes: Keyframes
@@ -54,16 +54,15 @@ class Measurements:
         begin: int = 0,
         end: int | None = None,
     ) -> list[gtsam.NonlinearFactor]:
-        """Return the factors that a graph gets with the keyframes from begin to end and with some rays and landmarks.
-
-        Without `end`, all later keyframes count.
+        """Return the factors that come into a graph with new keyframes, rays and landmarks.
 
         Args:
             owner: (R,) the landmark of each ray, or -1.
             which: (n,) the added rays. The first n factors are their bearings, in the order of `which`.
             landmarks: (m,) the added landmarks.
-            positions: (N, 3) m, the landmarks in map.
+            positions: (N, 3) m, all landmarks in map.
             loss: the loss of the bearings.
+            begin, end: the added keyframes are `begin` to `end` - 1. If `end` is None, they are all from `begin` on.
         """
         keyframes, settings = self.keyframes, self.settings
         end = len(keyframes) if end is None else end
@@ -83,14 +82,14 @@ class Measurements:
 def fixed_pose_factors(
     rays: Rays, origins: Floats, directions: Floats, landmark: Ints, across: Floats, loss: Loss
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of rays at fixed poses: the distance of each ray from its landmark, then the measured ranges.
+    """Return the factors of rays at fixed poses: first the distance of each ray from its landmark, then the measured ranges.
 
     The loss `l1` is Eq. 1, which has neither noise nor ranges.
 
     Args:
-        origins, directions: (n, 3), (n, 3) of the rays in map.
+        origins, directions: (n, 3), (n, 3) the rays in map.
         landmark: (n,) the landmark of each ray.
-        across: (n,) m, the noise of each ray across, at its landmark.
+        across: (n,) m, the standard deviation across each ray, at the distance of its landmark.
     """
     noise = robust(loss, np.ones(len(rays)) if loss == "l1" else across, 2)
     at = np.flatnonzero(np.isfinite(rays.range) & (loss != "l1"))

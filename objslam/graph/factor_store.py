@@ -22,7 +22,7 @@ class Stored(NamedTuple):
 
 @dataclass
 class FactorStore:
-    """The factors by kind, then by number, in the order in which a graph gets the kinds.
+    """The factors by kind, then by number. A graph gets the kinds in the order of `kinds`.
 
     The number of a `motion` is that of the keyframe at its end. The number of an `absolute` pose is that of its keyframe.
     The number of a `landmark` prior is that of the landmark. A `ray` has its own number. The caller numbers other kinds.
@@ -33,18 +33,18 @@ class FactorStore:
     )
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
-        """Store one group of factors for each number. Factors that have the same number are replaced."""
+        """Store one group of factors for each number. It replaces the factors of this kind that have the number already."""
         stored = self.kinds.setdefault(kind, {})
         for number, group in zip(numbers, groups, strict=True):
             stored[number] = Stored(frozenset(key for factor in group for key in factor.keys()), group)  # noqa: SIM118 (no dict)
 
     def drop(self, kind: str, numbers: Iterable[int]) -> None:
-        """Remove measurements of a kind."""
+        """Remove the factors of a kind that have these numbers."""
         for number in numbers:
             self.kinds[kind].pop(number, None)
 
     def drop_variables(self, keys: frozenset[int]) -> None:
-        """Remove every measurement of these variables."""
+        """Remove the factors of every measurement that involves one of these variables."""
         for kind, stored in self.kinds.items():
             self.kinds[kind] = {number: one for number, one in stored.items() if one.keys.isdisjoint(keys)}
 
@@ -53,5 +53,5 @@ class FactorStore:
         return build_graph(*(one.factors for stored in self.kinds.values() for one in stored.values()))
 
     def copy(self) -> FactorStore:
-        """Return a copy with tables of its own. The factors are shared."""
+        """Return a copy with tables of its own. The factors themselves are shared."""
         return FactorStore({kind: dict(stored) for kind, stored in self.kinds.items()})

@@ -1,4 +1,4 @@
-"""Triangulate objects at fixed camera poses, with the noise of these poses."""
+"""Triangulate objects at fixed camera poses. The noise of these poses counts as noise of the rays."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from objslam.triangulation.triangulate import Triangulation, triangulate
 def triangulate_at(
     map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
 ) -> Triangulation:
-    """Triangulate every object by Eq. 1 at the camera poses (K, 4, 4). Localised poses add their noise to the rays."""
+    """Triangulate every object by Eq. 1 at camera poses (K, 4, 4). The noise of a localisation adds to that of the rays."""
     sigma, place = pose_noise(rays, keyframes, settings)
     return _triangulate(map_T_camera, rays, association, settings, sigma, place)
 
@@ -21,7 +21,8 @@ def triangulate_landmarks(
 ) -> tuple[Triangulation, Bools]:
     """Triangulate every object at the camera poses (K, 4, 4), and return which objects (N,) can enter a growing graph.
 
-    An object can enter if at least `fewest` rays agree on it. Its rays must also have parallax, or one of them a range.
+    An object can enter if at least `fewest` rays agree on it. These rays must also have a parallax of at least
+    joint.min_parallax_deg, or one ray of the object must have a measured range.
     """
     found = _triangulate(map_T_camera, rays, association, settings, rays.sigma, 0.0)
     ranged = association.object[np.isfinite(rays.range) & (association.object >= 0)]
@@ -31,9 +32,10 @@ def triangulate_landmarks(
 
 
 def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
-    """Return the angle noise of the rays (R,), rad, and the noise of their origins, m, with the noise of the localisation.
+    """Return the standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins.
 
-    Keyframes that share a measured pose share its error, so their rays count as one ray.
+    Both contain the noise of the localisation. Keyframes that share one measured pose share its error, so its variance is
+    multiplied by their number. Without a localisation, the noise of the rays alone is left.
     """
     share = keyframes.localized_every
     of = settings.localization

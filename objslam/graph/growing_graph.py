@@ -1,4 +1,4 @@
-"""Keep the variables and factors of a growing graph. The factors are the same as offline, and all of them are stored."""
+"""Keep the variables and all factors of a growing graph. A measurement gives the same factors as offline."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from objslam.graph.variables import L0, LETTER, X0, Variables
 
 
 class GrowingGraph(ABC):
-    """Poses X(k) of keyframes, positions L(j) of landmarks, and the factors between them. The caller chooses the numbers.
+    """Poses X(k) of keyframes, positions L(j) of landmarks, and the factors between them. The caller chooses each k and j.
 
     A change by `drop_*`, `move`, `place` or `set_estimate` takes effect at the next `rebuild`.
     """
@@ -37,7 +37,7 @@ class GrowingGraph(ABC):
         """Read the current estimates of all variables from the graph."""
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
-        """Add a group of factors for each number, and store them by kind and number as `FactorStore` describes.
+        """Add a group of factors for each number, and store the groups by kind and number, as `FactorStore` explains.
 
         The keyframes, landmarks and other variables of the factors must be in the graph.
         """
@@ -80,7 +80,7 @@ class GrowingGraph(ABC):
         self.add("landmark", [j], [[point_prior(j, position, self._settings.joint.prior_sigma)]])
 
     def add_rays(self, rays: Bearings) -> None:
-        """Add the factors of rays with Huber's loss, and of their ranges with Cauchy's loss."""
+        """Add the bearing factors of rays with Huber's loss, and their range factors with Cauchy's loss."""
         groups: list[list[gtsam.NonlinearFactor]] = [[] for _ in rays.number]
         for which, made in ray_factors(rays, rays.landmark, "huber", self._settings):
             for i, factor in zip(which.tolist(), made, strict=True):
@@ -95,7 +95,7 @@ class GrowingGraph(ABC):
         self._insert(key, value)
 
     def drop_rays(self, numbers: Ints) -> None:
-        """Remove rays."""
+        """Remove the rays with these numbers."""
         if len(numbers):
             self._rebuild = None
             self._store.drop("ray", numbers.tolist())
@@ -118,7 +118,7 @@ class GrowingGraph(ABC):
         self._store.kinds["absolute"].clear()
 
     def move(self, new_T_old: Floats) -> None:
-        """Move the whole estimate by a pose (4, 4). The caller removes absolute poses first."""
+        """Move the whole estimate by a pose (4, 4). The caller must remove the absolute poses before."""
         self.refresh()
         at, weak = self._at, self._settings.joint.prior_sigma
         at.poses = {k: new_T_old @ pose for k, pose in at.poses.items()}
@@ -132,7 +132,7 @@ class GrowingGraph(ABC):
         self._at.points[j] = position
 
     def set_estimate(self, ids: Ints, poses: Floats, landmarks: Ints, points: Floats) -> None:
-        """Move keyframes `ids` (K,) to poses (K, 4, 4), and landmarks (n,) to points (n, 3)."""
+        """Move the keyframes `ids` (K,) to poses (K, 4, 4), and the landmarks (n,) to points (n, 3)."""
         self.refresh()
         self._at.poses.update(zip(ids.tolist(), poses, strict=True))
         self._at.points.update(zip(landmarks.tolist(), points, strict=True))

@@ -1,7 +1,7 @@
 """Initialise poses and landmarks with a known association, by growing the graph along the path.
 
-From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes enter a few at a time, at the poses that the
-solved ones predict. A landmark enters when its rays so far determine its position.
+From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes enter a few at a time, at poses that
+continue the solved path by odometry. A landmark enters when its rays so far determine its position.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _ITERATIONS = 4
-"""The number of iterations of the solve after each step. A larger number is slower. Few are enough, because each solve
-starts close to its optimum and the next one continues from there."""
+"""The number of iterations of each solve during growth. A larger number is slower. Few are enough, because each solve starts
+close to its optimum, and the next solve continues from its result."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
-doubles. Above the second, a shorter step is tried again. Larger limits take longer steps. On MRCLAM, limits from 1 and 3 to
-5 and 15 degrees converge to the same map. iSAM2 in place of full solves does not: in half the time it lost robot 1 or 5."""
+doubles. Above the second, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3 to 5
+and 15 degrees converge to the same map. iSAM2 in place of full solves took half the time, but it lost robot 1 or 5."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""The angle (rad), and the factor on the median of the step, that an outlier exceeds during growth. Larger values let more
-false boxes in. They were chosen well above the odometry's drift in one step."""
+"""During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
+median angle of the step. Larger values let more false boxes in. Both are well above the odometry's drift in one step."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter
 later. With fewer, false boxes agree by chance too often."""
@@ -38,7 +38,7 @@ _SHORTEST = 4
 def initialize_known(
     measured: Measurements, association: Association, progress: Callable[[int, int], None], trace: Trace | None = None
 ) -> tuple[Floats, Floats]:
-    """Return camera poses (K, 4, 4) and landmark positions (N, 3) near the solution, in map. An unknown position is NaN.
+    """Return camera poses (K, 4, 4) and landmark positions (N, 3), in map, near the solution. An unknown position is NaN.
 
     The map frame is the odometry's frame, in which the first keyframe is fixed. progress(done, total) counts keyframes.
     """
@@ -95,7 +95,7 @@ def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: 
 def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
 ) -> tuple[Ints, Floats, Ints]:
-    """Return the landmarks (n,) that the waiting rays determine now, their positions (n, 3), and the rays that agree."""
+    """Return the landmarks (n,) that the rays `waiting` determine now, their positions (n, 3), and the rays that agree."""
     if len(waiting) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), waiting
     landmarks, index = np.unique(association.object[waiting], return_inverse=True)

@@ -1,8 +1,9 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes enter a few at a time at predicted poses. Their rays are assigned to the known
-landmarks by predicted bearing, with a gate that contains the odometry's drift. The unassigned rays of the last stretch,
-whose poses still agree, give new landmarks. The result is the start of a global association.
+As in `init_known_correspondences`, keyframes enter a few at a time, at poses that continue the solved path by odometry. Each
+ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's drift.
+Unassigned rays of the most recent keyframes, between which the drift is small, give new landmarks. The result is the start
+of a global association.
 """
 
 from collections.abc import Callable
@@ -27,24 +28,24 @@ from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
 from objslam.graph.variables import make_values, read_points, read_poses
 
 _HORIZON = 0.1
-"""The drift in heading (rad, one standard deviation) up to which a landmark is expected at its position. A larger drift
-recognises landmarks after a longer absence, and confuses neighbours."""
+"""A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
+landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
 _STRETCH = 150
-"""The most recent keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
+"""The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The error (m) of a measured range that is allowed besides its noise. A larger value accepts more wrong ranges."""
+"""The error (m) that a measured range may have in addition to its noise. A larger value accepts more wrong ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
-"""The uncertainty of a step's pose after its alignment with the landmarks: a share of its drift, and standard deviations
-(rad, m). Larger values widen the gate of every ray."""
+"""The uncertainty of the poses in a step after their alignment with the landmarks. It is the share `_LEFT` of the drift's
+covariance, plus the standard deviations `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
-A wrong landmark disturbs all later poses."""
+With fewer rays, more wrong landmarks enter, and each of them disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-"""The number of iterations of the solve after a step, and after a loop closure. More are slower. A loop closure needs more,
-because it starts farther from its optimum."""
+"""The numbers of iterations of the solve after a step and of the solve after a loop closure. More are slower. The latter
+needs more, because it starts farther from its optimum."""
 _STRAIN = 200.0
-"""The squared deviation per joined landmark by which a loop may raise the cost. A larger value closes more wrong loops. On
-MRCLAM correct loops took up to 110, and wrong ones 240 and more."""
+"""The amount, for each joined landmark, by which a loop closure may raise the cost (a sum of squared deviations). A larger
+amount closes more wrong loops. On MRCLAM, correct loops took up to 110 for each landmark, and wrong ones 240 or more."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class InitialEstimate:
 def initialize_unknown(
     keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings, progress: Callable[[int, int], None]
 ) -> InitialEstimate:
-    """Return initial poses and landmarks. progress(done, total) counts keyframes."""
+    """Return initial poses and landmarks. The function progress(done, total) is called with numbers of keyframes."""
     measured = Measurements.of(keyframes, rays, settings)
     assert keyframes.drift is not None
     heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])  # variance, rad^2
@@ -115,7 +116,7 @@ def _solve(graph: gtsam.NonlinearFactorGraph, map_T_camera: Floats, known: Landm
 def _close(
     found: Closure, known: Landmarks, measured: Measurements, owner: Ints, map_T_camera: Floats, heading: Floats
 ) -> tuple[gtsam.NonlinearFactorGraph, Landmarks, Ints, Floats] | None:
-    """Return the graph, landmarks, owners and poses after a loop closure, or None if the cost rises too much."""
+    """Return graph, landmarks, landmark of each ray, and poses after a loop closure. None if the cost rises too much."""
     now, old, rays = found.now, found.before, measured.rays
     back = int(known.first[now].min())
     left = int(np.minimum(known.last[old], back).max())
@@ -145,14 +146,14 @@ def _close(
 
 
 def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Return which landmarks (N,) have a drift in heading below `_HORIZON` since their last observation."""
+    """Return for each landmark (N,) whether the heading drifted by less than `_HORIZON` since its last observation."""
     return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
 
 
 def _recognise(
     rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4) that are aligned with the landmarks."""
+    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4), aligned from keyframe `begin` on."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)
@@ -196,7 +197,7 @@ def _discover(
     cameras: tuple[Camera, ...],
     settings: Settings,
 ) -> Ints:
-    """Find landmarks among the unassigned rays of keyframes begin to end. Add them to `known` and `owner`."""
+    """Add landmarks from unassigned rays of keyframes `begin` to `end` - 1 to `known` and `owner`. Return their numbers."""
     free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
     none, fewest = np.zeros(0, dtype=np.int64), settings.association.min_rays + _MORE_RAYS
     if len(free) < fewest:
@@ -223,7 +224,7 @@ def _discover(
 
 
 def _drifted(keyframes: Keyframes, since: int) -> Floats:
-    """Return the covariances (K, 6, 6) that the odometry accumulated after keyframe `since`, in the camera frames."""
+    """Return the covariances (K, 6, 6) that the odometry accumulated after keyframe `since`, each in its camera's frame."""
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     assert odom_T_base is not None
     assert drift is not None

@@ -1,7 +1,7 @@
 """Estimate a growing graph by iSAM2: updates, rebuilds, and access to the estimate.
 
-If an update throws, Levenberg-Marquardt solves the stored factors from the last good estimate, and iSAM2 is rebuilt there.
-The damping covers variables that nothing holds yet.
+If an update raises an exception, Levenberg-Marquardt solves the stored factors from the last good estimate. iSAM2 is then
+rebuilt at this solution. Levenberg-Marquardt can solve it, because its damping holds variables that no measurement holds.
 """
 
 import gtsam
@@ -20,19 +20,19 @@ from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marqu
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 400
-"""The most keyframes of a graph that is rebuilt in one call. A larger number delays a frame for longer. A smaller number
-spreads a rebuild over more frames."""
+"""The most keyframes with which a graph is rebuilt in one call. A larger number delays the next image for longer. A smaller
+number spreads more rebuilds over several images."""
 _SLICE = 100
-"""The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays a frame for longer."""
+"""The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays the next image longer."""
 _FRESH = 10
-"""The number of updates without a landmark after which the landmark counts as deep in iSAM2's tree. A larger number changes
-the layout of the tree less often, and finds returning landmarks deeper in the tree."""
+"""A landmark counts as deep in iSAM2's tree if this many updates did not involve it. A larger number changes the layout of
+the tree less often, and finds returning landmarks deeper in the tree."""
 
 
 class IncrementalGraph(GrowingGraph):
     """A growing graph and its estimate.
 
-    rebuilds: how many times an update threw, and the graph was rebuilt.
+    rebuilds: how many times the graph was rebuilt because an update raised an exception.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -49,8 +49,8 @@ class IncrementalGraph(GrowingGraph):
     def prepare(self, coming: Ints, relinearise: bool = False) -> None:
         """Add the new variables and factors, and prepare the tree for a keyframe that may observe landmarks `coming` (n,).
 
-        An update eliminates the cliques between an observed variable and the root again. So variables that may be observed
-        move near the root, unless they are there. relinearise: also linearise again the variables that moved.
+        An update eliminates all cliques between an observed variable and the root again. So this call moves a variable near
+        to the root if it may be observed and is not there yet. relinearise: whether to relinearise changed variables too.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
         if relinearise or sunk or self._new.size():
@@ -84,22 +84,22 @@ class IncrementalGraph(GrowingGraph):
         return np.array([self._at.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4)
 
     def variable(self, key: int) -> gtsam.Pose3 | Floats:
-        """Return a variable from `add_variable` at the last `refresh`."""
+        """Return the value that a variable from `add_variable` had at the last `refresh`."""
         return self._at.others[key]
 
     def pose_covariance(self, k: int) -> Floats:
-        """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. It is NaN if the graph lacks it."""
+        """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. It is NaN if iSAM2 cannot give it."""
         return self._covariance(X0 + k, 6)
 
     def point_covariance(self, j: int) -> Floats:
-        """Return the covariance (3, 3) of L(j), m^2. It is NaN if the graph lacks it."""
+        """Return the covariance (3, 3) of L(j), m^2. It is NaN if iSAM2 cannot give it."""
         return self._covariance(L0 + j, 3)
 
     def seen_covariance(self, j: int, k: int) -> Floats:
         """Return the covariance (3, 3), m^2, of L(j) in the frame of X(k), as in `marginals.seen_covariances`.
 
-        It is NaN if the graph lacks it. It takes about 1 ms for a keyframe near the root, such as the newest, and about
-        100 ms for other keyframes.
+        It is NaN if iSAM2 cannot give it. A call takes about 1 ms for a keyframe near the root, such as the newest, and
+        about 100 ms for other keyframes.
         """
         try:
             joint = self._isam.jointMarginalCovariance([X0 + k, L0 + j])
@@ -108,7 +108,7 @@ class IncrementalGraph(GrowingGraph):
         return in_camera(joint, k, j, self.pose(k), self.points(np.array([j]))[0])
 
     def save(self) -> tuple[FactorStore, Variables]:
-        """Return a copy of the factors and variables for `restore`."""
+        """Return a copy of the factors and variables, which `restore` takes."""
         self.refresh()
         return self._store.copy(), self._at.copy()
 
@@ -123,7 +123,7 @@ class IncrementalGraph(GrowingGraph):
         """Optimise all variables by Levenberg-Marquardt from the current estimate, and rebuild iSAM2 there.
 
         It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is
-        not finite, or if nothing holds some variable. After a SolveError the graph is unchanged.
+        not finite, or if no factor holds some variable. After a SolveError the graph is unchanged.
         """
         self.refresh()
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
@@ -138,7 +138,7 @@ class IncrementalGraph(GrowingGraph):
             self._rescue()
 
     def rebuild_in_slices(self, order: Ints) -> None:
-        """Start a rebuild that runs one slice per call of `continue_rebuild`. Until its end the old graph stays in use.
+        """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end the old graph stays in use.
 
         A second call before the end rebuilds at once, because frequent changes must not postpone the end for ever.
         order: (K,) all keyframes. The keyframe at the start of a motion comes before the one at its end.
@@ -184,12 +184,12 @@ class IncrementalGraph(GrowingGraph):
             self._rescue()
 
     def _layout(self, coming: Ints) -> dict[int, int]:
-        """Return the group of each key to eliminate late. A higher group is eliminated later.
+        """Return a group number for each key that is eliminated late. A higher group is eliminated later.
 
-        The newest keyframe X(k) and the landmarks that it observes make the root. The coming landmarks make the clique below
-        the root. GTSAM merges a clique into its parent if it involves all variables of the parent. The cliques below these
-        two are dense, so each of the two gets a pose that no clique below it involves. The root has X(k), which motions tie
-        to X(k-1) only. The clique of the coming landmarks has X(k-1), which motions tie to X(k-2).
+        The newest keyframe X(k) and the landmarks that it observes make the root. The landmarks `coming` make the clique
+        below the root. GTSAM merges a clique into its parent if the clique involves all variables of the parent. The cliques
+        below these two are dense and would be merged. So each of the two gets a pose that no clique below it involves. The
+        root has X(k), which motions tie to X(k-1) only. The clique of `coming` has X(k-1), which motions tie to X(k-2).
         """
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
@@ -226,7 +226,7 @@ class IncrementalGraph(GrowingGraph):
         self._clear()
 
     def _rescue(self) -> None:
-        """Rebuild iSAM2 after an exception. Add priors on landmarks, then on poses, until the graph is determined."""
+        """Rebuild iSAM2 after an exception. If the graph is indeterminate, add priors on landmarks, then also on poses."""
         self.rebuilds += 1
         self._stale = False
         loose = [point_prior(j, point, HELD) for j, point in self._at.points.items()]

@@ -1,4 +1,4 @@
-"""Rebuild a large iSAM2 graph in slices, while the old graph stays in use, so that no frame waits for the whole rebuild."""
+"""Rebuild a large iSAM2 graph in slices, while the old graph stays in use, so that no image waits for the whole rebuild."""
 
 from collections.abc import Mapping
 
@@ -10,8 +10,8 @@ from objslam.graph.factor_store import FactorStore, Stored
 from objslam.graph.variables import LETTER, X0, Variables
 
 _RELINEARISE = (0.02, 0.05)
-"""The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact.
-They were chosen below a change that affects a bearing noticeably."""
+"""The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact. A
+change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
 """The number of updates between two automatic relinearisations. It is so large that only the caller asks for one, when it
 has time. A smaller number would relinearise without a request."""
@@ -37,16 +37,17 @@ def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
 class IncrementalRebuild:
     """A new iSAM2 that gets the stored factors keyframe by keyframe, and the later additions at the end.
 
-    order: keyframes. The keyframe at the start of a motion comes before the one at its end. variables: the linearisation
-    points. isam: the graph so far. new, later: keys of variables and factors that were added after the start.
+    order: the keyframes in the order of adding. The keyframe at the start of a motion comes before the one at its end.
+    variables: the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after the start
+    of the rebuild. later: the factors that came after it.
     """
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:
         self.isam = new_isam(variables.others)
         self._variables, self._order = variables, order
-        self._at: list[list[Stored]] = [[] for _ in order]  # by their last keyframe in the order
-        self._alone: dict[int, list[Stored]] = {}  # on one variable, no keyframe
-        self._last: list[Stored] = []  # on several variables, no keyframe
+        self._at: list[list[Stored]] = [[] for _ in order]  # factors by their last keyframe in the order
+        self._alone: dict[int, list[Stored]] = {}  # factors on a single variable that is no keyframe
+        self._last: list[Stored] = []  # factors on several variables without a keyframe
         place = {X0 + k: i for i, k in enumerate(order)}
         for stored in store.kinds.values():
             for one in stored.values():
@@ -68,7 +69,7 @@ class IncrementalRebuild:
         return self._done >= len(self._order)
 
     def step(self, keyframes: int) -> None:
-        """Add the next keyframes, by number. RuntimeError if their graph is indeterminate."""
+        """Add the next `keyframes` keyframes and their factors. RuntimeError if the graph is indeterminate."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         begin, self._done = self._done, self._done + keyframes
         for k, here in zip(self._order[begin : self._done], self._at[begin : self._done], strict=True):
@@ -78,7 +79,7 @@ class IncrementalRebuild:
         self.isam.update(graph, values)
 
     def finish(self, variables: Variables) -> None:
-        """Add the later variables and factors, linearised at `variables`. RuntimeError if the graph is indeterminate."""
+        """Add the later variables at their values in `variables`, and all other factors. RuntimeError if indeterminate."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key in self._alone:
             self._bring(key, graph, values)
@@ -96,7 +97,7 @@ class IncrementalRebuild:
             graph.push_back(factor)
 
     def _bring(self, key: int, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Add a variable, unless it is in the graph, and the factors on it alone."""
+        """Add a variable and the factors on it alone, unless the variable is in the graph already."""
         if key in self._there:
             return
         self._there.add(key)

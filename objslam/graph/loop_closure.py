@@ -1,4 +1,4 @@
-"""Close loops during initialisation: find recent landmarks that are also old landmarks, and correct the path."""
+"""Close loops during initialisation: find recent landmarks that are the same as old landmarks, and correct the path."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -14,18 +14,19 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The number of past epochs, latest first, in which a loop is searched. A larger value is slower and closes longer loops."""
+"""The number of past epochs, latest first, in which a loop is searched. An epoch is `_EPOCH` successive keyframes. A larger
+number is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
-"""The factors on the assumed drift with which a loop is searched, because wheels slip more than a Gaussian allows. Larger
-values find loops after a slip, and more wrong candidates."""
+"""The factors that multiply the standard deviations of the drift in the search for a loop, because wheels slip more than a
+Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The number of keyframes in an epoch. One keyframe represents the epoch. A larger number is faster. It also makes the drift
-since the epoch less exact."""
+"""The number of keyframes in an epoch. The drift since an epoch is computed for one of its keyframes. So a larger number is
+faster and less exact."""
 
 
 @dataclass
 class Landmarks:
-    """Landmarks: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe with an observation (N,)."""
+    """A table of landmarks: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe that saw it (N,)."""
 
     position: Floats
     covariance: Floats
@@ -45,9 +46,10 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Closure:
-    """A loop: the recent landmarks now (P,) are the old landmarks before (P,).
+    """A loop: recent landmarks that are the same as old landmarks.
 
-    correction: (4, 4) for the current poses. evidence: log odds.
+    correction: (4, 4) the motion in map that corrects the current poses. now: (P,) the recent landmarks. before: (P,) the
+    old landmark that each one is. evidence: log odds of the loop.
     """
 
     correction: Floats
@@ -69,8 +71,8 @@ def find_closure(
 ) -> Closure | None:
     """Return the loop with the most evidence, or None if no loop is certain.
 
-    The search has two cases. After a long drift, the active landmarks (N,) match landmarks without recent observations.
-    After a slip or a push, the landmarks born since then match all others.
+    The search has two cases. After a long drift, landmarks with recent observations (`active`, (N,)) match the others. After
+    a slip or a push, the landmarks that were found since then match all others.
     """
     together = _seen_together(rays, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
@@ -102,7 +104,7 @@ def find_closure(
 
 
 def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
-    """Return whether two landmarks (N, N) were observed in the same keyframe."""
+    """Return for each pair of landmarks (N, N) whether some keyframe observed both."""
     from scipy.sparse import csr_array
 
     held = np.flatnonzero(owner >= 0)
@@ -112,9 +114,9 @@ def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
 
 
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
-    """Return covariances (3, 3) of x, y, yaw of camera `now` relative to the anchor keyframes, along the axes of map.
+    """Return covariances (3, 3) of keyframe `now` relative to each anchor, for x, y and yaw along the axes of map.
 
-    Each anchor before `now` gives one covariance for each factor in `_SLIPS`.
+    anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
@@ -130,7 +132,11 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
 
 
 def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
-    """Spread a correction (4, 4) over the keyframes begin to end of a path (K, 4, 4), in proportion to the drift (K,)."""
+    """Return a path (K, 4, 4) with a correction (4, 4) spread over the keyframes from `begin` to `end`.
+
+    drift: (K,) accumulated along the path. The share of the correction that a keyframe gets is the share of the drift
+    between `begin` and `end` that has gathered there. Earlier keyframes get nothing. Later ones get all of it.
+    """
     gathered = drift - drift[begin]
     share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)
     share[:begin] = 0.0

@@ -1,4 +1,4 @@
-"""Compute marginal covariances of landmarks, also if the graph does not determine all landmarks."""
+"""Compute marginal covariances of landmarks, even if the graph does not determine all of them."""
 
 import gtsam
 import numpy as np
@@ -11,8 +11,8 @@ from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
-"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger value holds less, until the linear
-system is indeterminate. A landmark that only this prior holds counts as undetermined."""
+"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger value holds them less. With too large
+a value, the linear system is indeterminate. A landmark that only this prior holds counts as undetermined."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
@@ -42,10 +42,11 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 def seen_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, witnesses: Ints, ledger: Ledger
 ) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of landmarks (n,), each in the frame of its witness, a keyframe (n,).
+    """Return the covariances (n, 3, 3), m^2, of landmarks (n,). Each is relative to one keyframe, its witness (n,).
 
-    The uncertainty of the camera pose is left out. Far from the start of a map by odometry, it is nearly all of a landmark's
-    own covariance. If the linear system is indeterminate, the ledger gets a warning, and the result is NaN.
+    A covariance is in the camera frame of the witness, without the uncertainty of this camera's pose. Far from the start of
+    a map by odometry, nearly all uncertainty of a landmark in map is that of the pose. If the linear system is
+    indeterminate, the ledger gets a warning, and the remaining covariances are NaN.
     """
     covariance = np.full((len(landmarks), 3, 3), np.nan)
     if len(landmarks) == 0:

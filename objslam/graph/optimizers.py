@@ -20,7 +20,7 @@ OnIteration = Callable[[float, gtsam.Values], None]
 class Optimum:
     """The result of an optimisation. SolveError if its cost is not finite.
 
-    weights: (F,) one for each factor of the graph, or None unless GNC was used.
+    weights: (F,) the weight of each factor of the graph by GNC. Other optimisers give None.
     """
 
     values: gtsam.Values
@@ -109,7 +109,7 @@ def graduated(
 
 
 def indeterminate(error: RuntimeError) -> SolveError:
-    """Return the error for an exception of GTSAM. It names the undetermined variable if GTSAM names it."""
+    """Return a SolveError that explains an exception of GTSAM. It names the undetermined variable if GTSAM does."""
     reason = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
     return SolveError(
         f"the factor graph has no single solution: {reason.rstrip('.')}",

@@ -16,21 +16,21 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""The number of neighbours in time on each side of a rejected ray, and the share of rejected rays among them above which the
-poses are wrong. A larger share restores fewer rays. They were chosen so that a few false boxes in a row restore none."""
+"""A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is
+rejected too. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore none."""
 _ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _SURE = 0.95
-"""The share of inliers among an object's rays below which it is triangulated again. A larger share is slower, and finds more
-objects at wrong positions."""
+"""The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
+corrects more objects at wrong positions."""
 _FEWEST = 6
-"""The least number of rays whose median gives the noise of an object. An object with fewer rays has the assumed noise. A
+"""The least number of rays from which the noise of an object is measured. An object with fewer rays has the nominal noise. A
 larger number rejects more rays of noisy objects. A live session has no such limit."""
 
 
 @dataclass(frozen=True)
 class JointSolution:
-    """A joint solution: map_T_camera (K, 4, 4), positions (N, 3), and used (R,), which is True for inliers."""
+    """A solution for poses and objects. map_T_camera: (K, 4, 4). positions: (N, 3) m. used: (R,) True for inliers."""
 
     map_T_camera: Floats
     positions: Floats
@@ -77,7 +77,7 @@ def reject_outliers(
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """Return the rejected rays (R,) whose neighbours in time are mostly rejected, as if the poses were wrong."""
+    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too, as if poses were wrong."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)
@@ -128,7 +128,7 @@ def second_opinion(
 
 
 def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
-    """Return which rays (R,) agree with their object, relative to the noise of its inliers so far (or of all its rays)."""
+    """Return which rays (R,) agree with their object, given the noise of its inliers (at first, of all its rays)."""
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
     origins, directions = (a[placed] for a in rays.in_map(map_T_camera))
@@ -141,5 +141,8 @@ def _supported(rays: Rays, association: Association, map_T_camera: Floats, posit
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 by which whitened residuals (R,) exceed the assumed noise, squared, for covariances."""
+    """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays exceed their nominal noise.
+
+    It is the squared ratio of the measured to the nominal noise. residual: (R,) whitened by the nominal noise.
+    """
     return noise_factors(residual, landmark, count, _FEWEST) ** 2

@@ -1,4 +1,4 @@
-"""Compute the cost of poses and landmarks for comparing solutions with different inliers, and the information of rays."""
+"""Compute the cost of a solution, for a comparison with solutions that have other inliers, and the information of rays."""
 
 import numpy as np
 
@@ -15,10 +15,10 @@ lets rays miss nearby landmarks by more."""
 def truncated_cost(
     rays: Rays, owner: Ints, positions: Floats, map_T_camera: Floats, motion: Floats, covariance: Floats
 ) -> float:
-    """Return the sum of squared deviations of the rays and of the odometry. A ray counts `STRAY_RAY` at most.
+    """Return the sum of the squared deviations of the rays and of the odometry. A ray counts `STRAY_RAY` at most.
 
     owner: (R,) index into positions (N, 3), or -1 for a ray that does not count. map_T_camera: (K, 4, 4) the first K
-    keyframes. Later rays and motions do not count. motion (M, 4, 4) and covariance (M, 6, 6): by odometry.
+    keyframes. Later rays and motions do not count. motion, covariance: (M, 4, 4), (M, 6, 6) camera motions by odometry.
     """
     held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
     some = rays.take(held)
@@ -32,7 +32,7 @@ def truncated_cost(
 
 
 def ray_information(directions: Floats, across: Floats, along: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the information (N, 3, 3), m^-2, of rays about the positions of `count` landmarks.
+    """Return the information (N, 3, 3), m^-2, that rays give about the position of each of `count` landmarks.
 
     directions: (R, 3) unit, in map. across, along: (R,) m^-2, the information across and along each ray. The information
     along a ray without a range is 0. landmark: (R,) index of the ray's landmark.

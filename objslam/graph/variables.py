@@ -21,7 +21,7 @@ LETTER = 56
 
 
 def make_values(map_T_camera: Floats, positions: Floats, landmarks: Ints) -> gtsam.Values:
-    """Return values with X(0..K-1) at map_T_camera (K, 4, 4) and L(j) at positions[j] for each j of landmarks."""
+    """Return values with X(0) to X(K-1) at map_T_camera (K, 4, 4), and L(j) at positions[j] for each j in landmarks."""
     values = gtsam.Values()
     for k, pose in enumerate(map_T_camera):
         values.insert(X0 + k, gtsam.Pose3(pose))
@@ -41,7 +41,7 @@ def read_points(values: gtsam.Values) -> Floats:
 
 
 def with_points(positions: Floats, landmarks: Ints, values: gtsam.Values) -> Floats:
-    """Return a copy of the positions (N, 3) with the landmarks (n,) at their points in the values."""
+    """Return a copy of positions (N, 3) in which the landmarks (n,) have their points from the values."""
     placed = positions.copy()
     placed[landmarks] = _points(values, L0 + landmarks)
     return placed
@@ -86,7 +86,7 @@ class Variables:
 
 
 def _keys(values: gtsam.Values, first: int) -> Ints:
-    """Return the keys (n,) with the letter of the key `first`, in their order."""
+    """Return the keys (n,) that have the same letter as the key `first`, in ascending order."""
     keys = np.array(values.keys(), dtype=np.int64)
     return keys[keys >> LETTER == first >> LETTER]
 
@@ -105,5 +105,5 @@ def _points(values: gtsam.Values, keys: Ints) -> Floats:
 
 
 def _at(values: gtsam.Values, key: int, like: object) -> object:
-    """Read a variable with the type of another."""
+    """Return the variable with this key, which has the same type as the variable `like`."""
     return values.atPoint3(key) if isinstance(like, np.ndarray) else getattr(values, f"at{type(like).__name__}")(key)

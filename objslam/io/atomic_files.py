@@ -14,7 +14,7 @@ from objslam.errors import OutputError
 _STAGING = ".objslam-staging"
 _SWAPPING = "swapping"  # This file in the staging folder marks that the replacement of the old files has started.
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
-"""The ignored error codes of network file systems that cannot lock or sync a folder."""
+"""The error codes of network file systems that cannot lock or sync a folder. They are ignored."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class FileSet:
     pattern: str  # A glob pattern for files whose names vary.
 
     def names(self, folder: Path) -> tuple[str, ...]:
-        """Return all names of the set, with the files in the folder that match the pattern. The seal is first."""
+        """Return all names of the set: the seal, then `others`, then the files in the folder that match `pattern`."""
         return (self.seal, *self.others, *sorted(file.name for file in folder.glob(self.pattern)))
 
 
@@ -39,9 +39,9 @@ def try_folder(folder: Path, files: FileSet) -> None:
 
 
 def replace_files(folder: Path, files: FileSet, writers: dict[str, Callable[[Path], object]]) -> tuple[str, ...]:
-    """Replace a set of files in a folder, and return the names of the deleted files without replacement.
+    """Replace a set of files in a folder. Return the names of the old files that have no replacement.
 
-    `writers` has the function that writes each file, by file name. New files are first written to a staging folder. Then
+    writers: the function that writes each file, by file name. New files are first written to a staging folder. Then
     all files of the old set are deleted. Then the new files are renamed, the seal last. A killed process therefore never
     leaves a half-written file, a mix of two sets, or a seal in an incomplete set. Other files in the folder are not changed.
     Raises OutputError for a disk error, or if another run is writing to the folder.
@@ -87,7 +87,7 @@ def encode(text: str) -> bytes:
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """Convert OSError to OutputError. The error names the failing file, or always `path` if `only` is set."""
+    """Convert OSError to OutputError. The error names the failing file, or `path` if it is unknown or `only` is set."""
     try:
         yield
     except OSError as error:
@@ -110,7 +110,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 raise
-        if staging.exists():  # A killed run left the folder, because the lock is free.
+        if staging.exists():  # The lock is free, so a killed run left this folder.
             if is_cut_short(folder, files):
                 for name in files.names(folder):
                     (folder / name).unlink(missing_ok=True)
@@ -126,7 +126,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
 
 
 def _swap(staging: Path, folder: Path, files: FileSet) -> tuple[str, ...]:
-    """Replace the old files by the staged files. The order prevents a mix of two sets after a kill."""
+    """Replace the old files by the staged files. In this order, a killed process never leaves a mix of two sets."""
     old = files.names(folder)
     removed = tuple(name for name in old if (folder / name).exists() and not (staging / name).exists())
     _write(staging / _SWAPPING, b"")

@@ -1,4 +1,4 @@
-"""Collect boxes frame by frame and check them together."""
+"""Collect boxes image by image, and check them together at the end."""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +11,8 @@ from objslam.io.text import drop_rows, in_order
 
 @dataclass
 class BoxCollector:
-    """Frames and boxes with the place (file:line) of each. An unknown depth is NaN, and an unknown track id is -1."""
+    """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1.
+    Each frame and box has a place, such as file:line. The ledger shows the place if the frame or box is dropped."""
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)
@@ -41,7 +42,8 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """Return the valid detections. Late frames, invalid boxes and depths that are not above zero are counted."""
+        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted.
+        A depth that is not above zero becomes unknown and is counted."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)

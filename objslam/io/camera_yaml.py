@@ -1,6 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes, which keep line numbers. Numbers such as 1e-05, which YAML 1.1 reads as text, stay numbers.
+The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a number, although YAML 1.1 reads it as text.
 """
 
 import math
@@ -19,13 +19,13 @@ from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
 _CAMERAS = "cameras"
-_MAX_SIDE = 1 << 16  # The limit of width and height, px. A larger image counts as an error in the file.
+_MAX_SIDE = 1 << 16  # The limit of width and height, px. A larger value counts as an error in the file.
 _Mapping = dict[str, yaml.Node]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera of a file. placed: whether the file contains base_T_camera. Otherwise, base_T_camera is the identity."""
+    """A camera from a file. placed: whether the file has base_T_camera. If not, the camera has the identity."""
 
     camera: Camera
     placed: bool
@@ -36,14 +36,15 @@ def read_camera(
 ) -> Camera:
     """Read a camera file. Raises LogError with the line of an invalid value.
 
-    name: the camera name. The default is camera_name in the file, or "camera". place_needed: whether base_T_camera is
-    required. Otherwise, the default is the identity. depth_scale: the default of depth_scale in the file, units per metre.
+    name: the camera name. None takes camera_name from the file, or "camera" if the file has no name.
+    place_needed: whether base_T_camera must be in the file. If it need not, a missing base_T_camera is the identity.
+    depth_scale: the units per metre of depth images, used if the file has no depth_scale.
     """
     return _read(path, _load(path, read_bytes(path), "the file"), ledger, name, place_needed, depth_scale).camera
 
 
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
-    """Read one camera, or several cameras by name under the key `cameras`. Raises LogError with the line of an error."""
+    """Read one camera, or several named cameras under the key `cameras`. Raises LogError with the line of an error."""
     top = _load(path, read_bytes(path), "the file")
     if _CAMERAS not in top:
         return (_read(path, top, ledger),)
@@ -79,7 +80,7 @@ def _read(
 
 
 def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
-    """Parse a camera from text with the keys of a camera file. Raises LogError, which names `place` as the file."""
+    """Parse a camera from a text in the format of a camera file. Raises LogError, which names `place` as the file."""
     path = Path(place)
     return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
 
@@ -107,7 +108,7 @@ def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -
 
 
 def _load(path: Path, text: bytes, what: str) -> _Mapping:
-    """Return the values of a YAML text by key. Errors name the whole text `what`."""
+    """Return the values of a YAML text by key. `what` is the name of the text in error messages."""
     try:
         node = yaml.compose(text.decode("utf-8-sig"), Loader=yaml.SafeLoader)
     except UnicodeDecodeError as error:
@@ -169,7 +170,8 @@ def _size(path: Path, top: _Mapping, key: str) -> int:
 
 
 def _numbers(path: Path, node: yaml.Node, what: str) -> tuple[Floats, yaml.Node]:
-    """Return the numbers of a mapping {rows, cols, data}, a flat list or a list of rows, and the node of the list."""
+    """Return the numbers of a node, and the node of the list that has them.
+    The given node is a mapping {rows, cols, data}, a flat list or a list of rows."""
     if isinstance(node, yaml.MappingNode):
         fields = _mapping(path, node, what)
         values, data = _numbers(path, _get(path, fields, "data", f"{what}.", node), f"{what}.data")
@@ -205,7 +207,7 @@ def _distortion(path: Path, top: _Mapping) -> tuple[DistortionModel, Floats]:
     coefficients = _get(path, top, "distortion_coefficients")
     empty = isinstance(coefficients, yaml.ScalarNode) and coefficients.value in ("", "~", "null")
     values, data = (np.zeros(0), coefficients) if empty else _numbers(path, coefficients, "distortion_coefficients")
-    if given in ("", "plumb_bob") and not len(values):  # Simulators write a camera without distortion in this form.
+    if given in ("", "plumb_bob") and not len(values):  # Simulators write this form for a camera without distortion.
         return "plumb_bob", np.zeros(5)
     model = next((known for known in get_args(DistortionModel) if known == given), None)
     if model is None:

@@ -1,4 +1,4 @@
-"""Read and write detections.jsonl, which has one camera frame per line as JSON."""
+"""Read and write detections.jsonl, which has one line of JSON per camera frame. Here, a frame is an image with its boxes."""
 
 import json
 import math
@@ -20,9 +20,9 @@ class Malformed(ValueError):
 
 
 def read_detections(path: Path, ledger: Ledger) -> Detections:
-    """Read a detections file: pixels of the raw image, timestamps in s, depths z along the optical axis in m.
+    """Read a detections file. Boxes are in px of the raw image, timestamps in s, and depths z along the optical axis in m.
 
-    Malformed lines, late frames and invalid boxes are dropped and counted. Raises LogError if no frame is valid.
+    Malformed lines, frames out of time order and invalid boxes are dropped and counted. Raises LogError if no frame is left.
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
@@ -35,7 +35,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
             ledger.drop(f"detection frame malformed: {malformed}", where=place)
     if not collector.stamps:
         state = f"none of its {len(lines)} lines is a detection frame" if lines else "no detection frame in it"
-        raise LogError(state, where=str(path), hint="take the file away to run a detector on rgb.txt")
+        raise LogError(state, where=str(path), hint="remove this file, and run a detector on rgb.txt (--detector)")
     return replace(collector.checked(ledger), whole=whole)
 
 
@@ -78,7 +78,8 @@ def read_stamp(message: dict[str, Any]) -> float:
 
 
 def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
-    """Add a frame with its boxes, and return whether its boxes are whole. Raises Malformed if the frame is invalid."""
+    """Add a frame with its boxes. Return whether no box is cut off by the image edge (the key "whole" of the frame).
+    Raises Malformed if the frame is invalid."""
     stamp = read_stamp(frame)
     boxes = _list(frame, "boxes")
     if len(boxes) > MAX_BOXES:
@@ -124,7 +125,7 @@ def _depth(value: Any) -> float:
     if value is None:
         return math.nan
     (depth,) = read_numbers([value], "depths")
-    return 0.0 if math.isnan(depth) else depth  # A NaN in the file is counted like a depth of zero.
+    return 0.0 if math.isnan(depth) else depth  # A NaN in the file is counted as an invalid depth, like zero.
 
 
 def _track_id(value: Any) -> int:

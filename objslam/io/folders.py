@@ -7,7 +7,7 @@ from pathlib import Path
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """Delete the folder `path` and its parents after an error, if the block created them and left them empty."""
+    """After an error in the block, delete those of `path` and its parents that the block created and left empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

@@ -1,4 +1,4 @@
-"""Image lists in TUM format, rgb.txt and depth.txt, with "stamp relative/path" per line and '#' comments."""
+"""Image lists in TUM format (rgb.txt, depth.txt). Each line is "stamp relative/path" or a comment after '#'."""
 
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from objslam.io.text import drop_rows, in_order, parse_numbers, read_lines
 
 
 def read_images(path: Path, ledger: Ledger) -> Images:
-    """Read an image list without opening the images. Raises LogError if no line is valid.
+    """Read an image list without opening the images. Raises LogError if no line is left.
 
-    Malformed lines, late timestamps, missing files and files outside the folder of the list are dropped and counted.
+    A line is dropped and counted if it is malformed or out of time order, or if its file is missing or outside the folder.
     """
     inside = Inside(path.parent)
     name = path.name

@@ -1,4 +1,4 @@
-"""Read the stated size of a compressed image from its header without decoding the image."""
+"""Read the size of an image from the header of its file, without decoding the image."""
 
 import struct
 from collections.abc import Callable
@@ -10,7 +10,8 @@ _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
-    """Return stated width and height, px, of an image file, None for an unknown format. Raises ValueError for damage."""
+    """Return the width and height, px, that an image file states in its header. Return None for an unknown format.
+    Raises ValueError if the header is damaged or cut off."""
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:

@@ -14,7 +14,7 @@ MAX_PIXELS = 1 << 27  # The limit of pixels per image, more than any robot camer
 
 
 def decode_colour(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the pixels (H, W, 3), uint8, BGR, of an image file without EXIF rotation, None if it cannot be decoded."""
+    """Return the pixels (H, W, 3), uint8, BGR, of an image file, None if it cannot be decoded. EXIF rotation is ignored."""
     import cv2
 
     return _decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -23,7 +23,7 @@ class _Malformed(OutputError):
 
 
 def dump_objects(objects: ObjectMap) -> str:
-    """Return the text of objects.json for a map. `read_objects` restores all bits. NaN becomes null for valid JSON."""
+    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. NaN becomes null."""
     return _dump([_entry(o) for o in objects.objects], objects.frame)
 
 
@@ -48,7 +48,7 @@ def parse_objects(data: dict[str, Any]) -> ObjectMap:
 
 
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
-    """Read a ground truth file, an objects.json with at least id, label and position (m, in map) of each object.
+    """Read a ground truth file, an objects.json in which each object has at least id, label and position (m, in map).
 
     Unresolved objects in the map of a run are skipped. A malformed file raises `error` with the file and the object.
     """
@@ -62,7 +62,7 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
 
 
 def _dump(entries: list[dict[str, Any]], frame: str) -> str:
-    """Return the text of the file, with one line per object for line-based comparison of two files."""
+    """Return the text of the file. Each object is on its own line, so that two files can be compared line by line."""
     head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": ['
     lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
     return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
@@ -191,7 +191,7 @@ def _number(value: Any, name: str, null: bool = False) -> float:
     if value is None and null:
         return math.nan
     good = isinstance(value, int | float) and not isinstance(value, bool)
-    # The comparison is before float(), because an integer can exceed the largest float.
+    # This check precedes float(), because an integer can exceed the largest float.
     if not good or not -sys.float_info.max <= value <= sys.float_info.max:
         raise _Malformed(f"{name} must be a finite number, got {_short(value)}")
     return float(value)

@@ -1,4 +1,4 @@
-"""Read and write motions.parquet, the odometry between the poses of a result, for exports and other optimisers."""
+"""Read and write motions.parquet, the odometry between the poses of a result. Exports and other optimisers use it."""
 
 import io
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.errors import OutputError
 
-_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # The numbers per row of each column.
+_COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # How many numbers each column has in a row.
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Motions:
     before: Floats  # (M,) timestamp of the first pose, s.
     after: Floats  # (M,) timestamp of the second pose, s.
     motion: Floats  # (M, 4, 4) before_T_after.
-    covariance: Floats  # (M, 6, 6), translation (m), then rotation (rad), in the frame of the second pose.
+    covariance: Floats  # (M, 6, 6) of translation (m), then rotation (rad), in the base frame at `after`.
 
 
 def dump_motions(motions: Motions) -> bytes:

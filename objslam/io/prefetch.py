@@ -7,11 +7,11 @@ from typing import TypeVar
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
-_THREADS = 2  # The number of threads. A single thread decodes PNG images slower than a network on a GPU runs.
+_THREADS = 2  # The number of threads. A single thread decodes PNG images more slowly than a GPU runs a network on them.
 
 
 def ahead(work: Callable[[_In], _Out], items: Iterable[_In], depth: int) -> Iterator[_Out]:
-    """Yield work(item) for each item in order. Threads process at most `depth` items in advance."""
+    """Yield work(item) for each item in order. Threads process up to `depth` items before the caller asks for them."""
     waiting: deque[Future[_Out]] = deque()
     pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="objslam-images")
     try:

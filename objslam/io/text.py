@@ -16,17 +16,17 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
-_PLACES = 3  # The number of places that a ledger keeps per reason.
+_PLACES = 3  # How many places (file:line) a ledger keeps per drop reason.
 _MAX_UNPACKED = 1 << 30  # The size limit of an unpacked file, bytes, enough for a day of poses at 200 Hz.
 
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers of a text file."""
+    """The valid rows of a text file of numbers."""
 
     values: Floats  # (N, C), finite.
     lines: Ints  # (N,) line numbers, from 1.
-    rows: Ints  # (N,) row numbers, from 0. Dropped rows count too, so that rows of several files can be matched by number.
+    rows: Ints  # (N,) row numbers, from 0. They also count dropped rows, so rows of several files can be matched by number.
 
 
 @contextmanager
@@ -60,12 +60,12 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_lines(path: Path, ledger: Ledger) -> list[tuple[int, str]]:
-    """Return line number, from 1, and stripped text of all lines of a UTF-8 file except empty lines and '#' comments."""
+    """Return number, from 1, and stripped text of each line of a UTF-8 file. Empty lines and '#' comments are left out."""
     return split_lines(read_bytes(path), str(path), ledger)
 
 
 def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]]:
-    """Split bytes as `read_lines` does. Lines that are not UTF-8 are dropped and counted at `place`."""
+    """Split bytes as `read_lines` does. Lines that are not UTF-8 are dropped and counted. `place` is the file name."""
     damaged = False
     try:
         text = data.decode("utf-8-sig")
@@ -83,9 +83,10 @@ def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]
 
 
 def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
-    """Read a text file of `columns` numbers per row, separated by white space. Raises LogError if no row is valid.
+    """Read a text file in which each line has `columns` numbers, separated by white space. Raises LogError if none is valid.
 
-    Rows with a wrong number of columns or a value that is not finite are dropped and counted as `what` lines.
+    Lines with another number of columns or a value that is not finite are dropped and counted. `what` is the name of such a
+    line in the drop reason, such as "pose".
     """
     values, places = [], []
     numbered = read_lines(path, ledger)
@@ -106,13 +107,13 @@ def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
 
 
 def select(table: Table, keep: Bools, reason: str, path: Path, ledger: Ledger) -> Table:
-    """Return the rows of a table that `keep` (N,) marks, and count the other rows as drops for `reason`."""
+    """Return the rows of a table that `keep` (N,) marks. Count the other rows as drops under `reason`."""
     count_drops(reason, int((~keep).sum()), (f"{path}:{line}" for line in table.lines[~keep]), ledger)
     return Table(table.values[keep], table.lines[keep], table.rows[keep])
 
 
 def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) -> None:
-    """Count `count` drops for `reason`, with the first of their places."""
+    """Add `count` drops under `reason` to the ledger, with the first few of their `places` (file:line)."""
     first = list(islice(places, min(count, _PLACES)))
     for place in first:
         ledger.drop(reason, where=place)
@@ -120,13 +121,13 @@ def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) 
 
 
 def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
-    """Count the rows that `bad` (N,) marks as drops for `reason`. `places` has the place of each row."""
+    """Count as drops, under `reason`, the rows that `bad` (N,) marks. `places` has the place (file:line) of each row."""
     rows = np.flatnonzero(bad).tolist()
     count_drops(reason, len(rows), (places[i] for i in rows), ledger)
 
 
 def parse_numbers(fields: list[str]) -> list[float] | None:
-    """Return the fields as numbers, None if one is invalid. Python-only numbers (1_000, other digits) are invalid."""
+    """Return the fields as numbers, None if one is invalid. Forms that only Python reads (1_000, non-ASCII) are invalid."""
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
@@ -136,11 +137,11 @@ def parse_numbers(fields: list[str]) -> list[float] | None:
 
 
 def in_order(stamps: Floats, repeats: bool = False) -> Bools:
-    """Return which timestamps (N,) are later than all previous timestamps, (N,).
+    """Return the mask (N,) of the timestamps (N,) that are later than all previous timestamps.
 
     After a backward jump of the clock, timestamps are rejected until they pass the latest timestamp. A single outlier in
-    the future is rejected if the next two timestamps continue from the timestamp before it. With `repeats`, a timestamp may
-    equal its predecessor.
+    the future is rejected if the next two timestamps continue from the timestamp before the outlier. With `repeats`, a
+    timestamp may equal the latest timestamp.
     """
     before = np.concatenate([[-np.inf], stamps])[:-1]
     alone = np.zeros(len(stamps), dtype=bool)

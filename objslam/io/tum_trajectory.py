@@ -1,4 +1,4 @@
-"""Trajectories in TUM format, with "stamp tx ty tz qx qy qz qw" per line and '#' comments."""
+"""Trajectories in TUM format. Each line is "stamp tx ty tz qx qy qz qw" or a comment after '#'."""
 
 from pathlib import Path
 
@@ -14,15 +14,15 @@ _HEADER = "# stamp tx ty tz qx qy qz qw\n"
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
-    """Read a trajectory file, also with suffix .gz, with timestamps in s, translations in m and quaternions x y z w.
+    """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w.
 
-    Malformed lines, zero quaternions and late timestamps are dropped and counted. Raises LogError if no pose is valid.
+    Malformed lines, zero quaternions and poses out of time order are dropped and counted. Raises LogError if none is left.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
 
 def read_pose_table(path: Path, ledger: Ledger) -> Table:
-    """Read a trajectory file as `read_trajectory` does, and return a table of 8 columns."""
+    """Read a trajectory file as `read_trajectory` does, but return a table with its 8 columns."""
     table = read_table(path, 8, ledger, "pose")
     with np.errstate(over="ignore"):
         length = np.linalg.norm(table.values[:, 4:], axis=1)

@@ -8,11 +8,11 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.sources.journal.records import FrameMessage
 
-_WINDOW = 2000  # The number of updates behind the percentiles. A larger number makes the percentiles follow a change later.
+_WINDOW = 2000  # The newest update times that give the percentiles. With a larger number, they follow a change later.
 
 
 class _Guarded(Ledger):
-    """A ledger that several threads may write."""
+    """A ledger into which several threads may write at the same time."""
 
     def __init__(self, lock: threading.RLock) -> None:
         super().__init__()
@@ -28,7 +28,7 @@ class _Guarded(Ledger):
 
 
 class Counters:
-    """Counters that any thread may change. `ledger` holds the drops with their first few places."""
+    """Counters that any thread may change. `ledger` holds the drops, with the first few places of each reason."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -42,11 +42,11 @@ class Counters:
             self._accepted[kind] += count
 
     def drop(self, reason: str, where: str | None = None, count: int = 1) -> None:
-        """Count dropped messages by their reason."""
+        """Count messages that are dropped for a reason. where: the place of the first one, for reports."""
         self.ledger.drop(reason, count, where)
 
     def drop_frame(self, frame: FrameMessage, reason: str) -> None:
-        """Count a dropped frame and its boxes."""
+        """Count a dropped frame, and count its boxes for the same reason."""
         self.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
         self.drop(reason.replace("frames", "boxes", 1), count=len(frame))
 
@@ -66,7 +66,7 @@ class Counters:
             return dict(self.ledger.dropped)
 
     def update(self) -> tuple[float, float]:
-        """Return the median and the 99th percentile of the recent update times, s; 0 before the first update."""
+        """Return the median and the 99th percentile of the newest update times, s. Both are 0 before the first."""
         with self._lock:
             seconds = np.array(self._seconds)
         return (float(np.median(seconds)), float(np.quantile(seconds, 0.99))) if len(seconds) else (0.0, 0.0)

@@ -8,23 +8,23 @@ from objslam.core.camera import Camera
 
 
 class Sink(Protocol):
-    """Receives messages from any thread. A push returns at once: True if accepted, False if dropped and counted.
+    """Receives messages from any thread. A push returns at once, with False if the message is dropped and counted.
 
     No message raises an error, even if it is not finite, goes back in time or names an unknown camera.
-    The frames are `map`, `odom`, `base`, and the optical frame of each camera, which has the camera's name.
+    The coordinate frames are `map`, `odom`, `base`, and the optical frame of each camera, which has the camera's name.
     """
 
     def push_camera(self, camera: Camera) -> bool:
         """Push a calibrated camera. Its base_T_camera holds until `push_mount` replaces it."""
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6) in the order of ROS, x, y, z, roll, pitch, yaw."""
+        """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6), as in ROS, of x, y, z, roll, pitch, yaw."""
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
         """Push map_T_base (4, 4) of a localisation at a stamp, s. covariance: as in `push_odometry`."""
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
-        """Push base_T_camera (4, 4) of a camera that moves on the robot. It holds from the stamp, s, to the next."""
+        """Push base_T_camera (4, 4) of a camera that moves on the robot. It holds from the stamp, s, to the next mount."""
 
     def push_detections(
         self,
@@ -37,8 +37,8 @@ class Sink(Protocol):
         track_ids: Sequence[int] | None = None,
         whole: bool = False,
     ) -> bool:
-        """Push all boxes of one image. Push an image without a box too, because a missed object is evidence.
+        """Push all boxes of one image. Push images without boxes too, because they show that an expected object is absent.
 
         boxes: (B, 4) raw px. scores: (B,). depths: (B,) z in m, NaN where unknown. track_ids: B ids, -1 where unknown.
-        whole: as in `types.Detections`, True for fiducials, which are used up to the image's edge.
+        whole: as in `types.Detections`. It is True for fiducials, whose boxes are valid up to the edge of the image.
         """

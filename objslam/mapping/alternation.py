@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
-"""The noise (m, rad) of solved poses, as the objects see it. Larger values let an association tolerate larger residuals."""
+"""The noise (m, rad) of solved poses that an association expects. Larger values let it tolerate larger residuals."""
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
 _USUAL = 0.12
@@ -112,7 +112,7 @@ def solve(
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them. Only odometry holds other poses."""
+    """Return the keyframes that have a ray, and the rays with indices into them. Other poses depend on odometry only."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
 

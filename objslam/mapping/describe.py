@@ -21,7 +21,10 @@ from objslam.mapping.alternation import Solution
 
 
 def describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> tuple[ObjectMap, Floats]:
-    """Return the map of the objects, and the residual (R,), rad, of each ray. Counts of rays leave out rejected rays."""
+    """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
+
+    The numbers of rays and frames in the map leave out rejected rays, unless all rays of the object are rejected.
+    """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
     origins, directions = rays.in_map(map_T_camera)
@@ -88,7 +91,7 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Return the content of summary.json. counts: numbers of images, frames and boxes from the driver."""
+    """Return the content of summary.json. counts: how many images, frames and boxes the driver found."""
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))

@@ -1,4 +1,4 @@
-"""Compute the odometry between the poses of a result, for exports and other optimisers."""
+"""Compute the motions by odometry between the poses of a result, for exports and for other optimisers."""
 
 from dataclasses import replace
 
@@ -11,9 +11,9 @@ _TRANSLATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def motions_of(result: RunResult) -> Motions | None:
-    """Return the motions by odometry between the poses of trajectory.txt, or None if the run used no odometry (fixed mode).
+    """Return the motions by odometry between the poses of trajectory.txt. Their covariances have the translation first.
 
-    Their covariances have the translation first.
+    The result is None if the run used no odometry, as in the fixed mode.
     """
     from objslam.graph.factors.odometry import motions
 

@@ -30,23 +30,23 @@ _BLOCK = 6
 """The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
 number is slower. 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""The first capacity of the grid, in blocks. A larger value takes more memory in a small scene. The present value is
-enough for a room. The grid doubles when it is full."""
+"""The number of blocks for which the grid has room at first. A larger number takes more memory in a small scene. The present
+number is enough for a room. The grid doubles its room when it is full."""
 _SPARE = 1024
-"""The number of blocks that stay free. A larger number wastes more memory. Open3D grows by itself if a call touches more
-blocks than are free, and it counts the existing blocks too."""
+"""The number of blocks in the grid that stay free. A larger number wastes more memory. Open3D enlarges the grid by itself if
+one call touches more blocks than are free, and it counts blocks that exist already too."""
 _AHEAD = 4
 """The number of images that are decoded ahead. A larger number takes more memory."""
 _TOUCH = 4
-"""The step (px) at which Open3D samples a depth image for the blocks that a frame touches. It must equal Open3D's own step.
-A larger step drops more images as out of reach."""
+"""The step (px) at which Open3D samples a depth image to find the blocks that the image touches. It must equal Open3D's own
+step. A larger step drops more images as out of reach."""
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image to fuse, its colour image, and the camera pose (4, 4). Without colour, rgb is None."""
+    """A depth image to fuse, its colour image (None without colour), and the camera pose (4, 4)."""
 
     camera: int
     depth: Path
@@ -59,10 +59,10 @@ def reconstruct(
 ) -> Surface | None:
     """Fuse the depth images of a log, at the poses of a path (map_T_base), into a surface.
 
-    Depth images contain z at the pixels of the camera image. The ledger counts frames without a pose, a colour image within
-    20 ms, or a depth in reach, and images that are damaged or not in the camera's size. Blocks beyond
-    reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be imported,
-    the result is None with a warning.
+    Depth images contain z at the pixels of the camera image. The ledger counts the depth images that have no pose, no colour
+    image within 20 ms or no depth in reach. It also counts images that are damaged or do not have the camera's size. Blocks
+    beyond reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be
+    imported, the ledger gets a warning and the result is None.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
@@ -79,7 +79,10 @@ def reconstruct(
 
 
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
-    """Choose every reconstruction.stride-th depth image with a pose, in the order of time, and evenly if over max_frames."""
+    """Choose depth images that have a pose and, if all cameras have colour, a colour image, in the order of time.
+
+    Every reconstruction.stride-th image is chosen. If more than reconstruction.max_frames are left, they are thinned evenly.
+    """
     chosen = settings.reconstruction
     colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)
     shots: list[tuple[float, Shot]] = []
@@ -145,13 +148,13 @@ def _fuse(
 
 @dataclass(frozen=True)
 class Lens:
-    """The undistortion of a camera's images: maps for cv2.remap, or None without distortion."""
+    """The undistortion of a camera's images. maps: the two maps for cv2.remap, or None for a camera without distortion."""
 
     maps: tuple[NDArray[Any], NDArray[Any]] | None
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
-        """Make the maps to a pinhole camera with the same matrix."""
+        """Make the maps that turn the camera's images into those of a pinhole camera with the same matrix."""
         import cv2
 
         fisheye = camera.distortion_model == "equidistant"
@@ -162,7 +165,7 @@ class Lens:
         return cls(make(camera.matrix, camera.distortion, np.eye(3), camera.matrix, size, cv2.CV_16SC2))
 
     def straighten(self, image: NDArray[Any], *, smooth: bool) -> NDArray[Any]:
-        """Undistort an image. smooth: interpolate between pixels, which suits colour and falsifies depth."""
+        """Undistort an image. smooth: whether to interpolate between pixels, which suits colour but falsifies depth."""
         import cv2
 
         if self.maps is None:
@@ -173,9 +176,9 @@ class Lens:
 def load_shot(
     shot: Shot, camera: Camera, lens: Lens, max_depth: float, ledger: Ledger
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Read the undistorted depth (H, W), m, and RGB (H, W, 3) in [0, 1] of a shot. Depth out of reach is 0.
+    """Read the undistorted depth (H, W), m, and the undistorted RGB (H, W, 3) in [0, 1] of a shot. Depth out of reach is 0.
 
-    The depth is None if one of the two images cannot be used. The colour is None without a colour image.
+    Both are None if one of the two images cannot be used. The colour is None if the shot has no colour image.
     """
     raw = read_depth(shot.depth, camera, ledger)
     if raw is None:
@@ -198,9 +201,9 @@ def load_shot(
 
 
 class Grid:
-    """A voxel block grid that grows to reconstruction.max_blocks blocks. A voxel takes 20 bytes (8 without colour).
+    """A voxel block grid that grows up to reconstruction.max_blocks blocks. A voxel takes 20 bytes (8 without colour).
 
-    left_out: how many times a frame touched a block without room.
+    left_out: how many times a depth image touched a new block for which the grid had no room.
     """
 
     def __init__(self, settings: Settings, *, coloured: bool) -> None:
@@ -227,7 +230,7 @@ class Grid:
         return int(self._grid.hashmap().size())
 
     def add(self, depth: NDArray[np.float32], colour: NDArray[np.float32] | None, matrix: Floats, pose: Floats) -> None:
-        """Fuse depth (H, W), m, and colour (H, W, 3) in [0, 1] of a pinhole camera with pose map_T_camera (4, 4)."""
+        """Fuse depth (H, W), m, and colour (H, W, 3) in [0, 1] of a pinhole camera at the pose map_T_camera (4, 4)."""
         tensor, image_of = self._core.Tensor.from_numpy, self._geometry.Image
         images = [image_of(tensor(image)).to(self._device) for image in (depth, colour) if image is not None]
         # Open3D rounds a pixel position down. With half a pixel added, it takes the nearest pixel.
@@ -239,7 +242,7 @@ class Grid:
             self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
 
     def _with_room(self, touched: Any) -> Iterator[Any]:
-        """Yield the touched blocks (M, 3) that exist or have room, in portions that do not make Open3D grow by itself."""
+        """Yield those touched blocks (M, 3) that exist or find room, in portions so small that Open3D does not add room."""
         hashmap = self._grid.hashmap()
 
         def room() -> int:
@@ -258,7 +261,7 @@ class Grid:
             yield touched[self._core.Tensor(kept[start : start + _SPARE], device=self._device)]
 
     def surface(self, min_views: int) -> Surface | None:
-        """Extract the triangles between voxels with at least min_views observations, or None without triangles."""
+        """Return the triangles between voxels that at least `min_views` depth images saw, or None without triangles."""
         if not self.blocks:
             return None
         mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D requires more than its limit

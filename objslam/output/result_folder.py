@@ -29,7 +29,7 @@ from objslam.results.read import load_map
 from objslam.sources.log_folder import resembles_log
 
 _FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
-"""The files that a new result replaces or deletes. The exports of the older result are among them."""
+"""The files that a new result replaces or deletes. They include the exports of the older result."""
 
 
 def prepare_output(out: Path) -> None:
@@ -44,10 +44,10 @@ def prepare_output(out: Path) -> None:
             raise OutputError("the output is a file, not a folder", where=str(out), hint="name a folder with -o")
         if resembles_log(out):
             hint = "name another folder with -o"
-            raise OutputError("this is a log, not a place for its result", where=str(out), hint=hint)
+            raise OutputError("this is a log, and a result needs a folder of its own", where=str(out), hint=hint)
         names = _existing_files(out)
         if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
-            what = f"in the way of a result, and not written by a run: {', '.join(names)}"
+            what = f"these files are in the way of a result and were not written by a run: {', '.join(names)}"
             raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
         for name in _FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
@@ -68,15 +68,15 @@ def write_result(
 ) -> tuple[str, ...]:
     """Write a result into the folder `out` and replace an older result there; other files stay.
 
-    A run that is killed leaves no partial file and no mix of two results. summary.json exists only beside all other files of
-    its result.
+    A run that is killed leaves no partial file and no mix of two results. summary.json exists only if all other
+    files of its result exist.
 
     Args:
-        truth: the ground truth. It is stored for `load_truth`, and drawn after its alignment with the map.
+        truth: the ground truth. It is stored so that `load_truth` can read it, and it is drawn in the frame of the map.
         detected: the cameras whose boxes this run detected. The boxes are stored as detections.jsonl, which a log can use.
             With several cameras, the file name starts with the camera's name.
     Returns:
-        The names of the deleted files of the older result that have no successor, such as an export or a report.
+        The names of the older result's files that were deleted and not replaced, such as an export or a report.
     Raises:
         OutputError: the folder cannot be written, or another run writes there.
     """
@@ -85,10 +85,10 @@ def write_result(
 
 
 def clear_result(out: Path) -> tuple[str, ...]:
-    """Delete the files of an earlier run and return their names; objects.json stays, because a live session replaces it.
+    """Delete the files of an earlier run from the folder of a live session, and return their names.
 
-    A file of the earlier run would look like a file of the session. summary.json marks the folder as a result, so it is
-    deleted last.
+    A remaining file would look like a file of the session. objects.json stays, because the session replaces it. summary.json
+    marks the folder as a result, so it is deleted last.
     """
     names = tuple(name for name in reversed(_existing_files(out)) if name != files.OBJECTS)
     with disk_errors(out):
@@ -98,7 +98,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
 
 
 def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:
-    """Return the function that writes each file of a result, by file name."""
+    """Return, for each file name of a result, the function that writes this file."""
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     writers: dict[str, Callable[[Path], object]] = {
         files.OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
@@ -138,7 +138,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
 
 
 def _rays_table(result: RunResult) -> RaysTable:
-    """Return the content of rays.parquet; the object of a ray is an id in objects.json, or -1."""
+    """Return the content of rays.parquet. Each ray has the id of its object in objects.json, or -1 without an object."""
     rays, keyframes = result.rays, result.keyframes
     ids = np.array([*(o.id for o in result.map.objects), -1], dtype=np.int64)
     cameras = np.array([camera.name for camera in result.cameras], dtype=object)

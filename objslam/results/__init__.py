@@ -1,1 +1,1 @@
-"""Name the files of a result folder and read them. The folder `output` writes them."""
+"""The file names of a result folder and the readers of its files. The folder `output` writes these files."""

@@ -15,15 +15,15 @@ CONFIG = "config.yaml"  # All settings of the run.
 SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
 DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
 SURFACE = "reconstruction.ply"  # The mesh of the room.
-SURFACE_BEFORE = "reconstruction_before.ply"  # The mesh of the room at the poses of the log.
+SURFACE_BEFORE = "reconstruction_before.ply"  # The mesh of the room, made with the poses of the log.
 CLOUD = "reconstruction_cloud.ply"  # The vertices of the mesh as a point cloud.
 PICTURE = "map.png"  # The map from above.
 RECORDING = "recording.rrd"  # The recording for the viewer.
-EVALUATION = "evaluation.json"  # The evaluation by `objslam eval`.
-REPORT = "report.html"  # The page by `objslam report`.
+EVALUATION = "evaluation.json"  # The evaluation that `objslam eval` writes.
+REPORT = "report.html"  # The page that `objslam report` writes.
 TRUTH_OBJECTS = "groundtruth_objects.json"  # The true objects of the log.
 TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path of the log.
-GROUNDTRUTH = "groundtruth"  # The folder of a log with the truth as OBJECTS and TRAJECTORY.
+GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in the files OBJECTS and TRAJECTORY.
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),

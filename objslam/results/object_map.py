@@ -1,4 +1,4 @@
-"""The map of objects for users of the package, which can be loaded and saved."""
+"""The map of objects for users of the package. It can be loaded and saved."""
 
 from os import PathLike
 from pathlib import Path
@@ -10,11 +10,11 @@ from objslam.io.objects_json import dump_objects, read_objects
 
 
 class ObjectMap(object_map.ObjectMap):
-    """Hold the objects of one map in the frame `frame`, and load and save them."""
+    """The objects of one map in the coordinate frame `frame`. The map can be loaded and saved."""
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """Load the map of a result folder or of a file written by `save`. OutputError with the place if it is invalid."""
+        """Load the map of a result folder, or from a file that `save` wrote. OutputError names the place of an error."""
         from objslam.results.read import load_map  # deferred, because it imports scipy
 
         found = read_objects(Path(path)) if Path(path).is_file() else load_map(Path(path))

@@ -15,12 +15,12 @@ from objslam.results import files
 
 
 def load_map(out: Path) -> ObjectMap:
-    """Read the object map of the result folder `out`. OutputError names a missing or malformed part."""
+    """Read the object map of the result folder `out`. OutputError names what is missing or malformed."""
     return read_objects(_existing(out, files.OBJECTS))
 
 
 def load_trajectory(out: Path) -> Trajectory:
-    """Read the poses map_T_base of the result folder `out`. OutputError names a missing or malformed part with its line."""
+    """Read the poses map_T_base of the result folder `out`. OutputError names a missing file or a malformed line."""
     file, ledger = _existing(out, files.TRAJECTORY), Ledger()
     try:
         trajectory = read_trajectory(file, ledger)
@@ -32,8 +32,7 @@ def load_trajectory(out: Path) -> Trajectory:
 
 
 def load_motions(out: Path) -> Motions | None:
-    """Read the odometry between the poses of the result folder `out`, or None if it has none. OutputError if it is
-    invalid."""
+    """Read the odometry between the poses of the folder `out`; None if it has no odometry. OutputError if it is invalid."""
     _existing(out, files.OBJECTS)
     file = out / files.MOTIONS
     return read_motions(file) if file.is_file() else None
@@ -45,11 +44,11 @@ def load_rays(out: Path) -> RaysTable:
 
 
 def load_truth(path: Path) -> Truth | None:
-    """Read the ground truth in a path, or return None if a folder has none.
+    """Read the ground truth at a path, or return None if a folder has no ground truth.
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not its truth. Give that file itself to compare two results.
+            of its log. The objects.json of a result folder is not a truth. To compare two results, give this file itself.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """

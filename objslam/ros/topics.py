@@ -8,26 +8,27 @@ from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError
 
 ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
-TF, NONE = "tf", "none"  # The words in place of a topic: transforms supply the role, or nothing does.
+TF, NONE = "tf", "none"  # Words for --topic in place of a topic. TF: transforms supply the role. NONE: nothing does.
 FROM_TF = ("odometry", "localization")  # The roles that transforms can supply.
 LISTED = 8  # The limit of topics listed in a message. The limit keeps the message readable.
 
 
 @dataclass(frozen=True)
 class Choices:
-    """The topics that the user chose. names: topic names by (camera, role). The camera "" means any camera."""
+    """The topics that the user chose. names: topic names by (camera, role). The camera "" stands for any camera."""
 
     names: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
     def of(self, role: str, camera: str = "") -> list[str]:
-        """Return the names chosen for a role of the camera, else the names for any camera."""
+        """Return the topics chosen for a role of `camera`. Without any, return those chosen for any camera."""
         return self.names.get((camera, role)) or self.names.get(("", role)) or []
 
 
 def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
-    """Parse the values "role=/topic" of --topic, for a bag also "camera.role=/topic". Raises ConfigError for other values.
+    """Parse the values of --topic. Raises ConfigError for a wrong value.
 
-    With `live`, a missing "/" at the start of a topic is added.
+    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, there are no cameras, tf and tf_static are
+    also roles, and a missing "/" at the start of a topic is added.
     """
     choices, roles = Choices(), (*ROLES, "tf", "tf_static") if live else ROLES
     for text in texts:
@@ -43,7 +44,7 @@ def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
 
 
 def warn_of_choice(ledger: Ledger, role: str, taken: str, others: Iterable[str]) -> None:
-    """Warn that several topics fit a role, with the name of the chosen topic and the option to choose another."""
+    """Warn that several topics fit a role. The warning names the chosen topic and the option that chooses another."""
     names = list(others)
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     ledger.warn(f"several fit {role}: {taken} is taken, not {', '.join(names[:LISTED])}{more} (--topic {role}=... chooses)")
@@ -61,5 +62,5 @@ def closeness(a: str, b: str) -> int:
 
 
 def is_named(camera: str, frame: str, topic: str) -> bool:
-    """Return whether a camera name equals a frame, or a part of the frame or of a topic name."""
+    """Return whether a camera name equals a coordinate frame, or a part between slashes of the frame or of a topic name."""
     return camera in (frame, *frame.split("/"), *topic.split("/"))

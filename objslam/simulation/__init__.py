@@ -17,8 +17,8 @@ __all__ = ["PRESETS", "DepthNoise", "DriveSettings", "PoseNoise", "make_camera",
 def simulate(settings: DriveSettings, seed: int) -> Log:
     """Simulate a drive. The same settings and seed give the same log.
 
-    The ground truth holds the objects, and map_T_base at the frames' stamps. The frames odom and map coincide at the start.
-    Raises ConfigError if there are not enough places for objects that the path sees well.
+    The ground truth holds the objects, and map_T_base at the stamps of the images. The coordinate frames odom and map
+    coincide at the start. Raises ConfigError if too few positions for objects are seen well from the path.
     """
     seeds = np.random.SeedSequence(seed).spawn(6)
     path_rng, scene_rng, roam_rng, odometry_rng, localization_rng = (np.random.default_rng(s) for s in seeds[:5])

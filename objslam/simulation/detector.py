@@ -17,9 +17,10 @@ TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an ob
 
 @dataclass(frozen=True)
 class Views:
-    """The M visible objects in all frames of a camera, without errors.
+    """The M views of objects in all images of a camera, without errors.
 
-    frame, object: (M,) indices. centre, size: (M, 2) of the box, px. depth: (M,) z, m.
+    frame: (M,) the index of the image. object: (M,) the index of the object. centre, size: (M, 2) of the box, px.
+    depth: (M,) z, m.
     """
 
     frame: Ints
@@ -31,7 +32,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Boxes:
-    """Unordered boxes of one camera. object: (M,) the true object of each box, -1 for a false box."""
+    """M boxes of one camera in any order. object: (M,) the id of the object in each box, -1 for a false box."""
 
     frame: Ints
     object: Ints
@@ -42,7 +43,7 @@ class Boxes:
 
     @classmethod
     def join(cls, *parts: Self) -> Self:
-        """Concatenate boxes."""
+        """Concatenate several sets of boxes."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def take(self, boxes: Bools | Ints) -> Self:
@@ -51,9 +52,10 @@ class Boxes:
 
 
 def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points: Floats, extents: Floats) -> Views:
-    """Compute the objects that a camera sees at poses (F, 4, 4).
+    """Compute the objects that a camera sees at each of its poses map_T_camera (F, 4, 4).
 
-    points: the centres of the objects in map, (N, 3) or if they move (F, N, 3), m. extents: (N, 2) width and height, m.
+    points: the centres of the objects in map, m: (N, 3), or (F, N, 3) for moving objects. extents: (N, 2) the width and
+    height of the objects, m.
     """
     camera_T_map = inverse(map_T_camera)
     local = points @ np.swapaxes(camera_T_map[:, :3, :3], 1, 2) + camera_T_map[:, None, :3, 3]  # (F, N, 3)
@@ -68,14 +70,14 @@ def views(settings: DriveSettings, camera: Camera, map_T_camera: Floats, points:
 
 
 def _reach(settings: DriveSettings, size: Floats) -> Floats:
-    """Return the least distance (M, 2), px, of the centres of boxes of a size (M, 2) from the image's edge."""
+    """Return how far (M, 2), px, the centre of a box must be from the image's edges. size: (M, 2) of the boxes, px."""
     return np.zeros_like(size) if settings.cut_off else size / 2
 
 
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """Detect visible objects, with noise and misses. label: (N,) of the objects. first_id: the id of the first object."""
+    """Make boxes of visible objects, with noise and misses. label: (N,) of each object. first_id: the id of object 0."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
@@ -90,7 +92,7 @@ def detect(
 
 
 def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.random.SeedSequence) -> Boxes:
-    """Draw false boxes in the image. In each frame, each class has a box with the probability `settings.false`."""
+    """Draw random false boxes. In each image, each class gets a false box with the probability `settings.false`."""
     rng, depth = (np.random.default_rng(s) for s in seed.spawn(2))
     frame, label = np.nonzero(rng.random((settings.frames, classes)) < settings.false)
     count = len(frame)
@@ -111,7 +113,7 @@ def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> 
 
 
 def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
-    """Turn boxes into detections, sorted by frame and by falling score."""
+    """Turn boxes into detections. They are sorted by frame, and within a frame the box with the highest score is first."""
     order = np.lexsort((-boxes.score, boxes.frame))
     b, tracks = boxes.take(order), _tracks(settings, boxes)[order]
     return Detections(frame_stamps, b.frame, b.box, b.label, b.score, b.depth, tracks, classes)

@@ -11,12 +11,12 @@ from objslam.errors import ConfigError
 from objslam.simulation.shapes import Material, Part, Pattern, ball, box, make_object, paint, torus, turned
 
 CEILING = 2.6  # The height of the ceiling, m.
-SLOT = 0.34  # The width on a piece of furniture for each object, m. A larger value leaves fewer places.
+SLOT = 0.34  # The width that each object gets on a piece of furniture, m. With a larger value, fewer objects fit.
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A point light. position: (3,) in map, m. power: (3,) the linear colour of its light."""
+    """A point light. position: (3,) in map, m. power: (3,) the linear RGB colour of its light."""
 
     position: Floats
     power: Floats
@@ -26,8 +26,8 @@ class Lamp:
 class Room:
     """The content of a rendered room.
 
-    owner: (P,) the object of each part, -1 for furniture and other things. labels: the label of each object.
-    middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear colour of ambient light.
+    owner: (P,) the id of the object that has each part, -1 for furniture and other things. labels: the label of each object.
+    middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear RGB colour of ambient light.
     """
 
     parts: tuple[Part, ...]
@@ -39,10 +39,10 @@ class Room:
 
 
 def furnish_room(size: tuple[float, float], labels: Sequence[str], rng: np.random.Generator) -> Room:
-    """Make a room of a size along x and y (m), with the centre of the floor at the origin and objects with the labels.
+    """Make a furnished room with one object for each label. size: the size of the room along x and y, m.
 
-    Furniture along the walls reaches at most 0.6 m into the room. Each object stands on a piece of furniture among other
-    things. Raises ConfigError if the furniture has fewer places than there are objects.
+    The origin is the centre of the floor. Furniture along the walls reaches at most 0.6 m into the room. The objects stand
+    on the furniture, and other things stand between them. Raises ConfigError if the furniture has no place for all objects.
     """
     parts = _shell(size, rng)
     spots = []
@@ -125,7 +125,7 @@ def _shell(size: tuple[float, float], rng: np.random.Generator) -> list[Part]:
 
 def _wall_row(size: tuple[float, float], wall: int, rng: np.random.Generator) -> tuple[list[Part], list[Floats]]:
     along, across = size if wall % 2 == 0 else size[::-1]
-    # In the frame of the row, the wall is at y = 0 and the room at negative y.
+    # In the coordinate frame of the row, the wall is at y = 0 and the room is at negative y.
     to_wall = lift_se2(np.array([0.0, 0.0, wall * np.pi / 2])) @ lift_se2(np.array([0.0, across / 2, 0.0]))
     parts: list[Part] = []
     spots: list[Floats] = []
@@ -179,7 +179,7 @@ def _cabinet(width: float, depth: float, height: float, rng: np.random.Generator
 
 
 def _distractor(rng: np.random.Generator) -> list[Part]:
-    """Draw a thing that is none of the seven objects: a box, tin, bottle, ball, cone, ring or post."""
+    """Draw a random thing that is none of the paper's seven objects: a box, tin, bottle, ball, cone, ring or post."""
     first, second = any_material(rng), any_material(rng)
     r, h = float(rng.uniform(0.03, 0.08)), float(rng.uniform(0.06, 0.28))
     w, d = rng.uniform(0.06, 0.22, 2)

@@ -1,4 +1,4 @@
-"""Render colour, depth and objects of a furnished room by ray casting with Open3D on the CPU, without a display."""
+"""Render the colour, the depth and the object at each pixel of a furnished room. Open3D casts the rays, on the CPU."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,17 +14,17 @@ from objslam.simulation.furniture import Room
 
 Reals = NDArray[np.floating]
 
-NEAR = 0.05  # The least depth of all points of an object with a box, m.
-_NOISE = 64  # The number of grid points of the solid noise along each axis. A larger value repeats later.
+NEAR = 0.05  # The least depth of an object's points, m. An object with a nearer point counts as partly behind the camera.
+_NOISE = 64  # The grid points of the 3D noise along each axis. With a larger value, the noise repeats after a longer way.
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 
 
 @dataclass(frozen=True)
 class Cast:
-    """The surfaces that the rays of an image hit.
+    """The surfaces that the rays of an image hit, one ray for each pixel.
 
-    depth: (H, W) z, m, inf without a hit. part: (H, W) indices of parts, -1 without a hit. normal: (H, W, 3) in map.
-    point: (H, W, 3) in map, m.
+    depth: (H, W) z, m, inf without a hit. part: (H, W) the index of the part in the room, -1 without a hit.
+    normal: (H, W, 3) of the surface, in map. point: (H, W, 3) that is hit, in map, m.
     """
 
     depth: Reals
@@ -82,11 +82,11 @@ class Caster:
         return Cast(depth, part, hit["primitive_normals"].numpy(), point)
 
     def owners(self, cast: Cast) -> Ints:
-        """Return the object (H, W) at each pixel, -1 for none."""
+        """Return the id (H, W) of the object at each pixel, -1 for none."""
         return np.append(self.room.owner, -1)[cast.part]
 
     def silhouettes(self, map_T_camera: Floats, chosen: Ints) -> Ints:
-        """Count the pixels (M,) that the chosen objects (M,) would cover if nothing hid them."""
+        """Count the pixels (M,) that each chosen object would cover if nothing hid it. chosen: (M,) the ids."""
         counts = np.zeros(len(chosen), dtype=np.int64)
         for i, number in enumerate(chosen):
             window = self._window(number, map_T_camera)
@@ -96,9 +96,9 @@ class Caster:
         return counts
 
     def full_sizes(self, map_T_camera: Floats, chosen: Ints) -> Floats:
-        """Return the width and height (M, 2), px, of the boxes of the chosen objects (M,) in an image without edges.
+        """Return the width and height (M, 2), px, that the boxes of objects would have if the image had no edges.
 
-        The size is inf if a part of the object is outside the field of the lens model.
+        chosen: (M,) the ids. The size is inf if a part of the object is nearer than `NEAR` or outside the lens field.
         """
         sizes = np.full((len(chosen), 2), np.inf)
         for i, number in enumerate(chosen):
@@ -113,7 +113,7 @@ class Caster:
         return np.asarray(points @ camera_T_map[:3, :3].T + camera_T_map[:3, 3])
 
     def _window(self, number: int, map_T_camera: Floats) -> tuple[slice, slice] | None:
-        """Return the part of the image around an object, None if the object is outside or partly behind the camera."""
+        """Return the rows and columns around an object. Returns None if it is not in view or partly behind the camera."""
         local = self._local(number, map_T_camera)
         if local[:, 2].min() < NEAR:
             return None
@@ -124,7 +124,7 @@ class Caster:
         return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
     def shade(self, cast: Cast, eye: Floats) -> Reals:
-        """Compute the linear colour (H, W, 3) seen from `eye` (3,), with diffuse and glossy reflection and shadows."""
+        """Compute the linear RGB colour (H, W, 3), with reflections and shadows. eye: (3,) the camera position in map, m."""
         albedo, gloss = self._albedo(cast)
         view = _unit(eye.astype(np.float32) - cast.point)
         normal = np.where(_dot(cast.normal, view)[..., None] < 0, -cast.normal, cast.normal)
@@ -159,7 +159,7 @@ class Caster:
         return first + share[..., None] * (second - first), gloss
 
     def _pattern(self, kind: int, at: Reals) -> Reals:
-        """Return the share (M,) of the second colour at points (M, 3), in units of the pattern's scale."""
+        """Return the share (M,) of the second colour at points. at: (M, 3) in units of the pattern's scale."""
         if kind == 3:
             return (np.floor(at + 0.37).astype(np.int64).sum(axis=1) & 1).astype(np.float32)
         cell = np.floor(at * 2).astype(np.int64) & (_NOISE - 1)

@@ -1,4 +1,4 @@
-"""Render drives of a robot with an RGB-D camera among furniture and the paper's seven objects, as log folders."""
+"""Render drives of a robot with an RGB-D camera into log folders. The room has furniture and the paper's seven objects."""
 
 import os
 from collections.abc import Callable
@@ -26,17 +26,17 @@ from objslam.simulation.trajectory import Path as Course
 from objslam.simulation.trajectory import frame_stamps, localization, odometry
 
 TRUTH_BOXES = "boxes.jsonl"
-"""The file of the true boxes in the groundtruth folder of a rendered drive, in the format of detections.jsonl."""
-ROUNDS = 40  # The number of random rooms that are tried until every object is seen well. A larger value fails later.
+"""The name of the file of true boxes, which is in the groundtruth folder. Its format is that of detections.jsonl."""
+ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
 LOOK_AHEAD = 4
-"""The factor by which the images of a room's trial are smaller than those of the drive."""
+"""The factor by which images are smaller when a room is tried than when the drive is rendered."""
 
 
 class BoxLimits(Section):
-    """The limits of the true boxes that count. Other boxes are too small or too hidden for a detector."""
+    """The limits within which a true box counts. Boxes outside them are too small or too hidden for a detector."""
 
-    visible: Probability = 0.6  # The least share of an object's pixels in the image that nothing hides.
-    inside: Probability = 0.6  # The least share of the area of an object's box that is inside the image.
+    visible: Probability = 0.6  # The least visible share of the pixels that the object would cover if nothing hid it.
+    inside: Probability = 0.6  # The least share of the box area that is inside the image.
     long_side: NotNegative = 20.0  # The least length of a box's longer side, px.
     short_side: NotNegative = 10.0  # The least length of a box's shorter side, px.
 
@@ -54,8 +54,8 @@ class RenderSettings(CourseSettings):
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
     labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
-    """The least number of frames in which an object's box is whole and within the limits."""
-    min_parallax_deg: NotNegative = 33.0  # The least parallax over these frames, degrees.
+    """The least number of images in which each object has a box that is within the limits and not cut off by the edge."""
+    min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over these images, degrees.
     limits: BoxLimits = BoxLimits()
     sensor: Sensor = Sensor()
 
@@ -78,7 +78,7 @@ class RenderSettings(CourseSettings):
 class TrueBoxes:
     """The boxes around the visible pixels of the M objects in an image.
 
-    object: (M,) the ids. box: (M, 4) x1, y1, x2, y2, px. The box of the pixel (0, 0) alone is (0, 0, 1, 1), as in detectors.
+    object: (M,) the ids. box: (M, 4) x1, y1, x2, y2, px. A box around the one pixel (0, 0) is (0, 0, 1, 1), as in detectors.
     depth: (M,) the median z of the visible pixels, m. counts: (M,) whether the box is within the limits.
     cut: (M,) whether the box touches the image's edge.
     """
@@ -123,7 +123,7 @@ def render_drive(
 
     The same settings and seed give the same log for any number of workers (threads, by default one per core and at most 4).
     groundtruth/ holds the path, the centres of the objects' bounding boxes, and the true boxes (`TRUTH_BOXES`).
-    progress: a function that is called with the numbers of rendered frames and of all frames.
+    progress: a function that is called with the number of images rendered so far and the number of all images.
     Raises ConfigError if no room shows every object well enough, and OutputError if `check_target` refuses `out`.
     """
     import cv2
@@ -185,7 +185,7 @@ def render_drive(
 
 
 def drive_room(settings: RenderSettings, seed: int) -> Room:
-    """Return the room that `render_drive` renders for the same settings and seed. Raises ConfigError as `render_drive`."""
+    """Return the room that `render_drive` renders for these settings and seed. Raises ConfigError if it finds no room."""
     seeds = np.random.SeedSequence(seed).spawn(5)
     course = Course.lay(settings.motion, np.random.default_rng(seeds[0]))
     stamps = frame_stamps(settings.motion)[:, 0]
@@ -202,7 +202,7 @@ def _as_detections(frames: list[TrueBoxes], stamps: Floats, labels: tuple[str, .
 
 
 def _good_room(settings: RenderSettings, map_T_camera: Floats, seed: np.random.SeedSequence) -> Room:
-    """Draw rooms until the drive sees every object in enough frames and under enough parallax."""
+    """Return the first random room in which the drive sees every object in enough images and with enough parallax."""
     camera = settings.camera
     matrix = camera.matrix.copy()
     matrix[:2] /= LOOK_AHEAD
@@ -221,7 +221,7 @@ def _good_room(settings: RenderSettings, map_T_camera: Floats, seed: np.random.S
             return room
         worst = room.labels[poor[0]]
     raise ConfigError(
-        f"in {ROUNDS} random rooms some object is not seen well enough (in the last one {worst})",
+        f"in each of {ROUNDS} random rooms, an object is not seen well enough (in the last room: {worst})",
         where=settings.name,
         hint="set more frames or laps, or a lower min_views or min_parallax_deg",
     )

@@ -25,8 +25,8 @@ OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m
 WALL = 0.3  # The least distance of random objects from the walls, m.
 CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
-"""The largest number of frames of each camera in which the views of a place are counted. They are evenly spaced."""
-ROUNDS = 50  # The number of rounds of random places. A larger value finds places for more objects.
+"""The largest number of images of each camera that are checked for views of a position. They are evenly spaced."""
+ROUNDS = 50  # How often a set of random positions is drawn. With a larger value, positions are found for more objects.
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Scene:
 class Roamers:
     """The moving objects, which oscillate along each axis.
 
-    label: (K,). extent: (K, 2), m. middle (m), reach (m), rate (rad/s) and phase (rad) of each oscillation: (K, 3).
+    label: (K,) indices into the classes of the scene. extent: (K, 2) width and height, m. middle (m), reach (m), rate
+    (rad/s), phase (rad): (K, 3) the parameters of the oscillation along each axis.
     """
 
     label: Ints
@@ -59,9 +60,9 @@ class Roamers:
 
 
 def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.random.Generator) -> Scene:
-    """Place the given objects, then random objects where the path sees them well. frame_stamps: (F, C) for C cameras, s.
+    """Place the objects of `settings.placed`, then random objects at positions that are seen well from the path.
 
-    Raises ConfigError if there are not enough places.
+    frame_stamps: (F, C) the stamps of the images of C cameras, s. Raises ConfigError if there are not enough such positions.
     """
     numbered = (f"{name} {number}" for number in count(2) for name in EXTENTS)
     names = list(islice(chain(EXTENTS, numbered), settings.classes or settings.objects))
@@ -74,7 +75,7 @@ def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.r
 
 
 def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roamers:
-    """Draw objects of the scene's classes that move through the whole room at about 0.3 m/s."""
+    """Draw objects that move through the whole room at about 0.3 m/s. Their classes are those of the scene."""
     moving = settings.moving
     label = rng.integers(max(len(scene.classes), 1), size=moving)
     low, high = _bounds(settings)
@@ -96,7 +97,7 @@ def _bounds(settings: DriveSettings) -> tuple[Floats, Floats]:
 
 
 def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: Floats, rng: np.random.Generator) -> Floats:
-    """Draw good places (N, 3) at least `min_distance` apart for objects of extents (N, 2)."""
+    """Draw good positions (N, 3) in map, m, at least `min_distance` apart. extent: (N, 2) of the objects, m."""
     places = np.zeros((0, 3))
     for _ in range(ROUNDS):
         if len(places) == settings.objects:
@@ -107,7 +108,7 @@ def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: F
                 places = np.vstack([places, place])
     if len(places) < settings.objects:
         raise ConfigError(
-            f"only {len(places)} of {settings.objects} objects have a place that the cameras see well",
+            f"only {len(places)} of {settings.objects} objects have a position that the cameras see well",
             where=settings.name,
             hint="set fewer objects, more frames, or a lower min_distance, min_view_share or min_parallax_deg",
         )
@@ -115,7 +116,7 @@ def _places(settings: DriveSettings, path: Path, frame_stamps: Floats, extent: F
 
 
 def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Floats, extent: Floats) -> Bools:
-    """Return which places (P, 3) are off the path and are seen in enough frames and under enough parallax."""
+    """Return which positions (P, 3) are off the path, and are seen in enough images and with enough parallax."""
     way = path.at(START + np.linspace(0.0, path.lap, 1000))[:, :2]
     free = cKDTree(way).query(places[:, :2])[0] >= CLEARANCE
     checked = np.linspace(0, settings.frames - 1, min(settings.frames, CHECKED_FRAMES)).astype(int)
@@ -132,7 +133,7 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
-    """Return a lower bound (P,), rad, of the widest angle between the directions (V, P, 3) where seen (V, P)."""
+    """Return a lower bound (P,), rad, of the widest angle between directions (V, P, 3). seen: (V, P) which of them count."""
     # Each step finds the direction furthest from the last one. For directions in a plane, the result is the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)

@@ -12,23 +12,23 @@ class Sensor(Section):
     """The errors of colour and depth images."""
 
     exposure: NotNegative = 0.25
-    """The standard deviation of the exposure's logarithm around automatic exposure. The exposure drifts over a drive."""
+    """The standard deviation of ln(exposure / automatic exposure). The exposure drifts slowly during a drive."""
     white: NotNegative = 0.04
-    """The standard deviation of each colour channel's gain around the right white balance, drawn once a drive."""
+    """The standard deviation of the error of each colour channel's gain. The errors are drawn once for a drive."""
     blur: NotNegative = 0.5  # The sigma of the lens blur, px.
     vignette: Probability = 0.2  # The share of light that is lost in the image's corners.
-    shot: NotNegative = 0.02  # The standard deviation of the shot noise at full light. It grows with the root of the light.
+    shot: NotNegative = 0.02  # The standard deviation of the shot noise at full light. It grows as the root of the light.
     read: NotNegative = 0.006  # The standard deviation of the read noise, which is also present in the dark.
     depth_sigma: NotNegative = 0.002  # The constant part of the depth noise, m.
     depth_sigma_per_m2: NotNegative = 0.002
     """The part of the depth noise that grows with the square of the depth, m per m^2."""
     depth_missing: Probability = 0.01
-    """The share of pixels without depth, in addition to pixels at edges and on glancing surfaces."""
+    """The share of random pixels that get no depth. Pixels at depth edges and on steep surfaces get none either."""
     depth_range: tuple[Positive, Positive] = (0.3, 6.0)  # The least and largest measured depth, m.
 
 
 def exposures(sensor: Sensor, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the gains (F, 3) of each frame's colour channels around automatic exposure, as a slow random walk."""
+    """Draw the gains (F, 3) of the colour channels in each image, relative to automatic exposure. They vary slowly."""
     steps = rng.standard_normal(frames)
     wander = np.empty(frames)
     value = steps[0]
@@ -40,7 +40,7 @@ def exposures(sensor: Sensor, frames: int, rng: np.random.Generator) -> NDArray[
 
 
 def expose(sensor: Sensor, light: Reals, gain: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn linear light (H, W, 3) into an 8-bit RGB image (H, W, 3). At gain (3,) = 1, the mean light becomes 0.25."""
+    """Turn linear light (H, W, 3) into an 8-bit RGB image (H, W, 3). If `gain` (3,) is 1, the mean light becomes 0.25."""
     import cv2
 
     height, width = light.shape[:2]
@@ -56,7 +56,7 @@ def expose(sensor: Sensor, light: Reals, gain: NDArray[np.float64], rng: np.rand
 
 
 def measure_depth(sensor: Sensor, depth: Reals, rng: np.random.Generator) -> Reals:
-    """Add noise to depth (H, W), m. Pixels out of range, at depth edges and at random places become 0."""
+    """Add noise to depth (H, W), m. Pixels out of range, pixels at depth edges and some random pixels become 0."""
     low, high = sensor.depth_range
     inside = np.isfinite(depth) & (depth >= low) & (depth <= high)
     z = np.where(inside, depth, 0.0).astype(np.float32)

@@ -40,7 +40,7 @@ def make_camera(
 
 
 class PoseNoise(Section):
-    """The standard deviations of a planar pose, or of a step between two poses: per axis in m, and of the yaw in rad."""
+    """The standard deviations of a planar pose or of a step between two poses. xy: along x and along y, m. yaw: in rad."""
 
     xy: NotNegative = 0.0
     yaw: NotNegative = 0.0
@@ -52,7 +52,7 @@ class DepthNoise(Section):
     sigma: NotNegative = 0.03  # The constant part of the standard deviation, m.
     sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
     missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
-    wrong: Probability = 0.0  # The share of boxes with the depth of something else, at random up to max_range.
+    wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random up to max_range.
 
 
 class CourseSettings(Section):
@@ -62,14 +62,14 @@ class CourseSettings(Section):
     room: tuple[Positive, Positive] = (8.0, 6.0)
     """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
-    """The swings along x and y in a lap of a Lissajous curve, without a common divisor. (1, 1) is an ellipse."""
+    """The swings of a Lissajous curve along x and along y in a lap. They have no common divisor. (1, 1) is an ellipse."""
     margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
-    """The number of frames of each camera. Several cameras fire one after the other."""
-    frame_rate: Positive = 5.0  # The frames of each camera per second, Hz.
-    laps: Positive | None = None  # The laps in the whole drive. They determine the speed.
+    """The number of images of each camera. Several cameras take their images one after the other."""
+    frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
+    laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift, per distance (config.Odometry, whose floors are unused) or per frame (PoseNoise). None: no odometry."""
+    """The drift: config.Odometry per distance and turn (without its floors), PoseNoise per image. None: no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
@@ -80,9 +80,9 @@ class DriveSettings(CourseSettings):
     cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
     max_range: Positive = 6.0  # The largest distance at which a camera sees an object, m.
     cut_off: bool = False
-    """Whether boxes are cut off at the image's edge, as a real detector does. Otherwise objects at the edge get no box."""
+    """Whether boxes are cut off at the image's edge, as those of real detectors. If not, objects at the edge get no box."""
     objects: Annotated[int, Field(ge=0)] = 15
-    """The number of objects at random places."""
+    """The number of objects at random positions."""
     classes: Annotated[int, Field(ge=1)] | None = None
     """The number of classes of the objects, assigned in turn. None gives each object a class of its own."""
     placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
@@ -90,19 +90,19 @@ class DriveSettings(CourseSettings):
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """The least number of views of a random object without detector errors, as a share of one camera's frames."""
+    """The least number of images of all cameras in which a random object is in view, as a share of one camera's images."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
-    """The number of moving objects. They have the classes of the others and are no part of the ground truth."""
-    pixel_sigma: NotNegative = 0.0  # The standard deviation of a box centre, px per axis.
+    """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""
+    pixel_sigma: NotNegative = 0.0  # The standard deviation of the error of a box centre along each axis, px.
     missed: Probability = 0.0  # The share of visible objects without a box.
     false: Probability = 0.0  # The probability of a false box, in each frame for each class.
     depth: DepthNoise | None = None  # The errors of depths. None: boxes have no depths.
     tracks: Literal["none", "broken", "perfect"] = "none"
-    """The track ids of boxes. `perfect` ids are the ids of the objects in the ground truth, then those of moving objects.
-    `broken` ids start again after one second without a box. False boxes have no id."""
-    odometry_rate: Positive | None = 30.0  # The rate of odometry, Hz. None: at the frames' stamps.
-    localization_rate: Positive | None = 10.0  # The rate of the localisation, Hz. None: at the frames' stamps.
+    """The track ids of boxes. With `perfect`, boxes have the ids of their objects in the ground truth, and moving objects
+    have the next ids. With `broken`, an object gets a new id after one second without a box. False boxes have no id."""
+    odometry_rate: Positive | None = 30.0  # The rate of the odometry, Hz. None: one pose at the stamp of each image.
+    localization_rate: Positive | None = 10.0  # The rate of the localisation, Hz. None: one pose at the stamp of each image.
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -145,7 +145,7 @@ def preset(name: str, **changes: Any) -> DriveSettings:
 
 
 def pair(distance: float, label: str = "cup", **changes: Any) -> DriveSettings:
-    """Return a drive around two objects of a class, `distance` (m) apart. The camera looks left, from 1 to 4 m away."""
+    """Return a drive around two objects of one class, `distance` (m) apart. The camera looks left at them from 1 to 4 m."""
     camera = make_camera("left", focal=380.0, position=(0.0, 0.0, 0.3), yaw=np.pi / 2)
     places = ((label, (1.5, -distance / 2, 0.4)), (label, (1.5, distance / 2, 0.4)))
     drive = {"name": "pair", "room": (7.0, 7.0), "path": (1, 1), "laps": 1.0, "objects": 0, "placed": places}

@@ -16,7 +16,7 @@ Pattern = Literal["plain", "noise", "stripes", "checks"]
 
 @dataclass(frozen=True)
 class Material:
-    """A surface. A solid pattern mixes two linear colours (3,). scale: the pattern's scale, m. gloss: the share of gloss."""
+    """The look of a surface: a 3D pattern of two linear RGB colours (3,). scale: the pattern's size, m. gloss: its shine."""
 
     colour: Floats
     second: Floats
@@ -34,7 +34,7 @@ class Part:
     material: Material
 
     def moved(self, pose: Floats) -> Part:
-        """Return the part at a pose (4, 4)."""
+        """Return the part with its vertices transformed by a pose (4, 4)."""
         return replace(self, vertices=self.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
@@ -52,7 +52,7 @@ def turned(profile: list[tuple[float, float]], material: Material, segments: int
 
 
 def torus(radius: float, thickness: float, height: float, material: Material, segments: int = 36) -> Part:
-    """Make a horizontal ring. radius: of the centre line. thickness: the tube's radius. height: of the centre. All in m."""
+    """Make a horizontal ring. radius: of its centre line, m. thickness: the tube's radius, m. height: of its centre, m."""
     angle = np.linspace(0.0, 2 * np.pi, 14, endpoint=False)
     rings = np.column_stack([radius + thickness * np.cos(angle), height + thickness * np.sin(angle)])
     return _swept(rings, True, material, segments)
@@ -82,7 +82,7 @@ def _swept(rings: Floats, closed: bool, material: Material, segments: int) -> Pa
 
 
 def paint(rng: np.random.Generator, hue: float, saturation: float, value: float) -> Floats:
-    """Draw a linear colour (3,) near a hue (0 to 1), saturation and value."""
+    """Draw a random linear RGB colour (3,) near a hue, a saturation and a value (each 0 to 1)."""
     hue += rng.normal(0.0, 0.012)
     saturation = float(np.clip(saturation + rng.normal(0.0, 0.05), 0.0, 1.0))
     value = float(np.clip(value + rng.normal(0.0, 0.05), 0.02, 1.0))
@@ -103,7 +103,7 @@ def make_object(label: str, rng: np.random.Generator) -> list[Part]:
 
 def _parts(label: str, rng: np.random.Generator) -> list[Part]:
     if label == "ring":
-        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The second draw keeps later draws the same.
+        first, _ = _plastic(rng, 0.09, 0.9, 0.9), _plastic(rng, 0.0, 0.0, 0.9)  # The unused draw keeps later draws the same.
         return [torus(0.095, 0.026, 0.026, Material(first.colour, first.colour * 0.75, "noise", 0.03, 0.3))]
     if label == "sponge":
         foam, pad = paint(rng, 0.155, 0.75, 0.9), paint(rng, 0.36, 0.75, 0.3)

@@ -13,15 +13,15 @@ from objslam.simulation.settings import DriveSettings, PoseNoise
 
 START = 1_700_000_000.0  # The stamp of the start of every drive, s.
 WHEEL_OFFSET = 0.5
-"""The distance from the robot's centre of a wheel with constant speed, m. A larger value makes bends slower."""
+"""A wheel at this distance from the robot's centre (m) moves at constant speed. A larger value makes bends slower."""
 
 
 @dataclass(frozen=True)
 class Path:
     """A Lissajous curve that the robot drives repeatedly.
 
-    reach: (2,) the amplitudes, m. parameter: (T,) the curve parameter over one lap. time: (T,) the times in the lap, s.
-    offset: the time in the lap at which the drive starts, s.
+    reach: (2,) the amplitudes along x and y, m. parameter: (T,) samples of the curve parameter over one lap. time: (T,) the
+    time in the lap at each sample, s. offset: the time in the lap at which the drive starts, s.
     """
 
     reach: Floats
@@ -32,7 +32,7 @@ class Path:
 
     @classmethod
     def lay(cls, settings: DriveSettings, rng: np.random.Generator) -> Self:
-        """Make the path of a drive. It starts at a random place on the curve."""
+        """Make the path of a drive. It starts at a random position on the curve."""
         reach = np.array(settings.room) / 2 - settings.margin
         u = np.linspace(0.0, 2 * np.pi, 20_001)
         _, first, second = _curve(reach, settings.path, u)
@@ -68,13 +68,13 @@ def _integral(values: Floats, over: Floats) -> Floats:
 
 
 def frame_stamps(settings: DriveSettings) -> Floats:
-    """Return the stamps (F, C), s, of the frames of each camera. The cameras fire one after the other."""
+    """Return the stamps (F, C), s, of the images of each camera. The cameras take their images one after the other."""
     cameras = len(settings.cameras)
     return START + (np.arange(settings.frames)[:, None] + np.arange(cameras) / cameras) / settings.frame_rate
 
 
 def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate odom_T_base by adding up the true steps with noise. `stamps` are the frames' stamps (F,), s."""
+    """Simulate odom_T_base (None without odometry) as the sum of true steps with noise. stamps: (F,) of the images, s."""
     if settings.odometry is None:
         return None
     stamps = _clock(settings.odometry_rate, stamps)
@@ -90,7 +90,7 @@ def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random
 
 
 def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floats) -> Floats:
-    """Compute the standard deviations (S, 3) of steps (S, 3) with durations (S,) in frames."""
+    """Compute the standard deviations (S, 3) of steps (S, 3). frames: (S,) the durations, in units of the time per image."""
     if isinstance(noise, PoseNoise):
         return np.sqrt(frames)[:, None] * np.array([noise.xy, noise.xy, noise.yaw])
     way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
@@ -100,7 +100,7 @@ def _step_sigmas(noise: config.Odometry | PoseNoise, steps: Floats, frames: Floa
 
 
 def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:
-    """Simulate map_T_base as the true poses with independent errors. `stamps` are the frames' stamps (F,), s."""
+    """Simulate map_T_base (None without localisation): true poses with independent errors. stamps: (F,) of the images, s."""
     noise = settings.localization
     if noise is None:
         return None
@@ -110,7 +110,7 @@ def localization(settings: DriveSettings, path: Path, stamps: Floats, rng: np.ra
 
 
 def _clock(rate: float | None, frame_stamps: Floats) -> Floats:
-    """Return stamps at `rate` that cover all frames. Without a rate, return the frames' stamps."""
+    """Return stamps at `rate` (Hz) that cover all images. Without a rate, return the stamps of the images."""
     if rate is None:
         return frame_stamps
     return START + np.arange(int(np.ceil((frame_stamps[-1] - START) * rate)) + 1) / rate

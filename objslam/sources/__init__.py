@@ -76,7 +76,7 @@ SOURCES = (
     ),
     Source(
         "tum",
-        "groundtruth.txt (or .gz) and rgb.txt, or boxes in <stamp>.txt in a folder or tar archive",
+        "groundtruth.txt (or .gz), with rgb.txt or with box files <stamp>.txt in a folder or tar archive",
         "sources.tum_rgbd.reader:is_stamped",
         "sources.tum_rgbd.reader:read_stamped",
         TumOptions,
@@ -115,8 +115,8 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
 def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:
     """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
-    Images inside a bag are extracted into a folder beside the log folder and then linked into it, so that their bytes are
-    written once. Raises the errors of `read` and `log_folder.write_log_folder`.
+    Images inside a bag are extracted into a temporary folder beside the log folder. They are then linked into the log
+    folder, so that their bytes are written only once. Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder
 
@@ -129,7 +129,7 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
 
 
 def choose(path: Path, name: str | None = None) -> Source:
-    """Return the kind called `name`, or without a name the kind of the recording at a path. Raises the errors of `read`."""
+    """Return the kind called `name`, or if it is None the kind of the recording at `path`. Raises the errors of `read`."""
     if name is not None:
         named = {source.name: source for source in SOURCES}
         if name not in named:
@@ -147,6 +147,6 @@ def choose(path: Path, name: str | None = None) -> Source:
     except (OSError, ValueError) as error:  # A NUL in the path raises ValueError.
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
     if (path / "objects.json").is_file() and (path / "summary.json").is_file():
-        raise LogError("this is a result, not a log", where=str(path), hint="give the log_path in its summary.json")
+        raise LogError("this is a result, not a log", where=str(path), hint="give its log, the log_path in summary.json")
     looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)
     raise LogError("nothing here that objslam reads", where=str(path), hint=f"looked for {looked_for}")

@@ -30,22 +30,22 @@ _T = TypeVar("_T")
 
 
 def is_log_folder(path: Path) -> bool:
-    """Return whether the folder holds a camera and a path, which every log folder has."""
+    """Return whether the folder holds a camera and a path of the robot (odometry or localisation), as log folders do."""
     camera = (path / CAMERA).is_file() or (path / CAMERAS).is_dir()
     return camera and ((path / ODOMETRY).is_file() or (path / LOCALIZATION).is_file())
 
 
 def resembles_log(path: Path) -> bool:
-    """Return whether the folder holds a camera or a path."""
+    """Return whether the folder holds a camera or a path of the robot (odometry or localisation)."""
     return any((path / name).exists() for name in (CAMERA, CAMERAS, ODOMETRY, LOCALIZATION))
 
 
 def read_log_folder(path: Path, ledger: Ledger) -> Log:
     """Read a log folder.
 
-    Malformed lines are dropped and counted with file and line. Unusable images and ground truth are left out with a warning.
-    An unusable odometry is left out with a warning if the localisation is usable, and vice versa. Images are not opened.
-    Raises LogError if a camera, its detections or its mount is unusable, or if no path is usable.
+    Malformed lines are dropped, and counted with their file and line. Unusable lists of images and unusable ground truth are
+    left out with a warning. If only one of odometry and localisation is usable, the other is left out with a warning. Images
+    are not opened. Raises LogError if a camera, its detections or its mount is unusable, or if no path is usable.
     """
     with reading(path):
         if not path.is_dir():
@@ -55,7 +55,7 @@ def read_log_folder(path: Path, ledger: Ledger) -> Log:
 
 
 def read_truth(folder: Path, ledger: Ledger) -> Truth | None:
-    """Read the ground truth in a folder. Returns None if it has none. Unreadable files are left out with a warning."""
+    """Read the ground truth in a folder. Unreadable files are left out with a warning. Returns None if nothing is left."""
     objects = _optional(read_truth_objects, folder / TRUTH_OBJECTS, ledger)
     trajectory = _optional(lambda file: read_trajectory(file, ledger), folder / TRUTH_TRAJECTORY, ledger)
     return None if objects is None and trajectory is None else Truth(objects or (), trajectory)
@@ -65,8 +65,9 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     """Write a log folder. Every number reads back as the same float. Rotations are written as unit quaternions.
 
     The content is written into a temporary folder that is renamed at the end. Images are linked or copied into rgb/ and
-    depth/. Images that are already in the camera's folder keep their place. Detections without frames are not written.
-    Raises OutputError if the log lacks a camera or a path, or if `check_target` refuses the path.
+    depth/. Images that are already in the camera's folder keep their relative path. Detections without frames are not
+    written. Raises OutputError if the log has no cameras, if it has neither odometry nor localisation, if the names of its
+    cameras cannot be folder names, if a file cannot be written, or if `check_target` refuses the path.
     """
     path = Path(os.path.realpath(path))
     if not log.cameras or not (log.odometry or log.localization):
@@ -75,7 +76,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     names = [camera_log.camera.name for camera_log in log.cameras]
     files = all(name and not name.startswith(".") and "/" not in name and name.isprintable() for name in names)
     if len(set(names)) < len(names) or (len(names) > 1 and not files):
-        raise OutputError(f"the cameras' names must differ and be file names, got {names}", where=log.name)
+        raise OutputError(f"the cameras' names must differ and be usable as folder names, got {names}", where=log.name)
     check_target(path, overwrite)
     with beside(path) as work, _writing(path):
         fresh = work / "new"
@@ -92,7 +93,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """Make an empty folder beside a path, on the same disk, and remove it afterwards."""
+    """Make an empty folder in the parent folder of a path, so that both are on one disk, and remove it at the end."""
     path = Path(os.path.realpath(path))
     with no_empty_folders(path.parent):
         with _writing(path):
@@ -204,7 +205,7 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
 
 
 def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images:
-    """Link or copy images into a temporary folder that is renamed to `final` later, and return them with their new paths."""
+    """Link or copy images into `folder`, and return them with their new paths. `folder` is renamed to `final` later."""
     sources = [path.resolve() for path in images.paths]
     distinct = list(dict.fromkeys(sources))
     names = [source.name for source in distinct]

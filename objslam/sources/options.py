@@ -23,17 +23,17 @@ class Option:
     metavar: str | None = None
 
 
-WithRange = Annotated[bool, Option("--without-range", "MRCLAM: bearings only.")]
-Label = Annotated[str | None, Option("--label", "Label for boxes that come without one.")]
-DETECTOR = Option("--detector", "ONNX model that finds the boxes in the rgb images, in place of those of the log.")
+WithRange = Annotated[bool, Option("--without-range", "MRCLAM, TUM, ROS bags: boxes without depths (bearings only).")]
+Label = Annotated[str | None, Option("--label", "Label of boxes that have no class.")]
+DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. They replace the boxes of the log.")
 """The option that chooses the detector, in `objslam run` and in live sessions."""
 
 
 @dataclass(frozen=True)
 class AnyOptions:
-    """The options of every source. format: the name of the source. None chooses the source from the content."""
+    """The options of every source. format: the name of the source. None chooses the source by the recording's content."""
 
-    format: Annotated[str | None, Option("--format", "Kind of the recording. [default: by content]")] = None
+    format: Annotated[str | None, Option("--format", "Kind of the recording. [default: found from its content]")] = None
 
 
 def names(*kinds: type[Any] | None) -> frozenset[str]:
@@ -49,7 +49,7 @@ def flags(kind: type[Any]) -> dict[str, tuple[Any, Option]]:
 
 
 def unused(options: Any, kind: type[Any], taken: Collection[str]) -> list[str]:
-    """Return the flags of the fields of `kind` that `options` changes from the default but that `taken` does not name."""
+    """Return the flags of the options of `kind` that differ from the default, except those of the fields in `taken`."""
     called = {name: option.flag.partition("/")[0] for name, (_, option) in flags(kind).items()}
     return [
         called.get(field.name, f"--{field.name.replace('_', '-')}")

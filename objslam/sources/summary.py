@@ -42,7 +42,7 @@ class Contents:
 
 
 def timing(stamps: Floats) -> Timing:
-    """Compute the timing of stamps (N,), N > 0, in any order."""
+    """Compute the timing of stamps (N,), s, N > 0, in any order. The rate is 0 if all stamps are equal."""
     times = np.sort(stamps)
     span = float(times[-1] - times[0])
     rate = (len(times) - 1) / span if span > 0 else 0.0
@@ -82,11 +82,11 @@ def contents(log: Log) -> Contents:
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
-    """Return a message if none of a camera's frames (N,), s, is within the time of the path, else an empty list."""
+    """Return one message if images have stamps (N,), s, but none of them is in the time of the path. Else return none."""
     if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
         return []
     return [
-        f"{where}: none of its frames ({frames.min():.3f} to {frames.max():.3f} s) is on the path "
+        f"{where}: none of its frames ({frames.min():.3f} to {frames.max():.3f} s) is within the time of the path "
         f"({path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s); check that both use one clock"
     ]
 

@@ -1,8 +1,8 @@
-"""A-contrario consensus over ray pairs (AC-RANSAC): which rays of an object agree, for many objects at once, in torch.
+"""Find which rays of an object agree, for many objects at once, in torch, by a-contrario consensus (AC-RANSAC).
 
-No fixed threshold fits, because the box of a large object wanders by many times the pixel noise. So the consensus is the
-share of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon & Monasse, IPOL
-2, 2012).
+No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
+consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
+& Monasse, IPOL 2, 2012). Its measure is the number of false alarms (NFA): how many subsets agree as well by chance.
 """
 
 import math
@@ -14,20 +14,19 @@ from torch import Tensor
 
 from objslam.triangulation.point_to_lines import least_squares, minimise_distances, object_sum
 
-_VIEW_CAP = 1 - math.cos(math.radians(45))  # The view over which wrong boxes are uniform, a cone with 45 degrees half angle.
-_NOISE_SIGMAS = 3.0  # The standard deviations within which a closer agreement scores no better.
-_MOST_NOISE = 0.25  # The largest share of the view that noise may take; larger lets very noisy rays agree with any point.
-_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together; larger needs more memory.
+_VIEW_CAP = 1 - math.cos(math.radians(45))
+"""The view in which wrong boxes are uniformly distributed: a cone with 45 degrees half angle. Unit: 2 pi sr."""
+_NOISE_SIGMAS = 3.0  # The standard deviations of noise below which a smaller deviation of a ray scores no better.
+_MOST_NOISE = 0.25  # The largest share of the view for noise. A larger one lets very noisy rays agree with any point.
+_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most alternations of Eq. 1 and selection, which end earlier once the agreement stops growing.
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """Rays of many objects, sorted by object.
-
-    origin: (R, 3) m, in coordinates of their object. direction: (R, 3) unit. sigma: (R,) rad. position_sigma: m, noise of
-    the origins. index: (R,) object of each ray. number: (N,) rays of each object.
-    """
+    """Rays of many objects, sorted by object. origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit.
+    sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each
+    ray. number: (N,) number of rays of each object."""
 
     origin: Tensor
     direction: Tensor
@@ -37,7 +36,9 @@ class Bundle:
     number: Tensor
 
     def chunks(self, objects: Tensor, hypotheses: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects (indices) into chunks of similar size: objects (B,), their rays (B, n), and which rays are real."""
+        """Split objects, given by their indices, into chunks of objects with similar numbers of rays. A chunk holds the
+        objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill the rows of objects
+        with fewer rays. hypotheses: the number of points to score per object. It limits the chunks."""
         first = torch.cumsum(self.number, 0) - self.number
         objects = objects[torch.argsort(self.number[objects], stable=True)]
         while len(objects):
@@ -52,7 +53,8 @@ class Bundle:
 
 @dataclass(frozen=True)
 class PointSolution:
-    """Solution of Eq. 1. point: (N, 3). determined: (N,) whether the rays fix it. gradient: (N,) norm. iterations."""
+    """Solutions of Eq. 1. point: (N, 3) m. determined: (N,) whether the rays fix the point. gradient: (N,) norm of the
+    gradient, NaN if they do not. iterations: the number of solver iterations."""
 
     point: Tensor
     determined: Tensor
@@ -61,9 +63,9 @@ class PointSolution:
 
 
 def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
-    """Solve Eq. 1 on the rays in use (R,), from the least-squares points.
+    """Solve Eq. 1 on the rays in `use` (R,), starting at the least-squares points.
 
-    Objects that their rays do not fix keep the point of `least_squares` and get a NaN gradient.
+    An object whose rays fix no point keeps the point of `least_squares` and gets a NaN gradient.
     """
     origin, direction, index = bundle.origin[use], bundle.direction[use], bundle.index[use]
     point, determined = least_squares(origin, direction, index, len(bundle.number))
@@ -76,11 +78,12 @@ def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
-    """Solve Eq. 1 on the rays that agree, and return the solution, inlier (R,) and log NFA (N,).
+    """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
-    The candidates are Eq. 1 on all rays, ray pairs, and a point far ahead, on which nearly parallel rays agree. Eq. 1 and
-    the selection then alternate from the best candidate while the agreement grows. An object without two agreeing rays keeps
-    all its rays. hypotheses and jitter are as in `best_pair`.
+    Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
+    far ahead, on which nearly parallel rays agree. From the best candidate on, two steps alternate while the agreement
+    grows: select the rays that agree with the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all
+    its rays. `hypotheses` and `jitter` are as in `best_pair`.
     """
     used = torch.ones(len(bundle.origin), dtype=torch.bool, device=bundle.origin.device)
     result = solve_points(bundle, used)
@@ -115,7 +118,7 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
 
 
 def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
-    """Return which objects (N,) have all rays within the noise of their point, so that no candidate can be better."""
+    """Return for which objects (N,) all rays agree with the object's point within noise. No other point can score better."""
     to_point = points[bundle.index] - bundle.origin
     distance = to_point.norm(dim=1).clamp(min=1e-12)
     cos = (to_point * bundle.direction).sum(1) / distance
@@ -125,7 +128,7 @@ def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
 
 
 def _far_ahead(bundle: Bundle) -> Tensor:
-    """Return points (N, 3) on each object's mean direction, so far that all its rays see them in one direction."""
+    """Return a point (N, 3) along the mean ray direction of each object, so far that all rays see it in one direction."""
     count = len(bundle.number)
     reach = torch.zeros_like(bundle.number, dtype=bundle.origin.dtype)
     reach = reach.scatter_reduce(0, bundle.index, bundle.origin.norm(dim=1), "amax").clamp(min=1.0)
@@ -134,7 +137,8 @@ def _far_ahead(bundle: Bundle) -> Tensor:
 
 
 def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the consensus about one point (N, 3) per object: inlier (R,), and log NFA (N,), below 0 if not by chance."""
+    """Return which rays (R,) agree with the point (N, 3) of their object, and the log NFA (N,) of this agreement. A log NFA
+    below 0 means that the agreement is not by chance."""
     inlier = torch.zeros(len(bundle.origin), dtype=torch.bool, device=points.device)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
     for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
@@ -145,10 +149,11 @@ def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
-    """Return the points (B, 3) of ray pairs with which the other rays agree most, NaN without a pair.
+    """Return for each object the midpoint (B, 3) of two rays with which its rays agree most. NaN if no midpoint exists.
 
-    objects: (B,) indices. hypotheses: the most pairs tried per object, spread evenly over all its pairs. jitter:
-    (hypotheses,) in [0, 1), the place of each pair in its part. An object's result depends on its own rays alone.
+    objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
+    that many equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of this
+    pair in its part. The result of an object depends on its own rays alone.
     """
     points = bundle.origin.new_full((len(bundle.number), 3), torch.nan)
     log_nfa = torch.full_like(points[:, 0], torch.inf)
@@ -171,7 +176,8 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pairs first < second (B, H) of each object's number (B,) of rays, and whether each pair exists."""
+    """Return the pairs (B, H) of rays `first` < `second` of objects with `number` (B,) rays, and whether each pair exists.
+    which: (H,) indices of the hypotheses, with their jitter (H,)."""
     n = number[:, None].to(jitter.dtype)
     pairs = n * (n - 1) / 2
     rank = torch.where(pairs <= hypotheses, which, torch.floor((which + jitter) * (pairs / hypotheses)))
@@ -186,10 +192,9 @@ def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tu
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist: not if parallel.
-
-    A midpoint may lie behind a ray, which then does not agree with it. `closest_approach` does this in numpy.
-    """
+    """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have
+    no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in
+    numpy."""
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
     cos = (n1 * n2).sum(-1)
@@ -204,7 +209,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that a wrong box is as close to points (B, H, 3) as each ray, 1 if it points away."""
+    """Return the probability (B, H, n) that the ray of a wrong box is as close to the points (B, H, 3) as each ray is. It is
+    1 for a ray that points away from the point, and for a ray that is not `real`."""
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
     distance2 = points.square().sum(-1)[..., None] - 2 * points @ origin.mT + origin.square().sum(-1)[:, None]
@@ -218,10 +224,11 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest log NFA (B, H) over all shares of rays with chances (B, H, n), and the largest chance in that share.
+    """Return the lowest log NFA (B, H) over all k, and the k-th lowest chance for this k. The k rays with the lowest chances
+    are the ones that agree. chance: (B, H, n) of each ray.
 
-    NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays are 2 k numbers, and 3 of
-    them determine the point. Each p counts for 2 numbers.
+    NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
+    and 3 of them determine the point. Each p counts for 2 coordinates.
     """
     chance = chance.sort(dim=-1).values
     n = number.to(chance.dtype)[:, None]

@@ -1,4 +1,4 @@
-"""Covariance and parallax of triangulated objects, and their fusion with ranges, for many objects at once, in torch."""
+"""Compute covariance and parallax of triangulated objects, and fuse rays with ranges, for many objects at once, in torch."""
 
 import math
 
@@ -9,19 +9,20 @@ from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.ac_ransac import Bundle
 from objslam.triangulation.point_to_lines import Lines, object_sum
 
-_EVERY_PAIR = 256  # The most rays of an object whose pairs are all compared for the widest angle; larger costs time.
-_RANGE_ITERATIONS = 30  # The iterations of the range fit from the median range, the same for all objects of a batch.
+_EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
+_RANGE_ITERATIONS = 30  # The iterations of the range fit, which starts at the median range. All objects take as many.
 
 
 def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return covariances (N, 3, 3) m^2 of Eq. 1's solutions (N, 3) on the rays in use (R,), NaN if these fix no point.
+    """Return the covariance (N, 3, 3) m^2 of each solution of Eq. 1 on the rays in `use` (R,). NaN if these fix no point.
 
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
-    & Ronchetti, Robust Statistics, ch. 6). Offsets are Gaussian with s_i along both axes across ray i. The unit offset u
-    then has E[u u^T] = P / 2, and is independent of the distance with E[1 / distance] = sqrt(pi / 2) / s_i. So a ray adds
-    sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1
-    also has a bias that more rays do not reduce. Angular noise tilts the unit offset forward along ray i of length
-    r_i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, because rays miss a nearer object by less. The result includes its square.
+    & Ronchetti, Robust Statistics, ch. 6). The offset of ray i is Gaussian with standard deviation s_i along both axes
+    across the ray. Then its direction u has E[u u^T] = P / 2, where P projects across the ray. Its length d is independent
+    of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i
+    widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not reduce: rays miss a nearer
+    object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, where r_i is the
+    length of the ray. The result includes the square of this bias.
     """
     rays = _used(bundle, use)
     lines, index = Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point)), rays.index
@@ -38,11 +39,12 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 
 def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
-    """Fuse rays in use with ranges (R,) m along them, NaN for none, to points (N, 3) and covariances (N, 3, 3).
+    """Fuse the rays in `use` (R,) with their ranges (R,) m, and return points (N, 3) m and covariances (N, 3, 3) m^2.
 
-    It is for objects whose rays alone are too uncertain, and gives NaN for objects without a range. The loss is squared
-    across the rays, whose outliers are already removed. It is Cauchy's along the rays, because a range may belong to the
-    background. `association.refinement.refine` is robust in both directions and gives no covariance.
+    It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
+    range gets NaN. The loss is squared across the rays, because their outliers are already removed. It is Cauchy's along the
+    rays, because a range may belong to the background. `association.refinement.refine` is robust in both directions and
+    gives no covariance.
     """
     rays, count = _used(bundle, use), len(bundle.number)
     ranges, range_sigma = ranges[use], range_sigma[use]
@@ -87,30 +89,28 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
 
 
 def largest_sigma(covariances: Tensor) -> Tensor:
-    """Return the largest standard deviation (N,) m in any direction of covariances (N, 3, 3), inf for NaN."""
+    """Return the standard deviation (N,) m of each covariance (N, 3, 3) m^2 in its most uncertain direction. inf for NaN."""
     known = covariances.isfinite().all(dim=2).all(dim=1)
     variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
     return torch.where(known, variance.sqrt(), torch.inf)
 
 
 def reach(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return the median distance (N,) m of points (N, 3) from the origins of their rays in use (R,), NaN without rays."""
+    """Return the median distance (N,) m of each point (N, 3) from the origins of its rays in `use` (R,), or NaN."""
     index = bundle.index[use]
     return object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
 
 
 def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
-    """Return which objects (N,) lie ahead of more than half of their rays in use."""
+    """Return whether each point (N, 3) lies ahead of more than half of its rays in `use` (R,)."""
     index = bundle.index[use]
     towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1).sign()
     return object_sum(towards, index, len(point)) > 0
 
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
-    """Return the widest angle (N,) rad between any two of an object's rays in use (R,), as undirected lines.
-
-    For objects with many rays it compares only the extreme rays in 64 directions, which is exact to 1 %.
-    """
+    """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
+    For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
     rays = _used(bundle, use)
     widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
     axes = _sphere(64, rays.direction)
@@ -134,7 +134,8 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
 
 
 def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Return the median (N,) of each object's values (R,), NaN without values. `core.statistics` does this in numpy."""
+    """Return the median (N,) of the values (R,) of each object. NaN without values. index: (R,) the object of each value.
+    `core.statistics.grouped_median` returns the upper median in numpy."""
     if len(values) == 0:
         return values.new_full((count,), torch.nan)
     order = torch.argsort(values)
@@ -153,17 +154,16 @@ def _used(bundle: Bundle, use: Tensor) -> Bundle:
 
 
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
-    """Return the standard deviation (R,) m of the offset of an object from each ray, per perpendicular axis."""
+    """Return the standard deviation (R,) m, along each perpendicular axis, of the offset between each ray and its object."""
     return ((rays.sigma * distance).square() + rays.position_sigma**2).sqrt().clamp(min=1e-12)
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
-    """Return the factor (N,), at least 1, by which the variance exceeds its expectation, from normalised residuals (R,).
-
-    It uses the mean residual, which is robust. The fit takes `taken` of the 2 n degrees of freedom and leaves the rest. The
-    excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain. The factor 1 + 3.2 / (rest - 2)
-    is the 95 % quantile of F(3, rest) over its limit, to 3 % from 4 rays on.
-    """
+    """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation. miss: (R,)
+    normalised residuals. Their mean is used, because it is robust. The fit takes `taken` of the 2 n degrees of freedom of n
+    rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain.
+    The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
+    exact to 3 % from 4 rays on."""
     number = rays.number.to(miss.dtype)
     mean = object_sum(miss, rays.index, len(number)) / number.clamp(min=1) / RAYLEIGH_MEAN
     rest = (2 * number - taken).clamp(min=1)

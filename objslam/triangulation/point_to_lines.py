@@ -1,4 +1,4 @@
-"""Solve Eq. 1 of Staszak & Belter for many objects at once, in torch: the point with the least sum of distances to lines."""
+"""Solve Eq. 1 of Staszak & Belter: find the point with the least sum of distances to lines, for many objects at once."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import Self
 import torch
 from torch import Tensor
 
-_MAX_ITERATIONS = 80  # The most Newton steps; a solved object leaves the batch earlier.
+_MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the batch earlier.
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
-_LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances) above the rounding errors.
-_ON_LINE = (1e-7, 1e-5)  # The tried distances (in mean distances) within which the exact solution may lie on a line.
+_LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
+_ON_LINE = (1e-7, 1e-5)  # The tried values of `on_line` in `_exact_optimum` (in mean distances).
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of many objects. foot: (R, 3) the point of each line nearest to its object's origin. direction: (R, 3) unit.
+    """Lines of many objects. foot: (R, 3) the point of each line nearest to the coordinate origin. direction: (R, 3) unit.
     index: (R,) the object of each line. count: the number N of objects."""
 
     foot: Tensor
@@ -27,44 +27,44 @@ class Lines:
 
     @classmethod
     def through(cls, origin: Tensor, direction: Tensor, index: Tensor, count: int) -> Self:
-        """Make lines through points (R, 3), in coordinates of their object, along unit directions (R, 3)."""
+        """Make lines through the points `origin` (R, 3), in coordinates of their object, along unit directions (R, 3)."""
         # The first projection leaves a rounding error along the line of the size of the origin. The second removes it.
         return cls(perpendicular(perpendicular(origin, direction), direction), direction, index, count)
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum values (R, ...) over each object's lines, to (N, ...)."""
+        """Return the sum (N, ...) of the values (R, ...) over the lines of each object."""
         return object_sum(values, self.index, self.count)
 
     def offset(self, points: Tensor) -> Tensor:
-        """Return the perpendicular offsets (R, 3) of each object's point (N, 3) from its lines. Eq. 1 sums their norms."""
+        """Return the perpendicular offset (R, 3) from each line to the point (N, 3) of its object. Eq. 1 sums the norms."""
         return perpendicular(points[self.index], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Sum weight (R,) times I - n n^T over each object's lines, to (N, 3, 3)."""
+        """Return the sum (N, 3, 3) of weight (R,) times I - n n^T over the lines of each object with directions n."""
         eye = torch.eye(3, dtype=weight.dtype, device=weight.device)
         return self.sum(weight)[:, None, None] * eye - self.outer(self.direction * weight[:, None], self.direction)
 
     def outer(self, a: Tensor, b: Tensor) -> Tensor:
-        """Sum (a b^T + b a^T) / 2 of vectors (R, 3) over each object's lines, to (N, 3, 3)."""
+        """Return the sum (N, 3, 3) of (a b^T + b a^T) / 2 over the lines of each object, with vectors a, b (R, 3)."""
         (a0, a1, a2), (b0, b1, b2) = a.T, b.T
         off = (0.5 * (a0 * b1 + a1 * b0), 0.5 * (a0 * b2 + a2 * b0), 0.5 * (a1 * b2 + a2 * b1))
         six = self.sum(torch.stack([a0 * b0, a1 * b1, a2 * b2, *off], dim=1))
         return six[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].view(-1, 3, 3)
 
     def select(self, objects: Tensor) -> tuple[Lines, Tensor]:
-        """Return the lines of some objects (N,) bool, renumbered, and the mask (R,) of these lines."""
+        """Return the lines of the selected objects (N,), with new object numbers, and the mask (R,) of these lines."""
         rays = objects[self.index]
         number = torch.cumsum(objects, 0) - 1
         return Lines(self.foot[rays], self.direction[rays], number[self.index[rays]], int(objects.sum())), rays
 
 
 def object_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Sum values (R, ...) over each object's rays, to (N, ...)."""
+    """Return the sum (N, ...) of the values (R, ...) over the rays of each object."""
     return values.new_zeros((count, *values.shape[1:])).index_add_(0, index, values)
 
 
 def perpendicular(vectors: Tensor, direction: Tensor) -> Tensor:
-    """Return the parts (R, 3) of vectors perpendicular to unit directions (R, 3)."""
+    """Return the part (R, 3) of each vector (R, 3) that is perpendicular to its unit direction (R, 3)."""
     return vectors - direction * dot(vectors, direction)[:, None]
 
 
@@ -74,10 +74,10 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the points (N, 3) with the least sum of squared distances to their lines, and whether lines fix them (N,).
+    """Return the points (N, 3) with the least sum of squared distances to their lines, and whether the lines fix them (N,).
 
-    Parallel lines and a single line fix no point. The result is then 1 m ahead of the mean origin on the mean line. It is
-    NaN without lines.
+    Parallel lines and a single line fix no point. The result is then the point of the mean line that lies 1 m ahead of the
+    mean origin. It is NaN without lines.
     """
     number = object_sum(torch.ones_like(origin[:, 0]), index, count)
     base = object_sum(origin, index, count) / number[:, None]  # Map coordinates may be large.
@@ -95,7 +95,7 @@ def least_squares(origin: Tensor, direction: Tensor, index: Tensor, count: int) 
 
 
 def minimise_distances(origin: Tensor, direction: Tensor, index: Tensor, start: Tensor) -> tuple[Tensor, int, Tensor]:
-    """Solve Eq. 1 for N objects from a start (N, 3), and return points (N, 3), iterations and norms (N,) of the gradient.
+    """Solve Eq. 1 from the start (N, 3). Return the points (N, 3), the number of iterations, and the gradient norms (N,).
 
     If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
     The lines of each object must fix a point. Objects without lines keep their start.
@@ -126,8 +126,9 @@ def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
     """Minimise the sum of sqrt(distance^2 + epsilon^2) for all objects by primal-dual Newton, while epsilon goes to zero.
 
     The method is Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000), with Chan, Golub & Mulet's
-    linearisation. The dual (R, 3) of a line is the unit offset. If the solution lies on the line, it is another vector in
-    the unit ball across the line. Lengths are in mean distances of the object, and coordinates from its own origin.
+    linearisation. It returns the points (N, 3), the dual (R, 3) of each line, and the number of iterations. The dual is the
+    unit offset. If the solution lies on the line, the dual is another vector in the unit ball across the line. The unit of
+    length is the mean distance of an object from its lines at the start.
     """
     zeros = lines.foot.new_zeros(lines.count)
     point, dual = zeros[:, None].repeat(1, 3), torch.zeros_like(lines.foot)
@@ -140,7 +141,7 @@ def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
     for iteration in range(_MAX_ITERATIONS):
         distance = q.norm(dim=1).clamp(min=_TINY)
         gradient = lines.sum(q / distance[:, None]).norm(dim=1)
-        # Rounding limits the gradient: an offset is exact to 1e-16, and its direction to 1e-16 over its length.
+        # Rounding limits the gradient: an offset is exact to 1e-16, and its direction to 1e-16 divided by its length.
         finished = gradient <= 4e-16 * lines.sum(1 + 1 / distance).clamp(max=1e6)
         finished |= late >= 4
         if finished.any():
@@ -163,7 +164,7 @@ def _smoothed_optimum(lines: Lines) -> tuple[Tensor, Tensor, int]:
 
 
 def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Take one damped primal-dual step from points o (N, 3) with offsets q and duals y (R, 3), to the new o, q, y."""
+    """Take one damped primal-dual step. Return the new points o (N, 3), offsets q (R, 3) and duals y (R, 3)."""
     r = _radius(q, epsilon[lines.index])
     hessian = lines.spread(1 / r) - lines.outer(y / r.square()[:, None], q)
     trace = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
@@ -189,9 +190,9 @@ def _newton_step(lines: Lines, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor)
 def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) -> tuple[Tensor, Tensor]:
     """Return the exact optimum (N, 3) next to the smoothed one, and the norm (N,) of its smallest subgradient.
 
-    Lines within on_line of the smoothed solution are assumed to pass through the exact one. The point moves onto these
-    lines, and Newton steps use the remaining freedom. The subgradient shows whether the assumption holds. It is inf if the
-    lines do not meet.
+    Lines within the distance `on_line` of the smoothed solution are assumed to pass through the exact one. The point moves
+    onto these lines, and Newton steps use the remaining freedom. The subgradient shows whether the assumption holds. Its
+    norm is inf if these lines do not meet.
     """
     on = lines.offset(point).norm(dim=1) <= on_line
     weight = on.to(point.dtype)[:, None]
@@ -209,7 +210,7 @@ def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) ->
             inverse_d = (1 - weight) / d
             curvature = lines.spread(inverse_d[:, 0]) - lines.outer(u * inverse_d, u)
             point = point - _short_newton(free @ curvature @ free, _apply(free, pull))
-    # For the smallest subgradient, each line on the point may oppose the pull of the others with at most 1.
+    # Each line through the point may add a vector of length up to 1. These vectors make the subgradient smallest.
     answer = perpendicular(dual, lines.direction) * weight
     for _ in range(30 if bool(on.any()) else 0):
         rest = pull + lines.sum(answer)
@@ -220,7 +221,7 @@ def _exact_optimum(lines: Lines, point: Tensor, dual: Tensor, on_line: float) ->
 
 
 def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
-    """Return Newton steps (N, 3) along curved directions, at most 1e-3 long, because the solution is near."""
+    """Return Newton steps (N, 3) along directions in which the cost curves. They are short, because the solution is near."""
     scale = hessian.diagonal(dim1=1, dim2=2).sum(1).clamp(min=_TINY)
     eigenvalues, vectors = torch.linalg.eigh(hessian / scale[:, None, None])
     inverse = torch.where(eigenvalues > 1e-10, 1 / eigenvalues.clamp(min=_TINY), 0.0)

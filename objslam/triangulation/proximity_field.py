@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats
 from objslam.triangulation.triangulate import solve_eq1
 
-_AT_ONCE = 2_000_000  # The most distances computed together; larger needs more memory.
+_AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _REACH = 8.0  # Half the edge of a slice, as a multiple of the rays' median distance from the minimum.
 _LEAST_REACH, _MOST_REACH = 0.15, 3.0  # The least and the largest half edge (m) of a slice.
 
@@ -22,11 +22,9 @@ class FieldSlice:
 
 @dataclass(frozen=True)
 class ProximityField:
-    """The field of one object.
-
-    minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays there. horizontal: the slice through it
-    parallel to the floor. vertical: the slice along the mean direction of the rays, where the object is the least certain.
-    """
+    """The field of one object. minimum: (3,) m, the solution of Eq. 1. cost: m, the mean distance of the rays from the
+    minimum. horizontal: the slice through the minimum parallel to the floor. vertical: the upright slice through the minimum
+    along the mean direction of the rays, in which the object is the least certain."""
 
     minimum: Floats
     cost: float
@@ -35,7 +33,7 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the mean distance, m, of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit: Eq. 1's cost over R."""
+    """Return the mean distance (...) m of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit: the cost of Eq. 1 over R."""
     flat = points.reshape(-1, 3)
     centre = flat.mean(axis=0)  # Squares of large map coordinates would hide small distances.
     p, m = flat - centre, origins - centre
@@ -51,10 +49,10 @@ def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
 
 
 def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach: float | None = None) -> ProximityField:
-    """Return the field of the object of R >= 2 rays (R, 3), (R, 3) unit, in slices of size x size points.
+    """Return the field of one object with R >= 2 rays (R, 3), (R, 3) unit. A slice has `size` x `size` points.
 
-    reach: half the edge of a slice, m. None derives it from the distances of the rays. Parallel rays have no minimum, and
-    their slices lie 1 m ahead, as in `solve_eq1`.
+    reach: half the edge of a slice, m. None derives it from the distances of the rays. Parallel rays have no minimum.
+    Their slices then lie 1 m ahead, at the point of `solve_eq1`.
     """
     minimum = solve_eq1(origins, directions, np.zeros(len(origins), dtype=np.int64), 1)[0][0]
     off = np.linalg.norm(np.cross(minimum - origins, directions), axis=1)
@@ -74,13 +72,13 @@ def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach:
 
 
 def main_heading(directions: Floats) -> Floats:
-    """Return the mean horizontal unit direction (3,) of rays with directions (R, 3) as lines, or east if they have none."""
+    """Return the mean horizontal unit direction (3,) of undirected rays (R, 3). It is east if all rays are vertical."""
     flat = directions[:, :2]
     values, axes = np.linalg.eigh(flat.T @ flat)
     return np.array([1.0, 0.0, 0.0] if values[1] < 1e-12 else [*axes[:, 1], 0.0])
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Return which rays (R,) of an object (R,) bool have a weight above 0, or all its rays if none has."""
+    """Return a mask (R,) of the rays of one object (R,) that have a weight above 0. If none has, it holds all its rays."""
     kept = object_ & (weight > 0)
     return kept if kept.any() else object_

@@ -1,6 +1,6 @@
-"""Triangulate objects from rays with known poses: Eq. 1 of Staszak & Belter on the rays that agree, for a whole log at once.
+"""Triangulate all objects of a log at once from rays with known poses, by Eq. 1 of Staszak & Belter on the rays that agree.
 
-Inputs and outputs are numpy float64 arrays. The first call imports torch and the modules with it, which takes long.
+Inputs and outputs are numpy float64 arrays. The first call imports torch and the modules that use it, which takes long.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ if TYPE_CHECKING:
     from objslam.triangulation.ac_ransac import Bundle
 
 _CUDA_PAYS = 200_000
-"""The number of rays from which the device "auto" is CUDA. One CPU core solves Eq. 1 for 50,000 rays in 0.12 s and
-triangulates them in 0.6 s. For much fewer rays the start of CUDA alone takes longer. The exact limit depends on the card."""
+"""The least number of rays for which the device "auto" is CUDA. One CPU core solves Eq. 1 for 50,000 rays in 0.12 s and
+triangulates them in 0.6 s. For much fewer rays the start of CUDA alone takes longer. The best limit depends on the card."""
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """N objects from one batch of R rays, all in the frame of the rays (map).
+    """N objects from one batch of R rays, in the coordinate frame of the rays (map).
 
-    positions: (N, 3) m, NaN without rays. If the rays do not fix an object, it is a point on their mean ray, 1 m ahead if no
-    range was measured. covariance: (N, 3, 3) m^2, NaN if not determined. ok: (N,) whether the position is reliable.
-    parallax: (N,) rad, the widest angle between inlier rays as lines. rms: (N,) rad, angular residual of the inlier rays.
-    distance: (R,) m, Eq. 1's distance of a ray to its object, NaN without object. weight: (R,) 1 for an inlier, else 0.
-    counts: (N,) number of inlier rays. iterations: of the solver. gradient: (N,) norm of Eq. 1's gradient at the solution,
-    or of the smallest subgradient if rays pass through it, NaN for a position that is not from Eq. 1.
+    positions: (N, 3) m, NaN without rays. If the rays do not fix an object, its position is a point on their mean ray. The
+    point lies 1 m ahead if no range was measured. covariance: (N, 3, 3) m^2, NaN if not determined. ok: (N,) whether the
+    position is reliable. parallax: (N,) rad, the widest angle between inlier rays as undirected lines. rms: (N,) rad, root
+    mean square angle between the inlier rays and the object. distance: (R,) m between a ray and its object as in Eq. 1, NaN
+    without object. weight: (R,) 1 for an inlier, else 0. counts: (N,) number of inlier rays. iterations: number of solver
+    iterations. gradient: (N,) norm of the gradient of Eq. 1 at the solution, or of the smallest subgradient if rays pass
+    through the solution. It is NaN for a position that is not from Eq. 1.
     """
 
     positions: Floats
@@ -64,19 +65,20 @@ def triangulate(
     range_sigma: ArrayLike | None = None,
     position_sigma: float = 0.0,
 ) -> Triangulation:
-    """Triangulate all objects of a batch by consensus and Eq. 1 on the rays that agree, with covariance and status.
+    """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
-    An object is ok if at least 2 rays agree, more closely than by chance, with the parallax and the relative precision of
-    the settings, and if it lies ahead of most of these rays. Ranges are fused only for an object whose rays fail these
-    limits, or for which one range is more precise than all rays. Other objects keep the position of Eq. 1, because a range
-    ends on the surface of an object and its rays meet inside. The result does not depend on other objects or on ray order.
+    An object is ok if at least 2 rays agree more closely than by chance, if their parallax and the relative precision meet
+    the limits of the settings, and if the object lies ahead of most of these rays. Ranges are fused only for an object
+    whose rays fail these limits, or for which one range is more precise than all rays. Other objects keep the position of
+    Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object does not
+    depend on other objects or on ray order.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
         object_index: (R,) the object of each ray, -1 for none, of `count` objects.
-        sigma: (R,) or one number, rad, of a ray's angle along each perpendicular axis.
-        ranges, range_sigma: (R,) m along the rays, NaN if unknown, and (R,) or one number, m.
-        position_sigma: m, of the origins.
+        sigma: (R,) or one number, rad, the noise of a ray's angle along each perpendicular axis.
+        ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
+        position_sigma: m, the noise of the origins along each axis.
     Raises:
         ValueError: the arrays do not fit together or are not finite.
         ConfigError: the device does not exist.
@@ -144,10 +146,10 @@ def triangulate(
 def closed_form(
     origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int, *, device: config.Device = "auto"
 ) -> tuple[Floats, Bools]:
-    """Return the points (N, 3) m with the least sum of squared distances to their rays' lines, and which are unique (N,).
+    """Return the points (N, 3) m with the least sum of squared distances to their rays as lines, and which are unique (N,).
 
-    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then 1 m ahead of the mean
-    origin on the mean ray. It is NaN without rays.
+    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then the point of the mean
+    ray that lies 1 m ahead of the mean origin. It is NaN without rays.
     """
     from objslam.triangulation import point_to_lines
 
@@ -162,12 +164,12 @@ def solve_eq1(
 ) -> tuple[Floats, int, Floats]:
     """Solve Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
 
-    Arguments are as in `triangulate`. Objects that their rays do not fix get the point of `closed_form`. Two rays have their
-    whole common perpendicular as optimum, and the result is its midpoint.
+    Arguments are as in `triangulate`. An object whose rays fix no point gets the point of `closed_form`. For two rays, each
+    point between them on their common perpendicular is optimal, and the result is the midpoint.
 
     Returns:
-        The points (N, 3) m, the iterations, and the norm (N,) of the gradient, NaN if the rays do not fix a point. If rays
-        pass through the solution, it is the norm of the smallest subgradient. So a value of 0 always proves the optimum.
+        The points (N, 3) m, the number of iterations, and the norm (N,) of the gradient. The norm is NaN if the rays fix no
+        point. If rays pass through the solution, it is the norm of the smallest subgradient. So 0 always proves the optimum.
     """
     import torch
 
@@ -203,7 +205,7 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray, which must be finite and above 0 for rays with a `needed` number (default: all rays)."""
+    """Return one value per ray. It must be finite and above 0 if the ray's `needed` is finite (default: for all rays)."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
@@ -214,7 +216,7 @@ def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None =
 def _bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, device: config.Device
 ) -> tuple[Ints, torch.Tensor, Bundle]:
-    """Return the indices of rays with an object in bundle order, the mean origin (N, 3) of each object, and the bundle."""
+    """Return the indices of the rays with an object, the mean ray origin (N, 3) of each object, and their bundle."""
     import torch
 
     from objslam.triangulation import point_to_lines
@@ -227,7 +229,7 @@ def _bundle(
     objects = torch.from_numpy(index[where]).to(place)
     base = point_to_lines.object_sum(origin, objects, count) / number[:, None]
     origin = origin - base[objects]
-    # The rays are sorted by their distance from the closed form. So their order and frame do not affect the tried pairs.
+    # The rays are sorted by their distance from the closed form. So the input order does not affect the tried pairs.
     points, _ = point_to_lines.least_squares(origin, direction, objects, count)
     order = torch.argsort(point_to_lines.Lines.through(origin - points[objects], direction, objects, count).foot.norm(dim=1))
     order = order[torch.argsort(objects[order], stable=True)]
@@ -236,7 +238,7 @@ def _bundle(
 
 
 def _miss(m: Floats, n: Floats, index: Ints, positions: Floats) -> tuple[Floats, Floats]:
-    """Return the distance (R,) m and the angle (R,) rad between each ray and its object, NaN without object."""
+    """Return the distance (R,) m and the angle (R,) rad between each ray and its object. NaN for a ray without object."""
     to_object = np.full_like(m, np.nan)
     has = index >= 0
     to_object[has] = positions[index[has]] - m[has]

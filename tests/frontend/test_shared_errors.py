@@ -74,11 +74,12 @@ def test_the_corrected_log_has_the_same_keyframes(clean):
     values = vector(errors, {**ERRORS, "front.x": 0.1, "front.focal": 0.03})
     found, rays, _ = errors.at(values)
     again, again_rays, _ = measured(errors.corrected_log(values))
-    both = np.isin(found.frame, again.frame)
-    assert_allclose(found.odom_T_base[both], again.odom_T_base, atol=1e-9)
-    assert_allclose(found.base_T_camera[both], again.base_T_camera, atol=1e-9)
-    some = np.isin(rays.keyframe, np.flatnonzero(both))
-    assert_allclose(rays.direction[some], again_rays.direction, atol=1e-9)
+    ours, theirs = np.isin(found.frame, again.frame), np.isin(again.frame, found.frame)  # one that leaves the path is dropped
+    assert ours.sum() > 110
+    assert_allclose(found.odom_T_base[ours], again.odom_T_base[theirs], atol=1e-9)
+    assert_allclose(found.base_T_camera[ours], again.base_T_camera[theirs], atol=1e-9)
+    here, there = (np.isin(r.keyframe, np.flatnonzero(k)) for r, k in ((rays, ours), (again_rays, theirs)))
+    assert_allclose(rays.direction[here], again_rays.direction[there], atol=1e-9)
 
 
 def test_noise_is_scaled_with_what_it_belongs_to(clean):

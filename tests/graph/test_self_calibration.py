@@ -55,7 +55,7 @@ def optimum(errors: SharedErrors, theta, made, start):
 def test_the_reduced_system_is_that_of_solving_anew(localization):
     """Brute force: solve at parameters that differ a little; the positions move as the sensitivity says."""
     more = ("calibration.focal=0.01", "calibration.translation=0.01")
-    made, errors = drive({}, overrides=more, frames=60, depth=DepthNoise(), missed=0.0, false=0.0, localization=localization)
+    made, errors = drive({}, overrides=more, frames=200, depth=DepthNoise(), missed=0.0, false=0.0, localization=localization)
     theta = np.zeros(len(errors.names))
     true = made.map_T_base @ made.keyframes.base_T_camera
     start = (made.keyframes.map_T_camera[0] @ inverse(true[0])) @ true, made.points
@@ -90,7 +90,7 @@ def test_what_bearings_do_not_tell_stays_at_its_prior_and_widens_the_map():
     made, errors = drive(ERRORS, overrides=("calibration.scale=0.05",))
     found, held = solve(made, errors), solve(*drive(ERRORS, overrides=("calibration.scale=0",)))
     k = errors.names.index("odometry.scale")
-    assert abs(found.calibration.values[k]) < 0.2 * 0.05
+    assert abs(found.calibration.values[k]) < 0.4 * 0.05
     assert found.calibration.sigma[k] > 0.95 * 0.05
     assert not found.calibration.to_dict()["parameters"]["odometry.scale"]["observable"]
     away = found.positions - made.keyframes.map_T_base[0, :3, 3]

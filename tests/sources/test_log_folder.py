@@ -187,7 +187,7 @@ def test_what_cannot_be_written(log, tmp_path):
         (replace(log, cameras=()), "without cameras"),
         (replace(log, odometry=None, localization=None), "without odometry or localization"),
         (replace(log, cameras=(camera_log, camera_log)), "names must differ"),
-        (replace(log, cameras=(camera_log, _camera_log("../x", camera_log.rgb.paths))), "file names"),
+        (replace(log, cameras=(camera_log, _camera_log("../x", camera_log.rgb.paths))), "folder names"),
         (replace(log, cameras=(lost,)), "lost.png"),
     ):
         with pytest.raises(OutputError) as caught:

@@ -88,7 +88,7 @@ def test_odd_files_are_dropped_and_named(numbered, tmp_path):
     assert [detections.label_names[i] for i in detections.label] == ["cabinet", "cabinet", "person"]
     assert np.isnan(detections.depths).all()
     assert ledger.dropped == {
-        "numbered file with the number of another file": 1,
+        "second file with the same number": 1,
         "numbered file that leaves the folder": 1,
         "numbered file that no pose belongs to": 2,
         'box line that is not "[class] x y w h score"': 2,

@@ -9,8 +9,8 @@ from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""The distance (m) of a virtual camera behind its ray. A larger value leaves less perspective and rounds more coarsely. The
-relative error is the range divided by the distance. The distance was chosen for a rounding (1e-16 of it) of a nanometre."""
+"""The distance (m) of a virtual camera behind the origin of its ray. A larger value leaves less perspective and rounds more
+coarsely. The relative error by perspective is the range divided by this distance. Rounding (1e-16 of it) is a nanometre."""
 L1_RADIANS = 1e-4
 """The angle (rad) below which the loss `l1` on bearings is quadratic, which gives it a derivative at 0. A larger angle is
 smoother and less like a norm. It was chosen far below the noise of a box (a twentieth of a pixel)."""
@@ -22,7 +22,7 @@ _CENTRE = np.zeros(2)
 
 
 def bearings(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return factors on the angle (rad) at X(keyframe) between L(landmark) and a direction (R, 3) in the camera frame."""
+    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe)."""
     make, unit = gtsam.BearingFactor3D, gtsam.Unit3
     return [
         make(X0 + k, L0 + j, unit(direction), model)
@@ -31,7 +31,7 @@ def bearings(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -
 
 
 def point_to_line(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return factors on the distance (m, Eq. 1) of L(landmark) from a ray of X(keyframe).
+    """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray, which starts at X(keyframe).
 
     The directions (R, 3) are in the camera frame. The pose is a variable.
     """
@@ -43,7 +43,7 @@ def point_to_line(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noi
 
 
 def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return factors on the distance (m, Eq. 1) of L(landmark) from a fixed ray.
+    """Return a factor for each fixed ray on the distance (m, Eq. 1) of L(landmark) from the ray.
 
     Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
     """
@@ -55,9 +55,9 @@ def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noi
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return for each ray, origin (R, 3) and direction (R, 3), a distant camera that looks along the ray.
+    """Return a distant camera for each ray. It looks along the ray, which has an origin (R, 3) and a direction (R, 3).
 
-    Its image of a point is the offset (m) of the point across the ray.
+    The camera images a point at the point's offset (m) across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])

@@ -16,8 +16,8 @@ def localizations(
 ) -> list[gtsam.NonlinearFactor]:
     """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
-    The priors have Huber's loss, because a localisation may jump. Keyframes that share a measurement share its information.
-    on_plane: whether the path is planar. If it is None, the poses decide.
+    The priors have Huber's loss, because a localisation may jump. Keyframes that share one measurement share its information
+    in equal parts. on_plane: whether the path is planar. If it is None, the poses decide.
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [

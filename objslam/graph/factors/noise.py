@@ -1,4 +1,4 @@
-"""Make noise models from a standard deviation and a loss, which limits the influence of outliers."""
+"""Make noise models from standard deviations and a loss. The loss limits the influence of outliers."""
 
 from collections.abc import Sequence
 from functools import lru_cache

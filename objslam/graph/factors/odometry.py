@@ -1,4 +1,4 @@
-"""Compute motions between keyframes by odometry, their covariances, and their factors."""
+"""Compute the motions between keyframes that odometry measures, with their covariances and their factors."""
 
 import gtsam
 import numpy as np
@@ -17,9 +17,9 @@ chosen for a robot that somebody carries a few steps."""
 def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:
     """Return the camera motions (K-1, 4, 4) between consecutive keyframes, and their covariances (K-1, 6, 6).
 
-    A motion is E_prev^-1 * odo * E_next. Its covariance is Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation
-    first. S is the covariance in base that the odometry accumulated between the two keyframes. Rows that are not
-    `Keyframes.measured` have no meaning.
+    A motion is E_prev^-1 * odo * E_next. E is base_T_camera, and odo is the motion of base. The covariance is
+    Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation first. S is the covariance in base that the odometry
+    accumulated between the two keyframes. Rows that are not `Keyframes.measured` have no meaning.
     on_plane: whether the path is planar. If it is None, the poses decide. ValueError if the keyframes have no odometry.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
@@ -33,7 +33,7 @@ def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = No
 
 
 def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
-    """Return whether the odometry is planar. With a localisation, each stretch may have a plane of its own."""
+    """Return whether the odometry is planar. With a localisation, each stretch without a gap may have its own plane."""
     stretch = keyframes.stretch
     if stretch is None or not keyframes.localized_every:
         return is_planar(odom_T_base)

@@ -13,7 +13,7 @@ value conditions the linear system worse. It was chosen far below the noise of a
 
 
 def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> list[gtsam.NonlinearFactor]:
-    """Return a weak prior on each of the landmarks (n,) at its row of positions (N, 3)."""
+    """Return a weak prior on each of the landmarks (n,). The mean is the landmark's row of positions (N, 3)."""
     return [point_prior(j, positions[j], settings.joint.prior_sigma) for j in landmarks.tolist()]
 
 

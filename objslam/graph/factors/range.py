@@ -1,4 +1,4 @@
-"""Factors for the measured range of a box, with the pose as a variable or fixed."""
+"""Factors for the measured range of a box. The camera pose is a variable or fixed."""
 
 import gtsam
 import numpy as np
@@ -9,7 +9,7 @@ from objslam.graph.variables import L0, X0
 
 
 def ranges(keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return factors on the distance (R,), m, between X(keyframe) and L(landmark)."""
+    """Return one factor for each of the distances `measured` (R,), m, between X(keyframe) and L(landmark)."""
     return [
         gtsam.RangeFactor3D(X0 + k, L0 + j, r, model)
         for k, j, r, model in zip(keyframe.tolist(), landmark.tolist(), measured.tolist(), noise, strict=True)
@@ -19,9 +19,9 @@ def ranges(keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise) -> li
 def along_ray(
     origins: Floats, directions: Floats, measured: Floats, sigmas: Floats, landmark: Ints
 ) -> list[gtsam.NonlinearFactor]:
-    """Return factors on the distance (R,), m, of L(landmark) along a fixed ray, with Huber's loss.
+    """Return one factor with Huber's loss for each of the distances `measured` (R,), m, of L(landmark) along a fixed ray.
 
-    Origins (R, 3) and directions (R, 3) are in map. Each factor has information along its ray only.
+    Origins (R, 3) and directions (R, 3) are in map. A factor does not restrict the landmark across its ray.
     """
     points = origins + directions * measured[:, None]
     roots = np.zeros((len(points), 3, 3))

@@ -17,8 +17,8 @@ from objslam.graph.factors.range import ranges
 class Bearings:
     """Rays of a live session, in the form that its graph takes.
 
-    number: (n,) the ray's own number. keyframe, landmark: (n,) numbers of X and L. direction: (n, 3) in the camera frame.
-    sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m.
+    number: (n,) the number of each ray. keyframe: (n,) the k of X(k). landmark: (n,) the j of L(j). direction: (n, 3) in the
+    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m.
     """
 
     number: Ints
@@ -33,10 +33,10 @@ class Bearings:
 def ray_factors(
     rays: Rays | Bearings, landmark: Ints, loss: Loss, settings: Settings
 ) -> list[tuple[Ints, list[gtsam.NonlinearFactor]]]:
-    """Return the factors of rays by kind: for each kind, the indices (m,) of its rays and one factor for each of these rays.
+    """Return for each kind of factor the indices (m,) of the rays that have it, and one factor for each of these rays.
 
-    The first kind is the bearing of every ray. If joint.factor asks for it, the point-to-line distance takes its place. The
-    second kind is the measured ranges.
+    The first kind is the bearing, which every ray has. If joint.factor asks for it, the point-to-line distance takes its
+    place. The second kind is the range, which only rays with a measured range have.
 
     Args:
         landmark: (n,) the landmark of each ray.

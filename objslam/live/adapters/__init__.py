@@ -1,7 +1,7 @@
 """Adapters bring messages to a session, one file per adapter. `ADAPTERS` lists them for `objslam live SOURCE`.
 
-A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` inherits its options. A source
-outside the table is a recording. This module imports no heavy library, because `--help` imports it.
+A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` inherits its options. A SOURCE
+that is not in the table is a recording. This module imports no heavy library, because `--help` imports it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice
 
-_INTERFACE = "DDS: auto, or a network interface's name or address. [default: as CYCLONEDDS_URI says, else loopback]"
+_INTERFACE = "DDS: a network interface, by name or address, or auto for any. [default: from CYCLONEDDS_URI, else loopback]"
 
 
 class Adapter(Protocol):
@@ -36,10 +36,10 @@ class Adapter(Protocol):
 
     @property
     def ledger(self) -> Ledger:
-        """The counts of messages that were dropped before a push, and warnings."""
+        """The warnings, and the counts of messages that were dropped before a push."""
 
     def run(self, stop: threading.Event) -> None:
-        """Push messages until stop is set or no more come."""
+        """Push messages until `stop` is set or the source ends."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LiveRosOptions(RosOptions):
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """The DDS domain and network, as in `live.dds.network`."""
+    """The DDS domain and network interface, as in `live.dds.network.open_network`."""
 
     domain: Annotated[int | None, Option("--domain", "DDS domain. [default: ROS_DOMAIN_ID, else 0]")] = None
     interface: Annotated[str | None, Option("--interface", _INTERFACE)] = None
@@ -59,7 +59,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class DdsOptions(NetworkOptions, LiveRosOptions):
-    """The options of messages over DDS and of the DDS network."""
+    """The options of the DDS adapter, for its ROS messages and for its network."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class LiveOptions(DdsOptions, SourceOptions):
 
 @dataclass(frozen=True)
 class Feed:
-    """An adapter, the functions that receive the snapshots, and the functions to call at the end.
+    """An adapter with its helpers. views: the functions that receive each snapshot. close: the functions to call at the end.
 
-    image: returns the image of a camera (name) at a stamp, s; None if the adapter has no images.
+    image: the function that returns the image of a camera, by its name, at a stamp, s. None if the adapter has no images.
     """
 
     adapter: Adapter
@@ -84,8 +84,8 @@ class Feed:
 class LiveSource:
     """A named source of `objslam live`.
 
-    says: its description in `--help`. opens: the function that makes its adapter. options: the class of its options, which
-    `LiveOptions` inherits; None without options.
+    says: its description in `--help`. opens: the function that makes its `Feed`. options: the class of its options, which
+    `LiveOptions` inherits. None if it has no options.
     """
 
     says: str
@@ -117,7 +117,7 @@ def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions) -> Feed:
 def _ros(
     sink: Sink, settings: Settings, options: LiveRosOptions, make: Callable[[RosMessages, TopicChoice], Adapter]
 ) -> Feed:
-    """Return the feed of an adapter of ROS messages, with a detector if the options name one."""
+    """Return the feed of an adapter for ROS messages, with a detector if the options name one. make: makes the adapter."""
     from objslam.live.ros.detector_worker import DetectorWorker
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice

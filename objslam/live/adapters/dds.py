@@ -13,11 +13,11 @@ from objslam.ros.bag.records import Connection, plain
 from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-_LONELY = 5.0  # The time without a publisher that matches, s, after which the user is warned. A larger value warns later.
+_LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
 _TAKE = 200  # The most messages taken from a reader at once. A larger number lets other topics wait longer.
 _MAX_READERS = 256  # The most open readers. It bounds the memory.
-_MIN_BUFFER = 2 << 20  # The smallest socket buffer for a raw image, bytes. A larger value warns on more systems.
-_Kind = tuple[bool, bool]  # Whether a writer is reliable, and whether it is transient-local, which keeps past messages.
+_MIN_BUFFER = 2 << 20  # The smallest socket buffer that holds a raw image, bytes. A larger value warns on more systems.
+_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether it is transient-local, so that old messages are kept.
 
 
 @dataclass
@@ -30,7 +30,10 @@ class _Publication:
 
 @dataclass
 class _Reader:
-    """A DDS reader for all publishers with the topic and the kind of `of`."""
+    """A DDS reader for all publishers of one topic with one QoS kind. of: one of these publications.
+
+    since: when the reader was made, s, by `time.monotonic`. lost: the number of lost messages that are already counted.
+    """
 
     of: _Publication
     entity: Any
@@ -42,7 +45,7 @@ class _Reader:
 
 @dataclass
 class DdsAdapter:
-    """Reads topics by type while their publishers come and go.
+    """Reads the topics of the wanted types, while their publishers come and go.
 
     A topic has one reader per kind of publisher: best-effort or reliable, volatile or transient-local. A reader with a
     stricter QoS than its publisher receives nothing, and a reader with a weaker QoS may lose messages.
@@ -60,7 +63,7 @@ class DdsAdapter:
         self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
-        """Push messages until stop is set."""
+        """Push messages until `stop` is set."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
         from cyclonedds.util import duration
@@ -99,7 +102,7 @@ class DdsAdapter:
                     self._publications[handle] = publication
 
     def _open(self, age: float) -> list[_Reader]:
-        """Return new readers for the wanted topics that lack one."""
+        """Open readers for the wanted topics that have none, and return them. age: the time since the start, s."""
         offered = {publication.topic: publication.type for publication in self._publications.values()}
         wanted = self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)
         opened = []
@@ -111,7 +114,7 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # frames and cameras first
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # transforms and calibrations first
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
@@ -125,7 +128,7 @@ class DdsAdapter:
         if not layouts:
             self.ledger.warn(f"{topic}: left out, because its type {type_} is unknown and DDS sends no definitions")
             return None
-        declared = publication.type_id  # older publishers declare none
+        declared = publication.type_id  # None for older publishers, which declare no type id.
         fitting = (layout for layout in layouts if declared is not None and layout.__idl__.get_type_id() == declared)
         layout = next(fitting, layouts[0])
         images = type_ in IMAGES
@@ -147,7 +150,7 @@ class DdsAdapter:
         return _Reader(publication, entity, make_decoder(Connection(topic, type_, "cdr")), time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        """Push a reader's messages, at most QUEUE of them, so that a busy reader does not delay a stop."""
+        """Push the messages that wait in a reader. At most QUEUE are pushed, so that a busy reader does not delay a stop."""
         for _ in range(QUEUE // _TAKE):
             samples = reader.entity.take(_TAKE)
             for sample in samples:
@@ -164,7 +167,7 @@ class DdsAdapter:
                 return
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
-        """Return whether a reader is for a publisher. A best-effort reader also receives from the reliable publishers."""
+        """Return whether a reader is for a publisher. A best-effort reader receives from the reliable publishers too."""
         if handle not in self._publications:
             self._look_around(found)
         publication = self._publications.get(handle)

@@ -11,12 +11,12 @@ from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
-_Kind = tuple[bool, bool]  # Whether the QoS is reliable, and whether it is transient-local.
+_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether it is transient-local.
 
 
 @dataclass
 class RclpyAdapter:
-    """Subscribes to topics by type while their publishers come and go. ObjslamError when rclpy cannot be imported.
+    """Subscribes to the topics of the wanted types, while publishers come and go. Raises ObjslamError without rclpy.
 
     ROS does not name the publisher of a message, so each topic has one subscription. It is reliable if all publishers are
     reliable; otherwise it is best-effort, which receives from all of them.
@@ -36,7 +36,7 @@ class RclpyAdapter:
         self.ledger = self.messages.ledger
 
     def run(self, stop: threading.Event) -> None:
-        """Push messages until stop is set."""
+        """Push messages until `stop` is set."""
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
@@ -61,7 +61,7 @@ class RclpyAdapter:
             rclpy.shutdown(context=context)
 
     def _look_around(self, node: Any, settled: bool) -> None:
-        """Subscribe to the wanted topics, again if the QoS of their publishers has changed."""
+        """Subscribe to the wanted topics. Subscribe again if the QoS of their publishers has changed."""
         offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
         for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
             type_ = offered[topic]

@@ -20,8 +20,9 @@ _BEHIND = 1.0  # The delay of a replay, s, above which the user is warned. A lar
 class ReplayAdapter:
     """Pushes the content of a log in the order of `events`.
 
-    speed: 2 is twice the speed of the drive, None is as fast as possible. wait: without a speed, it is called after each
-    frame, and returns once the map contains the frame. after: the stamp, s, before which a resumed session has everything.
+    speed: 2 replays twice as fast as recorded, None as fast as possible. wait: the function that is called after each frame
+    if `speed` is None. It returns once the map contains the frame. after: the function that returns the stamp, s, before
+    which a resumed session already has all messages.
     """
 
     sink: Sink
@@ -33,7 +34,7 @@ class ReplayAdapter:
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:
-        """Push the whole log, or until stop is set."""
+        """Push the whole log, unless `stop` is set before its end."""
         for camera_log in self.log.cameras:
             self.sink.push_camera(camera_log.camera)
         begin, first = time.perf_counter(), None
@@ -60,9 +61,10 @@ Push = Callable[[Sink], bool]
 
 
 def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
-    """Yield the log's stamps, s, whether each is a frame, and its push, in the order of the stamps.
+    """Yield the events of a log in time order: the time, s, whether the event is a frame, and the push of the event.
 
-    A frame follows the first pose that is not older, at the pose's stamp, so that no frame waits for a pose (live.max_lag).
+    The time of an event is its stamp. But the time of a frame is the stamp of the first pose that is not older, and the
+    frame follows this pose. So no frame waits for a pose (live.max_lag).
     """
     settings = settings or Settings()
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []  # stamps, rank at the same stamp, push by index
@@ -84,7 +86,7 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
 
 
 def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
-    """Return the stamps (F,) of the poses that frames wait for, or their own stamps beyond live.max_late."""
+    """Return the stamp (F,) of the first pose at or after each frame, or its own stamp if live.max_late is exceeded."""
     path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
     own = detections.frame_stamps
     if path is None:

@@ -7,7 +7,7 @@
 {"type": "detections", "camera": "front", ...a line of detections.jsonl...}
 
 A planar pose has "x", "y", "yaw" instead of translation and rotation. Odometry and localization may have a "covariance" of
-36 numbers. "camera" and "name" may be left out with a single camera, which is then called "camera".
+36 numbers. With a single camera, "camera" and "name" may be left out. The camera is then called "camera".
 """
 
 import json
@@ -29,7 +29,7 @@ from objslam.io.detections_jsonl import Malformed, add_frame, parse_object, read
 from objslam.live.interface import Sink
 
 _CAMERA = "camera"
-_LONGEST = 1 << 20  # The longest line, bytes. Longer lines are skipped. A larger number costs memory.
+_LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
 _WAIT = 0.1  # The time until a stop is noticed, s. A larger value notices it later.
 
@@ -44,7 +44,7 @@ class StdinAdapter:
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:
-        """Push messages until the stream ends or stop is set."""
+        """Push messages until the stream ends or `stop` is set."""
         number, rest, skipping = 0, b"", False
         while not stop.is_set() and (chunk := self._read(stop)):
             *lines, rest = (rest + chunk).split(b"\n")
@@ -61,7 +61,7 @@ class StdinAdapter:
             self._take(rest, number + 1)
 
     def _read(self, stop: threading.Event) -> bytes:
-        """Return the next bytes; b"" at the end or when stop is set."""
+        """Return the next bytes; b"" at the end of the stream or when `stop` is set."""
         source = self.stream.fileno()
         while not stop.is_set():
             if select.select([source], [], [], _WAIT)[0]:

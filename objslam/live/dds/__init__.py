@@ -1,1 +1,1 @@
-"""DDS is the transport of ROS 2: network, message types, publication of the map. Its adapter is `live.adapters.dds`."""
+"""Network, message types and map publication for DDS, the transport of ROS 2. The adapter is `live.adapters.dds`."""

@@ -14,7 +14,7 @@ from objslam.errors import ConfigError, ObjslamError
 
 LOOPBACK, AUTO = "loopback", "auto"
 _URI, _DOMAIN_ID = "CYCLONEDDS_URI", "ROS_DOMAIN_ID"
-_MAX_DOMAIN = 232  # The largest number of a DDS domain: larger domains have no ports.
+_MAX_DOMAIN = 232  # The largest number of a DDS domain, because larger numbers have no ports.
 _BUFFER = "4MB"  # The requested socket buffer. It holds a raw image, which arrives as a burst of fragments.
 _FAILED = re.compile(r"deserialization (\S+) failed")
 _MALFORMED = re.compile(r"malformed packet")
@@ -22,10 +22,10 @@ _MALFORMED = re.compile(r"malformed packet")
 
 @dataclass
 class Network:
-    """A domain that this process has joined.
+    """A DDS domain that this process has joined.
 
     where: its network, in words. entities: DDS entities that must live as long as the participant. unread: the number of
-    payloads that the library rejected, by DDS topic, "" for packets that are not DDS.
+    payloads that the library rejected, by DDS topic. The topic "" counts packets that are not DDS.
     """
 
     domain: int
@@ -41,9 +41,9 @@ _OPEN: dict[int, tuple[str | None, Network]] = {}
 def open_network(domain: int | None = None, interface: str | None = None) -> Network:
     """Join a DDS domain, or return the network of a domain that the process has already joined.
 
-    domain: None for ROS_DOMAIN_ID, else 0. interface: a name, an address, "auto" for any network, None for CYCLONEDDS_URI,
-    else loopback. ObjslamError when cyclonedds is not installed or the domain cannot be joined. ConfigError when the domain
-    or the interface is invalid, or the domain is already open on another interface.
+    domain: its number. None takes ROS_DOMAIN_ID, or 0 if that is unset. interface: the name or address of an interface, or
+    "auto" for any. None takes CYCLONEDDS_URI, or loopback if that is unset. ObjslamError when cyclonedds is not installed or
+    the domain cannot be joined. ConfigError when an argument is invalid, or the domain is already open on another interface.
     """
     try:
         import cyclonedds  # noqa: F401
@@ -117,7 +117,7 @@ def _settings(interface: str | None) -> tuple[str, str]:
 
 
 def _sockets() -> set[int]:
-    """Return this process's file descriptors that are sockets; none if the system does not list them."""
+    """Return this process's file descriptors that are sockets. The set is empty if the system does not list them."""
     found = set()
     folder = Path("/proc/self/fd")
     for entry in folder.iterdir() if folder.is_dir() else ():
@@ -130,7 +130,7 @@ def _sockets() -> set[int]:
 
 
 def _keep_inside(sockets: set[int]) -> None:
-    """Bind sockets to the loopback device, because the library listens on every address of any interface."""
+    """Bind sockets to the loopback device, because the library makes them listen on the addresses of all interfaces."""
     for number in sockets:
         with socket.socket(fileno=os.dup(number)) as own:
             if own.type == socket.SOCK_DGRAM:
@@ -144,11 +144,11 @@ def _keep_inside(sockets: set[int]) -> None:
 
 
 def _listen(reading: int, unread: Counter[str]) -> None:
-    """Count the payloads that the library rejects, because it checks them against their type before delivery."""
+    """Count the payloads that the library rejects when it checks their types. reading: the pipe with its log."""
     with os.fdopen(reading, errors="replace") as lines:
         for line in lines:
             if match := _FAILED.search(line):
-                unread[match[1].rpartition("/")[0]] += 1  # without the type behind the topic
+                unread[match[1].rpartition("/")[0]] += 1  # The text is topic/type, and only the topic counts.
             elif _MALFORMED.search(line):
                 unread[""] += 1
 

@@ -20,9 +20,9 @@ _MAX_PATH = 500  # The most poses of a published path. It keeps a path of hours 
 
 
 class DdsPublisher:
-    """Publishes snapshots below a prefix, transient-local: a later subscriber receives the last message.
+    """Publishes snapshots on topics below a prefix. Unresolved objects are left out.
 
-    Unresolved objects are left out. Call `publish` from one thread.
+    The topics are transient-local, so a later subscriber receives the last message. Call `publish` from one thread only.
     """
 
     def __init__(self, network: Network, prefix: str = "/objslam") -> None:

@@ -1,4 +1,4 @@
-"""DDS types of ROS 2 messages. Their payloads stay bytes, which rosbags' CDR reads and writes."""
+"""DDS types of ROS 2 messages. Their payloads stay bytes in CDR, which rosbags encodes and decodes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def layouts_of(type_: str) -> tuple[type, ...]:
 
 
 def _make_type(store: Typestore, type_: str) -> type:
-    """Make a DDS type that declares its fields but passes bytes: cyclonedds would process each field in Python."""
+    """Make a DDS type that declares fields but passes bytes, because cyclonedds would process each field in Python."""
     made = _make_struct(store, type_, {})
 
     def serialize(self: Any, *args: Any, **kwargs: Any) -> bytes:

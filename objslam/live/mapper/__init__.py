@@ -1,4 +1,4 @@
-"""The map of a live session: keyframes, association, landmarks and the incremental graph, in one thread.
+"""The map of a live session, which one thread builds: keyframes, tracks, landmarks and the incremental graph.
 
-Threads, queues and clocks are in `live.session`, and the association that offline runs share is in `association`.
+Threads, queues and clocks are in `live.session`, and the steps of association that offline runs share are in `association`.
 """

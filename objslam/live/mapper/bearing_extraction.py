@@ -1,4 +1,4 @@
-"""The bearings of a frame, with the calibrations and mounts of the cameras and the numbers of labels."""
+"""Converts the boxes of an image to bearings, from the stored calibrations and mounts of the cameras."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from objslam.frontend.bearings import box_rays, surest
 from objslam.live.mapper.frame_association import FrameRays
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts kept per camera. More mounts allow later frames of a camera on an arm, and cost memory.
+_MOUNTS = 4096  # The mounts kept per camera. With more, frames of a camera on an arm may come later. They cost memory.
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """A frame with the number of its camera, base_T_camera (4, 4), and the bearings of its usable boxes."""
+    """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4)."""
 
     camera: int
     base_T_camera: Floats
@@ -43,11 +43,11 @@ class BearingExtractor:
         self._cameras[number : number + 1] = [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Add a pose of a camera on the robot."""
+        """Add a mount: a pose of a camera on the robot from a stamp on."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage) -> FrameView:
-        """Return the bearings of a frame, with the mount of its camera at its stamp. Dropped boxes are counted."""
+        """Return the bearings of a frame, with the mount of its camera at its stamp. Count the dropped boxes."""
         number, settings = self._camera_number[frame.camera], self._settings
         camera, held = self._cameras[number], self._mounts.get(frame.camera)
         base_T_camera = camera.base_T_camera if held is None else held.at(frame.stamp, camera)

@@ -1,6 +1,6 @@
-"""The course of the robot, joined from odometry and localisation in the frame of the first pose.
+"""The course of the robot: its path, joined from odometry and localisation, in the coordinate frame of the first pose.
 
-Localisation replaces missing odometry. It also relates two pieces of the course at a change of source or after a gap.
+Localisation replaces missing odometry. It also relates the pieces of the course before and after a gap or change of source.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,16 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # s, kept of each path besides live.max_late, because frames wait in a queue. A longer time costs memory.
-_LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one frame.
+_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, because frames wait in a queue. A longer time costs memory.
+_LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
 @dataclass(frozen=True)
 class Placed:
-    """The pose of a frame: map_T_base (4, 4) by its path, and start_T_base (4, 4) and drift (6, 6) on the course.
+    """The pose of the robot at the stamp of an image, from the odometry or from the localisation.
 
-    piece: the number of the piece of the course. The path measures the motion between two frames of one piece.
+    piece: the number of the piece of the course. The path measures the motion between two images of one piece. map_T_base:
+    (4, 4) the pose on its own path. start_T_base, drift: the pose (4, 4) and its accumulated drift (6, 6) on the course.
     """
 
     by_odometry: bool
@@ -34,7 +35,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """One stretch of a path on the course. drift: (6, 6), added to the drift of the path."""
+    """One stretch of a path, placed on the course. drift: (6, 6), what the course adds to the drift of the path."""
 
     stretch: int
     start_T_path: Floats
@@ -42,7 +43,7 @@ class _Piece:
 
 
 class Course:
-    """The paths of odometry and localisation, and the poses of frames on them."""
+    """The paths of odometry and localisation, and the course that they form."""
 
     def __init__(self, settings: Settings) -> None:
         seconds, self._max_gap = settings.live.max_late + _KEPT, settings.poses.max_gap
@@ -60,10 +61,10 @@ class Course:
         self._localized_by_then = self.localization.newest
 
     def ready(self, stamp: float) -> bool:
-        """Return whether later messages cannot change the result of `place` for a frame.
+        """Return whether later messages cannot change the result of `place` for a frame with this stamp.
 
-        The odometry counts as silent after poses.max_gap of localisation without odometry. Then localisation gives the pose.
-        A frame on a new piece of the odometry waits until the localisation reaches the start of the piece.
+        When the localisation continues for poses.max_gap without odometry, the localisation gives the pose of the frame. A
+        frame on a new piece of the odometry waits until the localisation reaches the start of the piece.
         """
         odometry, localization = self.odometry, self.localization
         if odometry.newest < stamp:
@@ -76,9 +77,9 @@ class Course:
         return stretch is not None and (goes_on or localization.newest >= odometry.stretch_begin)
 
     def place(self, stamp: float, keyframes: KeyframeTable, before: int | None) -> Placed | None:
-        """Return the pose of a frame. None off both paths, and for a late frame on no known piece of the course.
+        """Return the pose of a frame. None if no path covers its stamp, or if it is late and would need a new piece.
 
-        before: the row of the keyframe before the frame.
+        before: the row of the last keyframe before the frame.
         """
         on, path = self.odometry.at(stamp), self.odometry
         if on is None:
@@ -103,7 +104,7 @@ class Course:
         return placed
 
     def _begin(self, stretch: int, path: PathBuffer, stamp: float, keyframes: KeyframeTable) -> _Piece:
-        """Make a new piece that starts at a stamp, placed by the newest pose of the localisation up to this stamp."""
+        """Make a new piece that starts at a stamp. If possible, the newest localisation until then positions it."""
         last = self._last
         if last is None:
             return _Piece(stretch, np.eye(4), np.zeros((6, 6)))
@@ -127,7 +128,10 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """Make the piece that takes a pose with drift `own` on its path to start_T_base with `drift` on the course."""
+        """Make the piece that puts a pose of its path at start_T_base on the course.
+
+        own: (6, 6) drift of this pose on its path. drift: (6, 6) drift of start_T_base. noise: (rad, m) of this relation.
+        """
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)
         turn, way = noise

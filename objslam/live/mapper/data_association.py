@@ -1,4 +1,4 @@
-"""The association of a new keyframe's rays with landmarks and tracks, and the ray factors in the graph."""
+"""The association of a new keyframe's rays with landmarks and tracks, and the addition of ray factors to the graph."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_NOVELTY_WEIGHT = 0.02  # The weight of a frame in MapState.novelty. A larger weight is noisier and adapts sooner.
+_NOVELTY_WEIGHT = 0.02  # The weight of one frame in MapState.novelty. A larger weight adapts sooner, with more noise.
 
 
 def associate(
     m: MapState, rays: FrameRays, map_T_camera: Floats, uncertainty: PoseUncertainty, predicted: PredictedLandmarks | None
 ) -> LandmarkUpdate:
-    """Assign every ray of the newest keyframe to a landmark or a track, and add the rays of landmarks to the graph.
+    """Assign the rays of the newest keyframe to landmarks and tracks, and add the rays of landmarks to the graph.
 
     map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of `predict_landmarks`, or None
     to compute it here.
@@ -28,8 +28,8 @@ def associate(
     numbers = m.next_id.ray + np.arange(count)
     m.next_id.ray += count
     row, owner, used = np.full(count, -1), np.full(count, -1), np.zeros(count, dtype=bool)
-    waiting: dict[int, Track] = {}  # The tracks of the mode by_label, by label.
-    tracks: dict[int, Track] = {}  # The tracks of the frame, by the index of the ray.
+    waiting: dict[int, Track] = {}  # The present tracks, by label, if every label is one object.
+    tracks: dict[int, Track] = {}  # The tracks of the frame's rays, by the index of the ray.
     if m.by_label:
         best = best_of_label(rays)
         row[best], missed = match_by_label(rays.take(best), map_T_camera, landmarks, uncertainty, settings.gate)

@@ -17,20 +17,20 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The factor on the largest distance of any observation for candidates. A larger factor costs time.
+_BEYOND = 1.5  # The largest distance to a candidate, as a factor on the largest observed one. A larger factor costs time.
 _NEAR = 10.0  # The distance (m) up to which every landmark is a candidate. A larger distance costs time.
-_ROUGH = 3.0  # The factor on a ray's noise above which a prediction is rough. A larger factor trusts more single boxes.
-_CLEAR = 6.0  # The squared deviation between the two best rough candidates. A larger value leaves more boxes undecided.
+_ROUGH = 3.0  # The least spread of a rough prediction, in units of a ray's noise. A larger value trusts more single boxes.
+_CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value trusts more single boxes.
-_BY_LABEL = 4.0  # The factor on the gate if a label is one object. A larger factor keeps more rays after a drift.
+_BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
 
 
 @dataclass(frozen=True)
 class FrameRays:
     """The rays of the usable boxes of one frame.
 
-    direction: (n, 3) unit, in the camera. sigma: (n,) rad. range, range_sigma: (n,) m, NaN if unknown. label: (n,) number.
-    score: (n,). box: (n, 4) px. track: (n,) number by the detector, -1 if unknown.
+    direction: (n, 3) unit vectors in the camera frame. sigma: (n,) rad. range, range_sigma: (n,) m, NaN if unknown. label:
+    (n,) the numbers of the labels. score: (n,). box: (n, 4) px. track: (n,) the track ids of the detector, -1 if unknown.
     """
 
     direction: Floats
@@ -43,7 +43,7 @@ class FrameRays:
     track: Ints
 
     def take(self, rays: Ints) -> FrameRays:
-        """Select rays (m,)."""
+        """Return the rays with these indices (m,)."""
         return FrameRays(**{name: value[rays] for name, value in vars(self).items()})
 
 
@@ -57,10 +57,10 @@ def match(
     landmark_of_track: Mapping[int, int],
     novelty: float = 1.0,
 ) -> Ints:
-    """Return the predicted landmark or track of each ray (n,), or -1.
+    """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for a ray without one.
 
     Long unseen tracks are excluded, unless the camera pose in the map is certain. map_T_camera: (4, 4) predicted camera
-    pose, with its `uncertainty`. labels: number of labels. gate: share of the right matches inside the gate.
+    pose, with its `uncertainty`. labels: number of labels. gate: share of the right matches that pass the gate.
     landmark_of_track: id of the last landmark of each detector track. novelty: recent share of boxes without a landmark.
     """
     obs, origin, count = in_map(rays, map_T_camera), map_T_camera[:3, 3], len(rays.label)
@@ -97,7 +97,10 @@ def match(
 def match_by_label(
     rays: FrameRays, map_T_camera: Floats, landmarks: LandmarkTable, uncertainty: PoseUncertainty, gate: float
 ) -> tuple[Ints, Ints]:
-    """Return the row (n,) of each ray's landmark inside the gate, or -1, and of its label's landmark outside, or -1."""
+    """Match each ray to the landmark of its label, and return the row (n,) of this landmark in one of two arrays.
+
+    The first array holds it if the ray is inside the gate, the second if it is outside. All other entries are -1.
+    """
     rows = np.flatnonzero(np.isin(landmarks.label, rays.label))
     hit, missed = (np.full(len(rays.label), -1, dtype=np.int64) for _ in range(2))
     if not len(rows):
@@ -121,7 +124,7 @@ def best_of_label(rays: FrameRays) -> Ints:
 
 
 def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(None)) -> Observations:
-    """Transform the rays of a selection to map."""
+    """Return rays as observations in map. which: the indices of these rays."""
     direction = rays.direction[which] @ map_T_camera[:3, :3].T
     origin = np.broadcast_to(map_T_camera[:3, 3], direction.shape)
     return Observations.of_lines(
@@ -132,7 +135,7 @@ def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(No
 def _possible(
     obs: Observations, origin: Floats, predicted: PredictedLandmarks, uncertainty: PoseUncertainty, unseen: Bools
 ) -> Ints:
-    """Return the candidates for rays from one origin (3,). unseen: (n,) which of the predicted are long unseen."""
+    """Return the indices in `predicted` of candidates for rays from one origin (3,). unseen: (n,) if long unseen."""
     wanted = np.flatnonzero(np.isin(predicted.label, obs.label))
     to = predicted.position[wanted] - origin
     distance = np.sqrt((to * to).sum(axis=1))
@@ -143,7 +146,10 @@ def _possible(
 
 
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
-    """Return the candidate of each ray (n,), or -1, with the least total cost, as `best_assignment` does for one frame."""
+    """Return the candidate of each ray (n,), or -1, such that the total cost is least, as `best_assignment` for one frame.
+
+    cost: of each edge, which may be negative. unmatched: the cost of a ray without a candidate.
+    """
     useful = np.flatnonzero(cost < unmatched)
     ray, place = pair_up(edges.ray[useful], edges.landmark[useful], unmatched - cost[useful], (rays, places))
     chosen = np.full(rays, -1, dtype=np.int64)
@@ -156,7 +162,7 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 
 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
-    """Remove ambiguous or too uncertain matches of roughly predicted landmarks, which `loop_closure` can find instead."""
+    """Remove ambiguous or too uncertain matches of roughly predicted landmarks. `loop_closure` can find them later."""
     rough = (edges.vague > 2 * np.log(_ROUGH)) & landmark[edges.landmark]
     if not rough.any():
         return edges

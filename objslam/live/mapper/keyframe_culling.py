@@ -6,19 +6,20 @@ from objslam.core.arrays import Bools, Ints
 from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
-_NEWEST = 1 / 3  # The share of live.max_keyframes that is newest and stays. A larger share removes more old keyframes.
-_OLDEST = 1 / 30  # The share of live.max_keyframes that is oldest and stays, since it relates the map to the start.
-_SHARE = 0.25  # The share of live.max_keyframes that one culling removes. A larger share is rarer and takes longer.
-_AGAIN = 0.1  # The share of live.max_keyframes that must be new before the next culling. A larger share makes it rarer.
+_NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. With more, more old ones are removed.
+_OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They relate the map to the start.
+_SHARE = 0.25  # The share of live.max_keyframes that one culling removes. With more, culling is rarer and takes longer.
+_AGAIN = 0.1  # The new keyframes before the next culling, as a share of live.max_keyframes. With more, culling is rarer.
 _ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
 _LEAST = 3  # The rays that every landmark keeps if _ENOUGH keeps too many keyframes. Three rays fix a position.
 _CROWDED = 1.2  # The factor on live.max_keyframes above which landmarks keep _LEAST rays. A larger factor costs memory.
 
 
 def cull_keyframes(m: MapState) -> None:
-    """Remove old keyframes from their densest places, if the map has more than live.max_keyframes.
+    """Remove old keyframes, if the map has more than live.max_keyframes, first where the keyframes are closest together.
 
-    One call never removes two neighbours. Some new keyframes must come before the next removal. The odometry is summed up.
+    One call never removes two consecutive keyframes. The motions before and after a removed keyframe become one motion. The
+    next removal waits for some new keyframes.
     """
     k, most = m.keyframes, m.settings.live.max_keyframes
     if len(k) <= most or m.next_id.keyframe < m.schedule.culled + _AGAIN * most:
@@ -45,7 +46,10 @@ def cull_keyframes(m: MapState) -> None:
 
 
 def _dispensable(m: MapState, order: Ints, wanted: int, fewest: int) -> Bools:
-    """Return which keyframes in time order (K,) to remove: at most `wanted`, and every landmark keeps `fewest` rays."""
+    """Return a mask (K,) of the keyframes to remove, in time order. At most `wanted` are removed.
+
+    Every landmark keeps at least `fewest` rays, unless it has fewer already. order: (K,) rows in time order.
+    """
     k, rays, most = m.keyframes, m.rays, m.settings.live.max_keyframes
     step = np.linalg.norm(np.diff(k.start_T_base[order][:, :3, 3], axis=0), axis=1)
     span = np.full(len(order), np.inf)

@@ -7,11 +7,11 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10  # The keyframes from one place. More keyframes average the detector's noise, but cost time.
+_STANDING = 10  # The keyframes while the cameras stand. More keyframes average the detector's noise, but cost time.
 
 
 class KeyframeSelector:
-    """Selects a keyframe after each set distance or angle of a camera, and a few keyframes from one place."""
+    """Selects a keyframe when a camera has moved by a set distance or angle, and a few keyframes while it stands."""
 
     def __init__(self, settings: Live) -> None:
         self._settings = settings
@@ -20,7 +20,7 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether enough keyframes from the place (4, 4) of a frame have its labels."""
+        """Return whether the camera stands still, there are enough keyframes since, and they show all labels `shown`."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
@@ -32,7 +32,7 @@ class KeyframeSelector:
         self._standing += 1
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, a new place begins."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, keyframes count anew."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

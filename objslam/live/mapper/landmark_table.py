@@ -13,20 +13,21 @@ from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_PROMISE
 from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
-_FLOOR = 0.01  # The standard deviation (m) added to each landmark. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # The information (m^-2) added to each landmark, for parallel rays. A larger value makes landmarks too certain.
-_INNER = 0.05  # The share of the image along its edge where a box may be cut off. A larger share expects fewer landmarks.
+_FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
+_HELD = 1e-4  # The information (m^-2) added to each landmark, as parallel rays give too little. More makes it too certain.
+_INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
-_FURTHER = 1.1  # The factor on the largest observed distance up to which a landmark is expected. More counts more misses.
-_NO_ID = -2  # The id of a track among the predicted landmarks. It differs from all ids, and from -1 for no landmark.
+_FURTHER = 1.1  # The factor on its largest observed distance up to which a landmark is expected. More counts more misses.
+_NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has it, and -1 means that there is none.
 
 
 class LandmarkTable(GrowingTable):
     """The landmarks in the order of their ids.
 
-    position: m, in map. information: m^-2, from the rays. drift: at the last observation. first, last: stamps of the first
-    and the last observation. seen, expected: numbers of frames that showed the landmark and that should have. far: m, the
-    largest observed distance. squared: sum of the squared deviations of its rays. rejected: number of rays outside the gate.
+    position: m, in map. information: m^-2, from the rays. drift: odometry drift at the last observation. first, last:
+    stamps, s, of the first and last observation. seen: number of frames that showed the landmark. expected: number of frames
+    that should have shown it. far: m, the largest observed distance. squared: sum of the squared deviations of its rays, in
+    variances. rejected: number of its rays outside the gate.
     """
 
     id: Ints = column(np.int64)
@@ -50,7 +51,7 @@ def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
 
 
 def covariances(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of landmarks from their rays at known poses."""
+    """Return the covariances (n, 3, 3), m^2, of landmarks by their rays alone, as if all camera poses were known."""
     return np.linalg.inv(landmarks.information[rows] + _HELD * np.eye(3)) + _FLOOR**2 * np.eye(3)
 
 

@@ -13,16 +13,16 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)  # The residual (rad) above which a loop is closing. A larger angle leaves less time to settle.
-_TRACKS = 4096  # The detector tracks whose landmark is stored. More serve a detector that reuses numbers after a long time.
+_JUMP = np.radians(2.0)  # The residual (rad) that shows that a loop closes. With a larger angle, the map settles later.
+_TRACKS = 4096  # The detector tracks whose landmark is stored. More help if a track id comes back after a long time.
 
 
 @dataclass(frozen=True)
 class LandmarkUpdate:
     """The observations of the newest keyframe, which is in the graph.
 
-    rays: of the frame. matched: (m,) the rays with a landmark. rows: (m,) the rows of these landmarks in their table.
-    tracks: all tracks with a ray of the frame.
+    rays: all rays of its frame. matched: (m,) the indices of rays with a landmark. rows: (m,) the rows of their landmarks
+    in the table. tracks: all tracks with a ray of the frame.
     """
 
     rays: FrameRays
@@ -32,7 +32,7 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count the landmarks that the newest keyframe showed or should have shown, and add the information of its rays."""
+    """Count the landmarks that the newest keyframe shows or should show, and add the information of its rays to them."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)
@@ -65,7 +65,7 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
 
 
 def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
-    """Move the rays and counts of one landmark to another landmark, by rows. The caller must `remove_landmarks` then."""
+    """Move rays and counts from the landmark in row `drop` to that in row `keep`. The caller must then remove `drop`."""
     landmarks, rays = m.landmarks, m.rays
     mine = np.flatnonzero(rays.owner == landmarks.id[drop])
     m.graph.drop_rays(rays.number[mine])
@@ -80,7 +80,7 @@ def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
 
 
 def remove_landmarks(m: MapState, rows: Ints, rebuild: bool = True) -> None:
-    """Remove landmarks without rays, by rows. Without `rebuild` the caller must rebuild the graph."""
+    """Remove the landmarks in these rows, which must have no rays. Without `rebuild` the caller must rebuild the graph."""
     ids = m.landmarks.id[rows]
     m.pairs.forget(set(ids.tolist()))
     m.graph.drop_landmarks(ids)

@@ -1,4 +1,4 @@
-"""Factors on keyframe poses: absolute poses by localisation, and motions between consecutive keyframes."""
+"""Factors on keyframe poses: absolute poses from localisation, and motions between consecutive keyframes."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ from objslam.live.mapper.state import MapState
 
 
 def localize(m: MapState) -> bool:
-    """Add the absolute poses of the keyframes that the localisation covers now, and return whether the map moved.
+    """Add absolute poses to the keyframes that the localisation covers only now, and return whether the map moved.
 
-    The first absolute pose moves a map that was relative to the start of the odometry.
+    The first absolute pose moves the whole map, because odometry alone gives the map relative to its own start.
     """
     if not m.localization.received or not m.localization.pending:
         return False
@@ -45,7 +45,7 @@ def localize(m: MapState) -> bool:
 
 
 def chain_keyframes(m: MapState) -> None:
-    """Connect consecutive keyframes by odometry, or by weak motion factors. The caller must rebuild the graph."""
+    """Connect consecutive keyframes by odometry, or without it by weak factors. The caller must rebuild the graph."""
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)
     if every.odom_T_base is None:

@@ -17,11 +17,11 @@ from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmark
 from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
-_ANCHORS = 3  # The past keyframes from which the drift to a loop is computed. More keyframes take longer.
+_ANCHORS = 3  # The past keyframes that are tried as the start of the loop. More keyframes take longer.
 _NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value relies on updates.
 _TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. A larger value relies on updates.
-_AROUND = 6.0  # The radius (m) around recognised landmarks in which others are expected, about the view in a hall.
-_ERA = 15.0  # The time (s) between the last observations of recognised and expected landmarks. More time adds misses.
+_AROUND = 6.0  # The radius (m) around recognised landmarks in which others match again. It is about the view in a hall.
+_ERA = 15.0  # The most time (s) between the last observations of recognised landmarks and of these others. More adds misses.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
@@ -68,7 +68,7 @@ def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) 
 
 
 def _planar(m: MapState, before: int, now: int) -> Floats:
-    """Return a fast upper bound (3, 3) on the covariance of x, y, yaw between two keyframes, by odometry or by the map."""
+    """Return a fast upper bound (3, 3) on the covariance of x, y, yaw between two keyframes, by odometry or the map."""
     k = m.keyframes
     turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
     to_camera = adjoint(k.camera_T_start[now])
@@ -79,7 +79,7 @@ def _planar(m: MapState, before: int, now: int) -> Floats:
 
 
 def _together(m: MapState) -> Bools:
-    """Return which pairs of landmarks (N, N) of one label share a frame."""
+    """Return a mask (N, N) of the pairs of landmarks of one label that one frame showed."""
     result = np.zeros((len(m.landmarks), len(m.landmarks)), dtype=bool)
     if m.pairs.together:
         a, b = m.rows_of(np.array(list(m.pairs.together))).T
@@ -88,7 +88,7 @@ def _together(m: MapState) -> Bools:
 
 
 def _close(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Merge landmarks `now` (P,) with landmarks `old` (P,)."""
+    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). A large correction is distributed first."""
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.landmarks.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
@@ -108,7 +108,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Give the landmarks around the old ones (P,) the drift of the first new one (P,), so that they are expected again."""
+    """Give the landmarks around those in rows `old` (P,) the drift of the first of `now` (P,), so that they match again."""
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
     since = gathered(drift, landmarks.drift)
@@ -120,7 +120,7 @@ def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
 
 
 def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Distribute the correction over the path, merge landmarks `now` (P,) with `old` (P,), and solve or restore the map."""
+    """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve or restore the map."""
     landmarks, k, rays = m.landmarks, m.keyframes, m.rays
     m.graph.refresh()
     saved = m.graph.save()
@@ -154,7 +154,7 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
 
 
 def _settled(m: MapState) -> Iterator[None]:
-    """Solve the corrected graph by one step, and by several steps for the next item."""
+    """Solve the corrected graph by one step, then by several steps. Yield after each solve that does not fail."""
     for solve in (m.graph.rebuild, lambda: m.graph.solve(_ITERATIONS, _TOLERANCE)):
         with suppress(SolveError):
             solve()
@@ -162,7 +162,7 @@ def _settled(m: MapState) -> Iterator[None]:
 
 
 def _holds(m: MapState, mine: Ints) -> bool:
-    """Return whether enough rays (n,) of the merged landmarks are inliers."""
+    """Return whether enough of the rays in rows `mine` (n,) are inliers."""
     m.graph.refresh()
     m.read_positions()
     obs = m.sight(mine)

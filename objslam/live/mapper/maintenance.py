@@ -21,21 +21,21 @@ from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.alternation import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
-_GROWING = 3  # The keyframe of each period that bounds growth. It differs from _CLOSING to spread the delay.
-_CLOSING = 6  # The keyframe of each period that merges and removes landmarks.
-_BREATH = 2  # The period of relinearisation after a loop closure, in keyframes. In a larger period the map settles later.
+_GROWING = 3  # The keyframe in each period that bounds growth. It differs from _CLOSING to spread the delay.
+_CLOSING = 6  # The keyframe in each period that merges and removes landmarks.
+_BREATH = 2  # The period of relinearisation after a loop closure, in keyframes. With a larger period, the map settles later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
-_GROWTH = 1.5  # The growth in keyframes between two full solves. More growth keeps errors of the first estimates for longer.
+_GROWTH = 1.5  # The growth factor of keyframes between full solves. A larger factor keeps errors of first estimates longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
 _LARGE = 400  # The keyframes above which relinearisation in slices replaces the full solve, because frames cannot wait.
-_ODDS = 2.5  # The least log odds that two landmarks are one, against a neighbour. Larger odds leave more duplicates.
+_ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
 """The least number of changes between inliers and outliers that shows two objects of a label. A drifted path gives one run
 of outliers. A larger number keeps one object for longer."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
-_AROUND = 0.15  # The border around the image, as a share of it. A wider border prepares the graph for more landmarks.
-_USUAL = 0.75  # The quantile of all distances up to which any landmark may be seen soon. More prepares more landmarks.
+_AROUND = 0.15  # The border around the image, as a share of the image. A wider border prepares the graph for more landmarks.
+_USUAL = 0.75  # The quantile of the distances `far` up to which any landmark may be seen soon. More prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:
@@ -70,7 +70,7 @@ def _coming(m: MapState) -> Ints:
 
 
 def _polish_if_grown(m: MapState) -> None:
-    """Solve the whole graph and test all rays again. A large graph is linearised again in slices instead."""
+    """If the graph has grown, solve it and test all rays again. A large graph is linearised again in slices instead."""
     if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
         return
     m.schedule.solved = m.next_id.keyframe
@@ -120,7 +120,10 @@ def _reconsider(m: MapState) -> bool:
 
 
 def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
-    """Return whether alternating inliers and outliers among the rays (R,), in time order, show two objects of a label."""
+    """Return whether rays (R,) of one landmark alternate between inliers and outliers, which shows two objects.
+
+    The rays are in time order. row: (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
+    """
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))
     for j in np.flatnonzero((against >= MANY) & (against > SECOND * number)).tolist():
@@ -139,7 +142,7 @@ def _forget_tracks(m: MapState) -> None:
 
 
 def _merge_duplicates(m: MapState) -> None:
-    """Merge near landmarks of one label like `alternation.merge_unseen_together`, with fast upper bounds on covariances."""
+    """Merge near landmarks of one label as `alternation.merge_unseen_together`, but with fast bounds on covariances."""
     landmarks = m.landmarks
     if len(landmarks) < 2:
         return
@@ -167,14 +170,17 @@ def _merge_duplicates(m: MapState) -> None:
 
 
 def _one(way: Floats, spread: Floats, density: float) -> bool:
-    """Return whether two landmarks `way` m apart are one. density: possible neighbours of the label per m^2."""
+    """Return whether two landmarks are one object. way: (3,) m, from one to the other. spread: (3, 3) m^2, its covariance.
+
+    density: possible neighbours of the label per m^2.
+    """
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
     return squared <= SAME_POINT and -np.log(area * density) - squared / 2 >= _ODDS
 
 
 def _drifted(m: MapState, rows: Ints) -> Floats:
-    """Return an upper bound (3, 3) on the covariance between two landmarks by the drift between their last observations."""
+    """Return an upper bound (3, 3) on the covariance between two landmarks, from the drift between their observations."""
     k, landmarks = m.keyframes, m.landmarks
     newest = int(np.argmax(k.stamp))
     pose = m.graph.pose(int(k.id[newest]))

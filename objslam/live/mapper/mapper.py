@@ -28,7 +28,7 @@ from objslam.sources.journal.records import CameraMessage, FrameMessage, Message
 
 
 class Mapper:
-    """Builds the map from messages in session time, in one thread."""
+    """Builds the map in one thread, from messages whose stamps are in session time (see `clock`)."""
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
         by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
@@ -36,7 +36,7 @@ class Mapper:
         self._extractor = BearingExtractor(settings, counters.ledger, self.state.cameras, self.state.labels)
         self._selector = KeyframeSelector(settings.live)
         self._predictor = PosePredictor(self.state)
-        self._predicted: PredictedLandmarks | None = None  # Made ahead of the next frame. None after a change of the map.
+        self._predicted: PredictedLandmarks | None = None  # For the next frame. None after the map has changed.
 
     def feed(self, message: Message) -> None:
         """Process a pose, a calibration or a mount."""
@@ -55,11 +55,11 @@ class Mapper:
             self._extractor.add_mount(message)
 
     def is_ready(self, stamp: float) -> bool:
-        """Return whether later messages cannot change the pose of a frame on the course."""
+        """Return whether later messages cannot change the pose of a frame with this stamp on the course."""
         return self.state.course.ready(stamp)
 
     def take(self, frame: FrameMessage) -> LandmarkUpdate | None:
-        """Add a frame to the map, and return the argument for `look_after`. None if the frame became no keyframe."""
+        """Add a frame to the map, and return the argument for `look_after`. None if the frame does not become a keyframe."""
         m = self.state
         before = m.newest_before(frame.stamp)
         placed = m.course.place(frame.stamp, m.keyframes, before)
@@ -99,7 +99,7 @@ class Mapper:
     def _is_wanted(
         self, frame: FrameMessage, camera: int, start_T_camera: Floats, shown: set[int], before: int | None
     ) -> bool:
-        """Return whether a frame is neither redundant nor late, and has boxes or can show missing landmarks."""
+        """Return whether a frame is neither redundant nor late, and has boxes or can show that landmarks are missing."""
         m = self.state
         if self._selector.is_redundant(camera, start_T_camera, shown):
             m.counters.accept("frames between keyframes")

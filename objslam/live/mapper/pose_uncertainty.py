@@ -8,8 +8,8 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import skew
 
 HORIZON = 0.06
-"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark at 5 m by 0.3 m. A
-neighbour may be as near. A larger drift trusts single boxes for longer."""
+"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark that is 5 m away by
+0.3 m, and a neighbour may be so near. A larger drift trusts single boxes for longer."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks match again. A larger value matches more.
 
 
@@ -17,8 +17,8 @@ _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks mat
 class PoseUncertainty:
     """The uncertainty of the camera pose of a frame.
 
-    drift: (6, 6) covariance that the odometry has accumulated, in the frame of the course. camera_from_drift: (6, 6) adjoint
-    from this frame to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame. NaN if unknown.
+    drift: (6, 6) covariance that the odometry has accumulated, on the course. camera_from_drift: (6, 6) adjoint from the
+    course to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame. It is NaN if unknown.
     """
 
     drift: Floats
@@ -32,13 +32,13 @@ class PoseUncertainty:
         return sum(variance[:3]) < HORIZON**2 and sum(variance[3:]) < _PLACED**2
 
     def of_landmarks(self, to: Floats, then: Floats, map_T_camera: Floats) -> Floats:
-        """Return covariances (n, 3, 3), m^2, of known landmarks relative to the camera.
+        """Return the covariances (n, 3, 3), m^2, that the camera pose adds to landmarks relative to the camera.
 
-        The result is the smaller of two covariances: by the drift since a landmark was seen, and by the pose in the map.
+        Each is the smaller of two: that of the drift since the landmark was seen, and that of the pose in the map.
         to: (n, 3) m from the camera to each landmark, in map. then: (n, 6, 6) drift when each landmark was last seen.
         """
         turn = map_T_camera[:3, :3]
-        lever = np.empty((len(to), 3, 6))  # The Jacobians by a small motion of the camera in its own frame.
+        lever = np.empty((len(to), 3, 6))  # The Jacobians for small motions of the camera in its own frame.
         lever[:, :, :3] = skew(to) @ turn
         lever[:, :, 3:] = -turn
         back = np.swapaxes(lever, 1, 2)
@@ -62,13 +62,13 @@ class PoseUncertainty:
 
 
 def gathered(now: Floats, then: Floats) -> Floats:
-    """Return the drift (n, 6, 6) accumulated from `then` (n, 6, 6) to `now` (6, 6). It is 0 if `now` is earlier."""
+    """Return the drift (n, 6, 6) that accumulated since `then` (n, 6, 6) until `now` (6, 6), or 0 if `now` is earlier."""
     since = now - then
     return np.where((np.trace(since, axis1=1, axis2=2) > 0)[:, None, None], since, 0.0)
 
 
 def long_unseen(now: Floats, then: Floats) -> Bools:
-    """Return which objects (n,) are long unseen, by a heading drift above HORIZON since they were last seen.
+    """Return which objects (n,) are long unseen, because the heading drift since then is above HORIZON.
 
     now: (6, 6) current drift. then: (n, 6, 6) drift when each object was last seen.
     """

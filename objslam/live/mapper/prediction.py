@@ -12,7 +12,7 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The keyframes between two slow covariance queries, while odometry adds to it. More make the pose less certain."""
+"""The keyframes between two slow queries of the covariance. Odometry adds to it in between, so more make it larger."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
     camera_T_start: (4, 4) start of the course in the camera frame. motion: id of the previous keyframe, motion (4, 4) from
-    its camera, and covariance (6, 6) of the motion in the new camera frame. None without a previous keyframe, or if
+    its camera, and covariance (6, 6) of the motion in the new camera frame. It is None without a previous keyframe, or if
     only localisation gives the pose.
     """
 
@@ -31,7 +31,7 @@ class PosePrediction:
 
 
 class PosePredictor:
-    """Predicts camera poses from map and course, and caches covariances that are slow to compute."""
+    """Predicts camera poses from the map and the course, and caches covariances that are slow to compute."""
 
     def __init__(self, state: MapState) -> None:
         self._state = state
@@ -41,9 +41,9 @@ class PosePredictor:
     def predict(
         self, before: int | None, stamp: float, placed: Placed, base_T_camera: Floats, start_T_camera: Floats
     ) -> PosePrediction:
-        """Predict the camera pose of a frame at a stamp, s. before: row of the previous keyframe.
+        """Predict the camera pose of a frame at a stamp, s. before: row of the previous keyframe, None without one.
 
-        base_T_camera, start_T_camera: (4, 4) camera pose on the robot, and on the course.
+        base_T_camera: (4, 4) camera pose on the robot. start_T_camera: (4, 4) camera pose on the course.
         """
         m, k = self._state, self._state.keyframes
         camera_T_start = inverse(start_T_camera)
@@ -82,13 +82,13 @@ class PosePredictor:
             self._covariances[number] = m.pose_covariance
 
     def covariance_of(self, keyframe: int) -> Floats:
-        """Return the covariance (6, 6) of a keyframe's camera in its own frame, from the cache or the graph."""
+        """Return the covariance (6, 6) of a keyframe's camera pose in the camera frame, from the cache or the graph."""
         if keyframe not in self._covariances:
             self._covariances = {keyframe: self._state.graph.pose_covariance(keyframe)}
         return self._covariances[keyframe]
 
     def _motion_floor(self, base_T_camera: Floats) -> Floats:
-        """Return `odometry.motion_floor` from a cache that holds for one mount."""
+        """Return `odometry.motion_floor` of a mount. It is cached for the last mount."""
         mount, planar, floor = self._floor
         on_plane = self._state.course.odometry.planar
         if mount is not base_T_camera or planar != on_plane:

@@ -33,7 +33,10 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """The localisation so far: the number of poses, the ids of keyframes without a pose, and whether poses are planar."""
+    """The state of the localisation. received: the number of its poses. pending: ids of keyframes that wait for its pose.
+
+    planar: whether all its poses so far lie in one plane.
+    """
 
     received: int = 0
     pending: list[int] = field(default_factory=list)
@@ -44,8 +47,8 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: number of frames with both landmarks. apart: a fifth of the frames with the less seen landmark, when the pair
-    was last tested and not merged.
+    together: number of frames with both landmarks. apart: set when a pair is tested and not merged, to a fifth of the number
+    of frames with its less seen landmark.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)
@@ -80,7 +83,7 @@ class MaintenanceSchedule:
 class MapState:
     """The whole state of a session's map.
 
-    graph: the factors and the estimate. cameras, labels: by their numbers. rays: `owner` gives the landmark of each ray.
+    graph: the factors and the estimate. cameras, labels: indexed by their numbers. rays: `owner` gives each ray's landmark.
     tracks: in the order of their first observation. by_label: whether every label is one object so far.
     landmark_of_track: id of the last landmark of each detector track. novelty: share of boxes that match no landmark, as an
     exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
@@ -110,7 +113,7 @@ class MapState:
     next_id: NextIds = field(default_factory=NextIds)
 
     def newest_before(self, stamp: float) -> int | None:
-        """Return the row of the newest keyframe at or before a stamp."""
+        """Return the row of the newest keyframe at or before a stamp, s; None if there is none."""
         stamps = self.keyframes.stamp
         if len(stamps) and stamps[-1] <= stamp:
             return len(stamps) - 1
@@ -122,7 +125,7 @@ class MapState:
         return np.argsort(self.keyframes.stamp, kind="stable")
 
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
-        """Return the keyframes at these rows (n,) in the type of the offline estimation."""
+        """Return the keyframes in these rows (n,) as in offline mapping."""
         k = self.keyframes
         localized, reckoned = bool(k.localized.any()), bool(k.by_odometry[rows].any())
         return Keyframes(
@@ -142,7 +145,7 @@ class MapState:
         return np.searchsorted(self.landmarks.id, ids)
 
     def bearings(self, at: Ints) -> Bearings:
-        """Return the rays at rows (n,) for the graph. The range bias of an object does not average out over its rays."""
+        """Return the rays in rows (n,) for the graph. Range noise includes a bias, which does not average out."""
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
@@ -151,7 +154,7 @@ class MapState:
         return Bearings(**columns, landmark=rays.owner[at], range_sigma=sigma)
 
     def sight(self, at: Ints) -> Observations:
-        """Return the rays at rows (n,) in map, at the poses of the graph's last refresh."""
+        """Return the rays in rows (n,) in map, from the camera poses at the graph's last refresh."""
         rays = self.rays
         ids, index = np.unique(rays.keyframe[at], return_inverse=True)
         poses = self.graph.poses(ids)[index]
@@ -168,7 +171,7 @@ class MapState:
         self.read_positions()
 
     def move_tracks(self, new_T_old: Floats, since: float) -> None:
-        """Move the tracks seen at or after a stamp by a pose (4, 4)."""
+        """Move the tracks that were seen at or after the stamp `since`, s, by a pose (4, 4)."""
         for track in self.tracks:
             if track.last >= since:
                 track.move(new_T_old)

@@ -17,7 +17,7 @@ def column(kind: DTypeLike, *shape: int) -> Any:
 
 
 class GrowingTable:
-    """Columns of one length. A column is an attribute: the array of the rows (n, *shape), which may be changed in place.
+    """A table. Each column is an attribute, an array (n, *shape) with one entry per row, which may be changed in place.
 
     Subclasses declare columns with `column`. `add` and `keep` replace all arrays.
     """
@@ -45,7 +45,7 @@ class GrowingTable:
         self._show()
 
     def keep(self, which: NDArray[np.bool_]) -> None:
-        """Keep the rows of a mask (n,) in their order."""
+        """Keep only the rows that a mask (n,) selects."""
         rows = np.flatnonzero(which)
         for room in self._room.values():
             room[: len(rows)] = room[rows]
@@ -87,7 +87,7 @@ class KeyframeTable(GrowingTable):
 class RayTable(GrowingTable):
     """The rays of the keyframes, one for each box, with columns as in `types.Rays`.
 
-    number: increasing. owner: the id of the ray's landmark, or -1. used: whether the graph has a factor of the ray.
+    number: the id of the ray, increasing. owner: the id of its landmark, or -1. used: whether the graph has its factor.
     """
 
     number: Ints = column(np.int64)

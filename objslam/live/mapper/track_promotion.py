@@ -16,16 +16,16 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
-SLACK = 0.02  # The relative error (m) of poses on one stretch. A larger error accepts rays that pass a point less closely.
+SLACK = 0.02  # The error (m) between poses on one stretch. A larger error accepts rays that pass a point less closely.
 _AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
-_AGAIN = 1.2  # The growth in rays or in spread before a track is tried again. Less growth costs time.
-_EARLY = 0.4  # The share of joint.min_parallax_deg that a certain position needs. A larger share makes landmarks later.
-_SURE = 0.05  # The sigma of a certain position as a share of its distance. A larger share makes more false landmarks.
+_AGAIN = 1.2  # The growth factor of the rays or the spread after which a track is tried again. A smaller factor costs time.
+_EARLY = 0.4  # The share of joint.min_parallax_deg that suffices for a certain position. More makes landmarks later.
+_SURE = 0.05  # The largest sigma of a certain position, as a share of its distance. More makes more false landmarks.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
 def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
-    """Make landmarks of the tracks whose rays are sufficient, and return the other tracks.
+    """Turn the tracks whose rays are sufficient into landmarks, and return the other tracks.
 
     The triangulation takes as long as an association. The graph adds the landmarks at its next update.
     """
@@ -78,9 +78,9 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 def fit_if_observable(
     obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
 ) -> PointFit | None:
-    """Triangulate rays in map. None with too few inliers, an uncertain position, or too little parallax and no range.
+    """Triangulate rays in map. None for too few inliers, for an uncertain position, or for low parallax without ranges.
 
-    least, share: the least number of inliers, and their least share. early: accept less parallax for a certain position.
+    least: least number of inliers. share: least share of inliers. early: accept less parallax for a certain position.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
@@ -95,7 +95,10 @@ def fit_if_observable(
 
 
 def prune_tracks(m: MapState) -> None:
-    """Remove and count tracks above the limit: from the most common labels, short tracks first, then the longest unseen."""
+    """Remove and count the tracks above the limit.
+
+    Labels with most tracks lose tracks first. Within a label, short tracks go first, then the longest unseen ones.
+    """
     if len(m.tracks) <= _MOST_TRACKS:
         return
     best_first = sorted(m.tracks, key=lambda t: (len(t.rays) >= m.settings.live.min_rays, t.last))[::-1]

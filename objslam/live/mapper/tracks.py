@@ -13,7 +13,7 @@ from objslam.graph.isam2 import IncrementalGraph
 
 _DEPTH = 2.5  # The assumed distance (m) of an object seen from one place only, about the middle of a room.
 _DEPTH_SIGMA = 2.0  # The standard deviation (m) of a track along its last ray. A larger value relies more on the rays.
-_DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More slows the position down.
+_DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More makes it move less.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
 _RECENT = 30  # The newest rays that define a track's position. More rays average more noise over a longer drift.
 _LONGEST = 200  # The most rays of a track. Above it, every second old ray is dropped. More rays cost memory and time.
@@ -24,7 +24,7 @@ TrackRay = tuple[int, int, Floats, float, float, float]
 
 @dataclass(eq=False)
 class Track:
-    """The rays of one object that is not a landmark yet.
+    """The rays of one object that is no landmark yet.
 
     by_label: whether its rays have only the label in common. Such a track is never dropped. first, last: stamps, s, of its
     first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)

@@ -22,10 +22,11 @@ class OnPath(NamedTuple):
 
 
 class PathBuffer:
-    """The poses of base from the last `seconds` of a path. Drift is accumulated in the frame of the first pose.
+    """The robot's poses in the last `seconds` of a path. Drift accumulates in the coordinate frame of the first pose.
 
-    max_gap: s, a longer gap ends a stretch and is not interpolated. planar: whether all poses so far have one height, roll
-    and pitch. newest: the stamp of the newest pose. stretch_begin: the first stamp of the newest stretch, inf without poses.
+    max_gap: s. A longer gap ends a stretch of the path, and no pose is interpolated in it. planar: whether all poses so far
+    have one height, roll and pitch. newest: the stamp of the newest pose. stretch_begin: the first stamp of the newest
+    stretch, inf without poses.
     """
 
     def __init__(self, settings: Odometry, seconds: float, max_gap: float) -> None:
@@ -63,7 +64,7 @@ class PathBuffer:
         return self._stamps[0] if self._stamps else np.inf
 
     def stretch(self, stamp: float) -> int | None:
-        """Return the number of the stretch at a stamp. None outside the path or in a gap above max_gap."""
+        """Return the number of the stretch at a stamp. None outside the path or in a gap longer than max_gap."""
         if not self.oldest <= stamp <= self.newest:
             return None
         after = bisect_left(self._stamps, stamp)
@@ -71,7 +72,7 @@ class PathBuffer:
         return on if self._stamps[after] == stamp or self._path[after - 1].stretch == on else None
 
     def at(self, stamp: float) -> OnPath | None:
-        """Return the interpolated pose and drift at a stamp. None outside the path or in a gap above max_gap."""
+        """Return the interpolated pose and drift at a stamp. None outside the path or in a gap longer than max_gap."""
         stretch = self.stretch(stamp)
         if stretch is None:
             return None
@@ -85,5 +86,5 @@ class PathBuffer:
         return OnPath(poses[0], (1 - share) * before.drift + share * then.drift, stretch)
 
     def from_start(self, pose: Floats) -> Floats:
-        """Return a pose (4, 4) in the frame of the first pose."""
+        """Return a pose (4, 4) in the coordinate frame of the first pose."""
         return np.asarray(self._from_start @ pose)

@@ -1,1 +1,1 @@
-"""The ROS messages of a running robot become pushes. `live.adapters` receive them, and `ros` knows their types."""
+"""Turns the ROS messages of a running robot into pushes. `live.adapters` receive the messages, and `ros` decodes them."""

@@ -15,18 +15,18 @@ from objslam.ros.bag.records import frame_name
 from objslam.ros.messages.decode import DecodeError
 from objslam.ros.messages.images import DEPTH_SCALE, depth_image
 
-_KEPT = 30  # The depth images kept per frame: 1 s at 30 Hz, the delay of a detector. A larger number costs memory.
-_MAX_FRAMES = 16  # The most frames with depth images. It bounds the memory.
-Drop = Callable[[str, str], None]  # A function that counts a drop, given its reason and its place.
+_KEPT = 30  # The depth images kept per camera: 1 s at 30 Hz, the delay of a detector. A larger number costs memory.
+_MAX_FRAMES = 16  # The most coordinate frames with depth images. It bounds the memory.
+Drop = Callable[[str, str], None]  # A function that counts a drop. Its arguments are the reason and the place.
 
 
 @dataclass
 class Boxes:
     """The boxes of one image.
 
-    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: s, any clock. points: by the index of a box, the tag that
-    replaces the box, (5, 3) m in the camera frame. size: (width, height) of the image, px, None if unknown. whole: as in
-    `types.Detections`. image: (H, W, 3) uint8 BGR, None if not available.
+    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: the time of arrival, s, by any clock. points: centre and
+    corners (5, 3) of a tag, m, in the camera frame, by the index of the box that they replace. size: (width, height) of the
+    image, px, None if unknown. whole: as in `types.Detections`. image: (H, W, 3) uint8 BGR, None if not available.
     """
 
     topic: str
@@ -44,19 +44,19 @@ class Boxes:
 
     @property
     def place(self) -> str:
-        """The topic and the stamp, as reports name the image."""
+        """The name of the image in reports: its topic and its stamp."""
         return f"{self.topic} at {self.stamp:.3f} s"
 
 
 class DepthImages:
-    """Keeps depth image messages, and decodes a message when boxes need it."""
+    """Keeps depth image messages, and decodes a message only when boxes need it."""
 
     def __init__(self, drop: Drop) -> None:
         self._drop = drop
         self._kept: dict[str, deque[tuple[float, str, Any]]] = {}
 
     def add(self, topic: str, message: Any, stamp: float) -> None:
-        """Keep a depth image that is registered to the camera of its frame. stamp: s."""
+        """Keep a depth image, which must be registered to the camera whose tf frame it names. stamp: s."""
         frame = frame_name(message.header.frame_id)
         if frame not in self._kept and len(self._kept) >= _MAX_FRAMES:
             self._drop(f"depth image beyond the first {_MAX_FRAMES} frames", topic)

@@ -1,4 +1,4 @@
-"""The cameras of a running robot: calibrations, places, and the boxes that wait until both are known."""
+"""The calibrations and mounts of a running robot's cameras, and the boxes that wait until both are known."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -24,8 +24,8 @@ from objslam.ros.topics import closeness, is_named, is_rectified
 PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s. A larger value drops fewer boxes.
 _DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value uses depths of slower cameras.
 _MAX_WAITING = 200  # The most images whose boxes wait. It bounds the memory.
-_IMAGES = 4  # The number of images per camera that are kept for a view. It bounds the memory.
-_SAME = 0.001  # The most by which stamps of an image and its boxes differ, s. It is far below the time between two images.
+_IMAGES = 4  # The number of images per camera that are kept for display. It bounds the memory.
+_SAME = 0.001  # The most that the stamps of an image and its boxes differ, s. It is far below the time between two images.
 _MAX_CAMERAS = 64  # The most cameras that are kept. It bounds the memory.
 
 
@@ -33,8 +33,8 @@ _MAX_CAMERAS = 64  # The most cameras that are kept. It bounds the memory.
 class _Known:
     """A calibrated camera.
 
-    source: the frame of its CameraInfo, "" for a file. frame: its frame in tf. frame_T_camera: the optical frame in `frame`.
-    placed: whether a file gives base_T_camera. pushed: the last pushed base_T_camera.
+    source: the frame of its CameraInfo, "" if a file gives the calibration. frame: its frame in tf. frame_T_camera: (4, 4)
+    its optical frame in `frame`. placed: whether a file gives base_T_camera. pushed: the last pushed base_T_camera.
     """
 
     camera: Camera
@@ -46,7 +46,7 @@ class _Known:
 
 
 class Cameras:
-    """Pushes each camera once it has a calibration and a place, then its boxes in order, and its mount when it moves."""
+    """Pushes each camera when its calibration and mount are known, then its boxes in order, and mounts that change."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Cameras:
         self.depths = DepthImages(drop)
 
     def add_info(self, topic: str, info: Any) -> None:
-        """Take a sensor_msgs/CameraInfo. A changed calibration is pushed again with the next boxes."""
+        """Take a sensor_msgs/CameraInfo. A changed calibration is pushed together with the next boxes."""
         frame = frame_name(info.header.frame_id)
         key = _fingerprint(info)
         old = self._infos.get(frame)
@@ -79,7 +79,10 @@ class Cameras:
             self._known = {name: known for name, known in self._known.items() if frame not in (name, known.source)}
 
     def add(self, boxes: Boxes) -> None:
-        """Push boxes, or keep them until they can be pushed. A second topic of a camera would count objects twice."""
+        """Push boxes, or keep them until they can be pushed.
+
+        Boxes from a second topic of one camera are dropped, because they would count objects twice.
+        """
         if len(self._topics) < _MAX_CAMERAS and self._topics.setdefault(boxes.frame, boxes.topic) != boxes.topic:
             self._drop("detection frame from a second topic of its camera", boxes.place)
             return
@@ -89,7 +92,7 @@ class Cameras:
         self.settle(boxes.arrived)
 
     def settle(self, now: float) -> None:
-        """Push the boxes whose cameras are known by now, and drop those that waited too long. now: s, as `Boxes.arrived`."""
+        """Push the boxes whose cameras are known by now, and drop those that waited too long. now: as `Boxes.arrived`, s."""
         still: deque[Boxes] = deque()
         held: set[str] = set()
         for boxes in self._waiting:
@@ -137,11 +140,11 @@ class Cameras:
         return ""
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return a camera's image at the stamp, s, of its boxes; None if it is not among the newest."""
+        """Return the image of a camera, by its name, at a stamp, s; None if it is not among the newest."""
         return next((image for at, image in self._images.get(camera, ()) if abs(at - stamp) <= _SAME), None)
 
     def _make(self, boxes: Boxes, waited: float) -> _Known | str:
-        """Return the new camera of boxes, or the reason why there is none yet."""
+        """Make the camera of boxes that have none, or return the reason why it cannot be made. waited: s."""
         frame = boxes.frame
         if frame not in self._frames:
             if len(self._frames) >= _MAX_CAMERAS:
@@ -171,7 +174,10 @@ class Cameras:
         return known
 
     def _source(self, boxes: Boxes, waited: float) -> str | None:
-        """Return the frame of the CameraInfo for boxes: their own frame, or after a while that of the nearest topic."""
+        """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
+
+        It is the frame of the boxes. After a while without a CameraInfo of this frame, that of the closest topic is used.
+        """
         if boxes.frame in self._infos:
             return boxes.frame
         if waited < PATIENCE / 2 or not self._infos:

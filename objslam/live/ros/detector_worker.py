@@ -25,7 +25,7 @@ _FAILED, _ENDED = "image that the detector failed on", "image that arrived after
 class DetectorWorker:
     """Runs a detector on offered images, and delivers its boxes.
 
-    One image per topic waits, until a newer image replaces it. So boxes are at most one detection per topic old.
+    One image per topic waits, until a newer image replaces it. So boxes are at most as old as one detection per topic takes.
     """
 
     def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
@@ -38,7 +38,7 @@ class DetectorWorker:
         self._warned: set[str] = set()
 
     def start(self, deliver: Callable[[Boxes], None], drop: Drop, warn: Callable[[str], None]) -> None:
-        """Start the detector's thread. Any thread may call deliver (boxes), drop (reason, place) and warn (message)."""
+        """Start the detector's thread. It calls deliver(boxes), warn(message) and drop(reason, place)."""
         self._deliver, self._drop, self._warn = deliver, drop, warn
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
         self._thread.start()
@@ -71,7 +71,7 @@ class DetectorWorker:
         try:
             while (waiting := self._next()) is not None:
                 self._look(*waiting)
-        except BaseException as error:  # noqa: BLE001 - the warning reports it: nothing catches what a thread raises
+        except BaseException as error:  # noqa: BLE001 - the warning reports it, because nothing catches what a thread raises
             with self._ready:
                 self._ended = True
                 left, self._waiting = self._waiting, {}

@@ -29,17 +29,18 @@ from objslam.sources.ros_bag.options import RosOptions
 if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
-_GRACE = 2.0  # The time before tf replaces an odometry topic, s. A larger value starts a robot without such a topic later.
-_LONGEST = 160  # The most letters of a place in the ledger. It keeps lines readable.
+_GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value starts a robot without one later.
+_LONGEST = 160  # The most letters of the place of a drop in the ledger. It keeps lines readable.
 _MAX_TRACKS = 100_000  # The most track names that are kept. It bounds the memory.
 
 
 class RosMessages:
     """Takes messages of ROS 1 or 2 by type, and pushes their content into a sink. Any thread may call it.
 
-    Odometry comes from one topic, or from tf without a topic. Localisation comes from poses in map, or from tf: each new
-    map -> odom is pushed with the next odometry.
-    ledger: the counts of unusable messages. chosen: the topics of the options. sources: the used topic, or "tf", by role.
+    Odometry comes from one topic, or from tf if there is no topic. Localisation comes from poses in the frame map, or from
+    tf, where each new transform map -> odom is pushed with the next odometry.
+    ledger: the counts of unusable messages. chosen: the topics that the options name. sources: the topic in use, or "tf",
+    by role.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class RosMessages:
             detector.start(self.add_boxes, self.refuse, self._warn)
 
     def receive(self, type_: str, topic: str, message: Any, received: float) -> None:
-        """Take a message. type_: its type in ROS 2, as nav_msgs/msg/Odometry. received: s since 1970, for unset stamps."""
+        """Take a message. type_: in ROS 2 form, as nav_msgs/msg/Odometry. received: s since 1970, used for unset stamps."""
         with self._lock:
             if type_ == ODOMETRY:
                 self._take_odometry(topic, message, received)
@@ -89,7 +90,7 @@ class RosMessages:
                 self._detector.offer(topic, message, _stamp(message.header, received))
 
     def refuse(self, reason: str, where: str, count: int = 1) -> None:
-        """Count an unusable message, from any thread."""
+        """Count unusable messages. Any thread may call this."""
         with self._lock:
             self.ledger.drop(reason, count, where[:_LONGEST] or None)
 
@@ -104,7 +105,7 @@ class RosMessages:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return the detector's image (H, W, 3), uint8 BGR, at a stamp, s; None if it is not among the newest."""
+        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s; None if it is not among the detector's newest."""
         with self._lock:
             return self._cameras.image(camera, stamp)
 
@@ -113,7 +114,7 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used for a role: the chosen source, or else the first that arrived."""
+        """Return whether a source is used for a role. Only the chosen source is used, or else the first that arrived."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:
@@ -146,7 +147,7 @@ class RosMessages:
             return
         if (frame, child) != (self._odom, self._child):
             self._odom, self._child = frame, child
-            with suppress(UnknownTransform):  # tf gives no localisation yet
+            with suppress(UnknownTransform):  # because tf may not give a localisation yet
                 self._correct(frame)
         self._push_odometry(stamp, pose, covariance)
 
@@ -199,12 +200,12 @@ class RosMessages:
             self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
 
     def _news(self, top: str, base: str) -> float | None:
-        """Return the newest stamp of top_T_base; None if it is the same as last time or all transforms are static."""
+        """Return the newest stamp, s, of the transform top_T_base; None if it is not new or all transforms are static."""
         before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
         return None if self._tf_stamp == before else self._tf_stamp
 
     def _correct(self, odom: str) -> None:
-        """Keep map -> odom to be pushed with the next odometry, unless it only repeats the last one."""
+        """Keep the transform map -> odom if it has changed. It is pushed with the next odometry."""
         world = find_world(self._tf.above(odom)[1:])
         if not world or not self._takes("localization", TF):
             return
@@ -213,7 +214,7 @@ class RosMessages:
             self._correction, self._corrected = correction, True
 
     def _odometry_by_tf(self) -> bool:
-        """Return whether tf gives the odometry: by the user's choice, or because no topic has appeared for a while."""
+        """Return whether tf gives the odometry, because the user chose tf or no odometry topic has appeared for a while."""
         if "odometry" in self.sources:
             return self.sources["odometry"] == TF
         now = self._clock()

@@ -11,7 +11,7 @@ _NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in the names of 
 LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s. A larger value finds a new topic later.
 HEAD_START = 1.0  # The time to find all publishers before one of several is chosen, s. A larger value starts sessions later.
 STOP_WAIT = 0.05  # The time until an adapter notices a stop, s. A smaller value wakes it more often without need.
-QUEUE = 1000  # The most waiting messages of a topic without images: 5 s of odometry at 200 Hz. A larger number costs memory.
+QUEUE = 1000  # The most waiting messages of a topic, except images: 5 s of odometry at 200 Hz. A larger number costs memory.
 
 
 @dataclass
@@ -22,10 +22,10 @@ class TopicChoice:
     images: bool = False
 
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
-        """Return the wanted topics among those offered (name: type).
+        """Return the wanted topics. offered: the types of all topics, by name. settled: whether probably all are known.
 
-        If several topics fit the odometry or the image, the shortest name is chosen with a warning, once the topics are
-        `settled`: probably all known.
+        If they are, one topic is chosen for the odometry, by the shortest name, and one for the images, as `_colour` sorts
+        them. A warning names the other topics that fit.
         """
         names = sorted(offered, key=lambda name: (len(name), name))
         picked = {name for name in names if self._plain(name, offered[name])}
@@ -67,7 +67,7 @@ class TopicChoice:
 
 
 def _colour(names: list[str], offered: Mapping[str, str]) -> list[str]:
-    """Return the topics of colour images, those with a CameraInfo beside them and then uncompressed ones first."""
+    """Return the topics of colour images: first those with a CameraInfo beside them, and uncompressed before compressed."""
     infos = [name for name in names if offered[name] == CAMERA_INFO]
     images = [n for n in names if offered[n] in IMAGES and not any(word in n.lower() for word in _NO_COLOUR)]
     near = {name: max((closeness(info, name) for info in infos), default=0) for name in images}

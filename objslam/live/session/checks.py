@@ -1,4 +1,4 @@
-"""Checks of pushed messages: values of any type become valid numbers, names, cameras and frames, or None."""
+"""Checks of pushed messages. They turn values of any type into valid numbers, labels, cameras and frames, or refuse them."""
 
 import math
 from collections.abc import Mapping, Set
@@ -12,17 +12,17 @@ from objslam.core.camera import COEFFICIENTS, Camera
 from objslam.core.types import MAX_BOXES
 from objslam.sources.journal.records import FrameMessage
 
-LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more nonsense.
-_LATEST = 1e11  # The largest valid stamp, s. A float has no microseconds beyond it. A larger value accepts more nonsense.
-_RIGID = 1e-3  # The most that an entry of R^T R differs from the identity. A larger value accepts worse rotations.
+LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more wrong lengths.
+_LATEST = 1e11  # The largest valid stamp, s. Above it, a float is too coarse for microseconds. A larger value accepts more.
+_RIGID = 1e-3  # The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations.
 _LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
-_LETTERS = 80  # The most letters of a text in a report. A larger number makes longer lines.
+_LETTERS = 80  # The most letters of a message's text in a report. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
 _EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
 def floats(values: object, *shape: int) -> Floats | None:
-    """Copy values into an array of a shape; None if that fails. An empty list fits any shape that holds no number."""
+    """Copy values into an array of a shape; None if that fails. An empty list fits every shape that has a 0 in it."""
     found = _array(values, np.float64)
     if found is None or found.shape == shape:
         return found
@@ -30,7 +30,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Copy the track ids of `Sink.push_detections` into an array (count,), -1 where unknown; None if they are invalid."""
+    """Copy the ids of `Sink.push_detections` into an array (count,), with -1 for unknown ids; None if an id is invalid."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)
@@ -45,13 +45,13 @@ def track_numbers(values: object, count: int) -> Ints | None:
 
 
 def stamp_of(value: object) -> float | None:
-    """Return a stamp, s; None if it is no number, not finite or out of range."""
+    """Return a stamp, s; None if the value is no number, not finite or out of range."""
     found = floats(value)
     return float(found) if found is not None and abs(float(found)) <= _LATEST else None
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
-    """Return the labels of an ordered collection; None for a text or an unordered collection."""
+    """Return labels as a tuple; None for a text, an unordered collection or more than MAX_BOXES labels."""
     if isinstance(labels, str | bytes | Mapping | Set) or not _is_short(labels):
         return None
     try:
@@ -71,14 +71,14 @@ def is_camera_name(value: object) -> bool:
 
 
 def told(value: object) -> str:
-    """Return how a report names a value: a text or a float by itself, any other value by its type."""
+    """Return the name of a value in reports: a text or a float itself, and the type of any other value."""
     if isinstance(value, str):
         return value[:_LETTERS] if value.isprintable() else ascii(value[:_LETTERS])
     return f"{value:.3f}" if isinstance(value, float) else f"of type {type(value).__name__}"
 
 
 def rigid(pose: object) -> Floats | None:
-    """Copy a rigid pose into an array (4, 4); None if it is not rigid."""
+    """Copy a rigid pose into an array (4, 4); None if the pose is not rigid, not finite or larger than LARGEST."""
     matrix = floats(pose, 4, 4)
     if matrix is None or not np.isfinite(matrix).all() or np.abs(matrix[:3]).max() > LARGEST:
         return None
@@ -90,7 +90,7 @@ def rigid(pose: object) -> Floats | None:
 
 
 def sound_camera(camera: object) -> Camera | str:
-    """Return a copy of a camera; if the camera is invalid, return the fault, which is worded to follow "camera"."""
+    """Return a copy of a valid camera. For an invalid camera, return its fault in words that follow "camera"."""
     if not isinstance(camera, Camera) or not is_camera_name(camera.name):
         return "without a name"
     matrix, distortion = floats(camera.matrix, 3, 3), _array(camera.distortion, np.float64)
@@ -121,8 +121,8 @@ def sound_frame(
 ) -> tuple[FrameMessage | None, str, str, dict[str, int]]:
     """Check the arguments of `Sink.push_detections`, which may be of any type.
 
-    Return the frame without its invalid boxes (None if the whole frame is malformed), the reason for dropping the whole
-    frame, the frame's name in reports, and the number of invalid boxes by reason.
+    Return the frame without its invalid boxes, or None if the whole frame is malformed; the reason to drop the whole frame,
+    or ""; the frame's name in reports; and the number of invalid boxes by reason.
     """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:
@@ -159,7 +159,7 @@ def sound_frame(
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array; None if they are no numbers (text, truth values, times) or no array."""
+    """Copy values into an array; None if they form no array, or hold something else than numbers, such as truth values."""
     if not _is_short(values, scalar=True):
         return None
     try:
@@ -173,7 +173,7 @@ def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
 
 
 def _is_short(values: object, scalar: bool = False) -> bool:
-    """Return whether values have a length of at most MAX_BOXES; `scalar` is the answer for values without a length."""
+    """Return whether values have a length of at most MAX_BOXES. For values without a length, return `scalar`."""
     try:
         return len(values) <= MAX_BOXES  # type: ignore[arg-type]
     except Exception:  # noqa: BLE001 - a foreign object may raise anything

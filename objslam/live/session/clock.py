@@ -1,20 +1,21 @@
-"""The session's clock: session time never goes back, even when the robot's clock does."""
+"""The clock of a session. It converts stamps to session time, which never goes back, even when the robot's clock does."""
 
 from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The consecutive older poses that prove a clock set back. A larger number follows it later, but more surely.
-_BACK = 0.5  # The least step of a clock set back, s. A smaller step is lateness. A larger value ignores small steps.
-_KEPT = 8  # The number of earlier clocks that stamps may still belong to. More clocks only cost memory.
-_MISSED = 0.005  # The advance of the path while the clock is set back, s. It is a step of odometry at 200 Hz.
+_SURE = 5  # The consecutive older poses that show that the clock was set back. A larger number is surer, but slower.
+_BACK = 0.5  # The least step back of a clock that is set back, s. With a smaller step, a pose is late instead.
+_KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
+_MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
 
 
 @dataclass
 class Clock:
     """Converts stamps to session time, in which the stamps of the path increase.
 
-    shift: the time, s, that is now added to a stamp. newest: the newest stamp of the path in session time, s, or -inf.
+    shift: the time, s, that is added to a stamp now. newest: the newest stamp of the path, in session time, s. It is -inf
+    before the first pose.
     """
 
     shift: float = 0.0
@@ -23,7 +24,7 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a path's stamp in session time (None if late or repeated), and whether the clock was set back."""
+        """Return a new pose's stamp in session time, None if late or repeated, and whether the clock was set back."""
         time = stamp + self.shift
         if time > self.newest:
             self.newest = time
@@ -43,7 +44,7 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return any other stamp in session time, by the latest clock that puts it between oldest and latest."""
+        """Return any other stamp in session time. Of all shifts, the newest that gives `oldest` to `latest` is used."""
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:
                 return stamp + shift
@@ -51,9 +52,9 @@ class Clock:
 
 
 class Lead:
-    """Chooses the `path` whose stamps set the clock (None before the first pose).
+    """Chooses the path whose stamps set the clock. path: this leading path, None before the first pose.
 
-    The odometry sets the clock. The localisation takes over when it continues for max_gap (s) without odometry.
+    The odometry leads. The localisation takes over when it continues for max_gap, s, without odometry.
     """
 
     def __init__(self, clock: Clock, max_gap: float) -> None:
@@ -63,13 +64,16 @@ class Lead:
         self.path: PathKind | None = None
 
     def choose(self, path: PathKind, at: float) -> None:
-        """Update the leading path for a new pose at a session time. A path that leads again resumes at its newest stamp."""
+        """Update the leading path for a new pose of a path. at: its session time, s.
+
+        A path that leads again continues from its own newest stamp.
+        """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))
 
     def heard(self, path: PathKind, at: float) -> None:
-        """Record that a pose at a session time was accepted."""
+        """Record that a pose of a path was accepted. at: its session time, s."""
         self._newest[path] = at
         if path == "odometry":
             self._odometry_until = max(self._newest.values())

@@ -1,4 +1,4 @@
-"""The end of a session: its keyframes and rays are solved once more as offline, and become a result."""
+"""The end of a session. Its keyframes and rays are solved once more, as in offline mapping, and become a result."""
 
 import time
 from pathlib import Path
@@ -18,10 +18,10 @@ from objslam.mapping.describe import describe, summarise
 
 
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
-    """Return the result of a session: association and solve alternate as in the joint mode, from the session's estimate.
+    """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
-    If labels identify objects, or there are more rays than live.reassociate, the session's association is kept. SolveError
-    when no box could be mapped.
+    The session's association is kept if every label is one object, or if there are more rays than live.reassociate.
+    SolveError when no box could be mapped.
     """
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
@@ -73,7 +73,10 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
 def _solve_joint(
     keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
 ) -> Estimate:
-    """Return the joint solve from the session's poses (K, 4, 4), or the offline solve if its residuals are smaller."""
+    """Return the joint solve that starts from the session's poses (K, 4, 4).
+
+    With few rays and without localisation, also solve from the odometry. Return the solve with the smaller residuals.
+    """
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements
     from objslam.graph.outlier_rejection import misfit
@@ -82,7 +85,7 @@ def _solve_joint(
     few = association.count and len(rays) <= settings.live.reassociate
     if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return found
-    other_ledger = Ledger()  # the session may have rejected a ray early, and never tested it again
+    other_ledger = Ledger()  # Of a second solve, because the session may have rejected rays early and for good.
     try:
         other = batch_solver.solve_joint(keyframes, rays, association, settings, other_ledger)
     except SolveError:
@@ -99,10 +102,10 @@ def _solve_joint(
 
 
 def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats]:
-    """Return keyframes in the order of time, their rays, the association, camera poses (K, 4, 4) and positions (N, 3).
+    """Return keyframes in time order, their rays, the association, camera poses (K, 4, 4) and object positions (N, 3).
 
-    With a localisation, keyframes that it does not cover are left out, as offline. Tracks with enough rays become objects,
-    which the solve may leave unresolved.
+    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. Tracks with enough rays
+    become objects too, but the solve may leave them unresolved.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
@@ -131,14 +134,14 @@ def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats
 
 
 def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
-    """Return the rays at these rows (R,) in the type of the offline estimation. keyframe: (R,) their keyframes there."""
+    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe there."""
     names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
     columns = {name: getattr(m.rays, name)[rows] for name in names}
     return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """Return the object (R,) of each ray, -1 without one, and the objects' labels (N,) and positions (N, 3)."""
+    """Return the object (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) of the objects."""
     landmarks, rays = m.landmarks, m.rays
     owner = rays.owner.copy()
     first = int(landmarks.id.max(initial=-1)) + 1

@@ -1,4 +1,4 @@
-"""The queue of frames that wait until the path covers them, and then enter the map in the order of their stamps."""
+"""The queue of frames. Frames wait until the path covers them, and then enter the map in the order of their stamps."""
 
 import bisect
 import time
@@ -10,30 +10,30 @@ from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.sources.journal.records import FrameMessage, Message
 
-TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason for dropping a frame that the session had no time for.
+TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason to drop a frame for which the session had no time.
 _RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or live.max_lag is too short"
 _NEVER_COVERED = "frames that the path never covered"
 
 
 class FrameQueue:
-    """Feeds messages to the mapper. patient: whether frames of any age are accepted.
+    """Passes messages to the mapper. patient: whether frames of any age are accepted.
 
-    lag: time, s, from the arrival of the newest frame until the map contains it. worked: when the last frame was processed,
-    s, by `time.perf_counter`.
+    lag: the time, s, from the arrival of the last mapped frame until the map contained it. worked: the `time.perf_counter`,
+    s, when a frame last left the queue.
     """
 
     def __init__(self, settings: Settings, counters: Counters, mapper: Mapper, patient: bool) -> None:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
         self._counters, self._mapper, self._patient = counters, mapper, patient
-        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, order of arrival, frame, arrival
+        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, order of arrival, frame, time of arrival
         self._frames = 0
         self.lag = 0.0
         self.worked = -np.inf
 
     def take(self, message: Message, arrival: float, measured: bool = True) -> bool:
-        """Take a message that arrived at a time, s, and return whether any frame left the queue.
+        """Take a message, and return whether any frame left the queue. arrival: `time.perf_counter` at its arrival, s.
 
-        measured: whether the lag is recorded and limited. It is not for a message of a journal.
+        measured: whether the time until the map contains a frame is limited and counted. It is False for a journal.
         """
         if isinstance(message, FrameMessage):
             self._frames += 1

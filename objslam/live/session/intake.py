@@ -1,4 +1,4 @@
-"""The entry of a session: every message is checked, put on the session's clock, delivered and counted."""
+"""The entry of a session. Every message is checked, converted to session time, delivered and counted."""
 
 import math
 import threading
@@ -25,22 +25,23 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1  # The step, m, that odometry may make besides live.max_speed. A larger value takes more restarts for motion.
-_TURN = 0.3  # The angle, rad, that odometry may turn besides _TURNS_PER_M. A larger value takes more restarts for motion.
+_JUMP = 0.1  # The allowed step, m, beyond the way at live.max_speed. A larger value takes more restarts for motion.
+_TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # The distance from zero, m and rad, of restarted odometry after a gap. A larger value detects more restarts.
-_FAR = 0.1  # The least distance from zero, m and rad, before such a gap. A larger value takes more restarts for motion.
+_ZERO = 0.05  # The most that odometry restarted in a gap differs from zero, m and rad. A larger value detects more restarts.
+_FAR = 0.1  # The least difference from zero, m and rad, before such a gap. A larger value takes more restarts for motion.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
-_WAIT = 2.0  # The lead over the path, s, above which older clocks are tried. A larger value takes old stamps for new ones.
+_WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 
 
 class Intake:
-    """A `Sink` that delivers valid messages in session time: stamps of the path increase, and odometry is continuous.
+    """A `Sink` that checks messages and delivers the valid ones.
 
-    deliver(message, arrival) is called with one message at a time, by the thread that pushed. It returns whether it accepted
-    the message, and counts the messages that it refuses.
+    It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
+    odometry, it converts the new poses, so that they continue the old path. The thread that pushes calls deliver(message,
+    arrival), for one message at a time. `deliver` returns whether it accepts the message, and counts what it refuses.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
@@ -54,7 +55,7 @@ class Intake:
         self._lead = Lead(self._clock, settings.poses.max_gap)
 
     def push_camera(self, camera: Camera) -> bool:
-        """Push as `Sink` says. A camera that is already known is accepted without being delivered."""
+        """Push as `Sink` says. A known camera that has not changed is accepted, but not delivered again."""
         sound = checks.sound_camera(camera)
         if isinstance(sound, str):
             return self._refuse(f"camera {sound}", checks.told(camera.name if isinstance(camera, Camera) else camera))
@@ -68,11 +69,11 @@ class Intake:
             return True
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push as `Sink` says. The drift comes from the settings, and the covariance is ignored."""
+        """Push as `Sink` says. The covariance is ignored, because the drift comes from the settings."""
         return self._push_pose("odometry", stamp, odom_T_base)
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push as `Sink` says. The noise comes from the settings, and the covariance is ignored."""
+        """Push as `Sink` says. The covariance is ignored, because the noise comes from the settings."""
         return self._push_pose("localization", stamp, map_T_base)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
@@ -125,7 +126,7 @@ class Intake:
 
     @property
     def newest(self) -> float:
-        """The newest stamp of the path that sets the clock, in session time, s; -inf without any."""
+        """The newest stamp of the path that sets the clock, in session time, s. It is -inf before the first pose."""
         return self._clock.newest
 
     def recall(self, message: Message) -> None:
@@ -183,7 +184,7 @@ class Intake:
         return self._clock.place(stamp, self.newest - self._settings.live.max_late, self.newest + _WAIT)
 
     def _continuous(self, at: float, odom_T_base: Floats) -> Floats:
-        """Return the pose in the frame of the first odometry, even when the robot's odometry has restarted since."""
+        """Return a pose in the coordinate frame of the first odometry, even if the robot's odometry has restarted."""
         last = self._last.get("odometry")
         pose = self._start_T_odom @ odom_T_base
         if last is None:
@@ -213,7 +214,7 @@ class Intake:
         self._hand_on(NoteMessage(self._clock.shift, self._start_T_odom))
 
     def _hand_on(self, message: Message) -> bool:
-        """Deliver a message, and count it only when it was accepted. Return whether it was."""
+        """Deliver a message, count it if it is accepted, and return whether it is accepted."""
         if not self._deliver(message, time.perf_counter()):
             return False
         self.counters.accept(_kind(message))
@@ -229,6 +230,6 @@ def _kind(message: Message) -> str:
 
 
 def _size(pose: Floats) -> tuple[float, float]:
-    """Return the distance (m) and the angle (rad) of a pose (4, 4)."""
+    """Return the length (m) of a pose's translation and the angle (rad) of its rotation. pose: (4, 4)."""
     angle = math.acos(min(1.0, max(-1.0, (float(np.trace(pose)) - 2.0) / 2.0)))
     return math.hypot(*pose[:3, 3]), angle

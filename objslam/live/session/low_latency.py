@@ -3,11 +3,11 @@
 import gc
 import sys
 
-_SWITCH_INTERVAL = 5e-4  # The time until threads switch, s. A larger value loses less time, but lets messages wait longer.
+_SWITCH_INTERVAL = 5e-4  # The time until Python switches threads, s. A larger value costs less, but messages wait longer.
 
 
 def configure() -> None:
-    """Switch threads sooner than Python's 5 ms, and exempt present objects from garbage collection, which saves 0.15 s."""
+    """Switch threads sooner than Python's 5 ms. Exempt present objects from garbage collection, which saves 0.15 s."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()

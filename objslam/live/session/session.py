@@ -1,4 +1,4 @@
-"""A session: messages pushed from any thread become a map in the session's own thread."""
+"""A session. Any thread pushes messages, and the session's own thread makes a map of them."""
 
 import threading
 import time
@@ -24,22 +24,22 @@ from objslam.live.session.snapshots import Describer, take_snapshot
 from objslam.sources.journal.file import Journal, messages
 from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
 
-_MOST_POSES = 20_000  # The most waiting messages besides frames: 100 s of odometry at 200 Hz. A larger number costs memory.
-_IDLE = 0.05  # The longest sleep of the idle thread and wait of a snapshot for a frame, s. A larger value answers later.
-_SHORT = 0.015  # The longest time of a frame, s, that a snapshot follows. A larger value delays more frames.
-_LONG = 0.5  # The wait for a snapshot, s, after which it follows any frame. A larger value answers later.
+_MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
+_IDLE = 0.05  # The longest sleep of the idle thread, and wait of a snapshot for a frame, s. A larger value answers later.
+_SHORT = 0.015  # The processing time, s, up to which a snapshot follows at once. A larger value delays more frames.
+_LONG = 0.5  # The wait, s, after which a snapshot follows a frame of any processing time. A larger value answers later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
 class Session(Intake):
-    """A `Sink` that builds a map. `start` it, push from any thread, take a `snapshot` at any time, `stop` it for the result.
+    """A `Sink` that builds a map. Call `start`, push from any thread, call `snapshot` at any time, and `stop` at the end.
 
     An error in the session's thread ends the session early. Then `failure` holds the error, every wait for the session ends,
-    pushes are refused, and `stop` returns the result of the messages until then.
+    pushes are refused, and `stop` returns the result of the messages before the error.
 
     journal: the file that receives every accepted message before it is processed. Only one session may write the file.
-    resume: whether to continue an existing journal, whose messages `start` processes. patient: whether frames of any age are
-    accepted, for a source that waits for the session.
+    resume: whether to continue an existing journal. Then `start` processes its messages. patient: whether frames of any age
+    are accepted, because the source waits for the session.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Session(Intake):
             return self._snapshot
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until all pushed messages are processed, at most timeout (s), and return whether they are.
+        """Wait until all pushed messages are processed, but at most `timeout`, s. Return whether they are processed.
 
         Return at once if the session ended early or was never started.
         """
@@ -104,10 +104,10 @@ class Session(Intake):
             return not (self._queue or self._busy) and self.failure is None
 
     def stop(self) -> RunResult:
-        """Process the pushed messages, end the thread, and solve the whole map once more.
+        """Process the pushed messages, end the thread, solve the whole map once more, and return the result.
 
-        After a `failure` the result covers the messages until then, and the ledger gets a warning. Raises the `failure` if
-        it left no result. SolveError when no box could be mapped.
+        After a `failure`, the result covers the messages before it, and the ledger gets a warning. Raises the `failure` if
+        there is no result. SolveError when no box could be mapped.
         """
         self._close()
         if self.failure is not None:
@@ -125,7 +125,7 @@ class Session(Intake):
         self._close(discard=True)
 
     def _close(self, discard: bool = False) -> None:
-        """End the thread, then close the journal, which no push writes any more."""
+        """End the thread, and then close the journal, because no push writes into it any more."""
         with self._changed:
             self._stopping = True
             if discard:
@@ -140,7 +140,7 @@ class Session(Intake):
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into the journal and into the queue, or into neither. A note goes into the journal alone."""
+        """Put a message into journal and queue, or into neither. A note enters the journal only. Return whether accepted."""
         with self._changed:
             if self._stopping:
                 self.counters.drop("messages after the end of the session")
@@ -201,14 +201,14 @@ class Session(Intake):
                 self._answer()
 
     def _guard(self, work: Callable[[], None]) -> None:
-        """Do work, and keep its error as the session's `failure` unless there is an earlier one."""
+        """Call `work`, and keep its error as the session's `failure`, unless there is an earlier failure."""
         try:
             work()
-        except Exception as error:  # noqa: BLE001 - `failure` reports it: nothing catches what a thread raises
+        except Exception as error:  # noqa: BLE001 - `failure` reports it, because nothing catches what a thread raises
             self.failure = self.failure or error
 
     def _end(self) -> None:
-        """Make the last snapshot, count the messages that remain, and wake all waiting threads."""
+        """Make the last snapshot, drop and count the messages that remain, and wake all waiting threads."""
         with self._changed:
             self._stopping = True
         self._guard(self._answer)
@@ -225,7 +225,7 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now. Right after a short frame, the next frame is furthest away."""
+        """Return whether to make a snapshot now. Right after a quick frame, the most time is left until the next frame."""
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 

@@ -1,4 +1,4 @@
-"""Snapshots of the map, made in milliseconds: only objects that were seen since the last snapshot are described again."""
+"""Snapshots of the map. They take milliseconds, because only objects seen since the last snapshot are described again."""
 
 import time
 from dataclasses import replace
@@ -19,9 +19,9 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.live.session.finalize import offline_rays
 
-_BUDGET = 0.012  # The time of a snapshot, s. A larger value delays frames, a smaller value leaves more descriptions old.
-_MOST = 200  # The most rays, evenly spread, that describe an object. A larger number takes longer.
-_FEW = 60  # The most rays for the parallax of an object, which compares all their pairs. A larger number takes longer.
+_BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
+_MOST = 200  # The most rays that describe an object. They are spread evenly over its rays. A larger number takes longer.
+_FEW = 60  # The most rays that give the parallax of an object, as the widest angle of all pairs. More rays take longer.
 
 
 class Describer:
@@ -32,9 +32,10 @@ class Describer:
         self._waiting: dict[int, tuple[int, MapObject]] = {}
 
     def map(self, m: MapState, whole: bool = False) -> ObjectMap:
-        """Return the landmarks with covariance and status by their ids, then the tracks with enough rays, unresolved.
+        """Return first the landmarks, in the order of ids, and then the tracks with enough rays, as unresolved objects.
 
-        Objects beyond the time budget, which `whole` ignores, keep their last description at their present position.
+        After the time budget is spent, objects keep their last description, but landmarks get their present position.
+        New landmarks get a covariance from their rays alone, and new tracks are left out. whole: ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
         landmarks, known = m.landmarks, self._described
@@ -48,7 +49,7 @@ class Describer:
             before = known.get(j)
             if before is not None and (before[0] == state or time.perf_counter() > end):
                 described, state = replace(before[1], position=points[row]), before[0]
-            elif time.perf_counter() > end:  # a new object: its rays alone give a covariance for now
+            elif time.perf_counter() > end:  # a new landmark, for which the rays alone give a covariance for now
                 described = _landmark(m, row, points[row], covariances(landmarks, np.array([row]))[0], False)
                 state = (-1, -np.inf)
             else:
@@ -64,7 +65,7 @@ class Describer:
         return ObjectMap(tuple(objects))
 
     def _wait(self, m: MapState, track: Track, whole: bool, end: float) -> tuple[int, MapObject] | None:
-        """Return the number of rays and the description of a track; None if a new track exceeds the budget."""
+        """Return the number of rays and the description of a track; None for a new track after time `end`, s."""
         before = self._waiting.get(track.id)
         if not whole and ((before is not None and before[0] == len(track.rays)) or time.perf_counter() > end):
             return before
@@ -72,7 +73,7 @@ class Describer:
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
-    """Return the state of a session. lag: s. whole: as in `Describer.map`."""
+    """Return a snapshot of a map. lag: as in `Snapshot`, s. whole: as in `Describer.map`."""
     return Snapshot(
         stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
         map=describer.map(m, whole),
@@ -88,7 +89,7 @@ def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) ->
 
 
 def _path(m: MapState) -> Trajectory:
-    """Return map_T_base of all keyframes, as of the graph's last refresh."""
+    """Return map_T_base of all keyframes by the estimate at the graph's last refresh."""
     k = m.keyframes
     stamps, first = np.unique(k.stamp, return_index=True)
     return Trajectory(stamps, m.graph.poses(k.id[first]) @ inverse(k.base_T_camera[first]))
@@ -120,7 +121,7 @@ def _landmark(m: MapState, row: int, position: Floats, covariance: Floats, from_
     parallax = widest_angle(m.sight(_spread(mine, _FEW)).direction)
     limits, away = m.settings.triangulation, reach(position, obs.origin)
     sigma = float(largest_sigma(covariance[None])[0])
-    if from_graph and sigma > limits.max_rel_sigma * away:  # sigma may include the drift of the map
+    if from_graph and sigma > limits.max_rel_sigma * away:  # This sigma may include the drift of the map.
         seen = m.graph.seen_covariance(j, int(rays.keyframe[mine].max()))
         sigma = float(largest_sigma(wider * seen[None])[0])
     status = status_of(sigma, away, count, parallax, bool(np.isfinite(obs.range).any()), limits)
@@ -171,7 +172,7 @@ def _rms_deg(obs: Observations, position: Floats) -> float:
 
 
 def _extent(m: MapState, at: Ints, position: Floats) -> tuple[float, float] | None:
-    """Return the width and height, m, of the object at a position by its rays at these rows; None if unknown."""
+    """Return the width and height, m, of an object at a position; None if unknown. at: the rows of its rays."""
     row = np.searchsorted(m.keyframes.id, m.rays.keyframe[at])
     frames, index = np.unique(row, return_inverse=True)
     poses = m.graph.poses(m.keyframes.id[frames])

@@ -21,8 +21,9 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
     Args:
         to: the name of a format in `FORMATS`.
         file: the file to write; by default the format's usual file in `out`.
+        datum: the position of the map on the earth.
     Raises:
-        ConfigError: the format does not exist, or takes no datum.
+        ConfigError: the format does not exist, or it cannot use the given datum.
         OutputError: the result cannot be read or lacks data that the format needs, or the file cannot be written.
     """
     from objslam.io.atomic_files import write_file

@@ -25,13 +25,13 @@ _TEXT_SIZE = 0.15  # The text of a label has this height, m.
 
 
 class MapMessages:
-    """Makes messages in one frame; ROS 2 Humble and later have their types, and `store` serialises them."""
+    """A maker of messages in one coordinate frame. ROS 2 Humble and later know their types, and `store` serialises them."""
 
     def __init__(self, frame: str) -> None:
         self.frame, self.store = frame, typestore()
 
     def make(self, name: str, *values: Any) -> Any:
-        """Make a message from its type, package/Name, and its fields in order."""
+        """Make a message of the type `name`, written as package/Name, from the values of its fields in order."""
         package, _, plain = name.partition("/")
         return self.store.types[f"{package}/msg/{plain}"](*values)
 
@@ -58,9 +58,9 @@ class MapMessages:
         return self.make("nav_msgs/Path", self.header(stamp), stamped)
 
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
-        """Make a vision_msgs/Detection3DArray from objects: labels with their shares, positions with covariances.
+        """Make a vision_msgs/Detection3DArray with the labels, positions and covariances of objects.
 
-        The depth of a box equals its width. A box has size 0 if the size of its object is unknown.
+        The score of a label is its share. The depth of a box equals its width. A box of unknown size has size 0.
         """
         return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 

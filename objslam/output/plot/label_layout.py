@@ -4,32 +4,32 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 
-_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # The candidates of a label lie in these directions, rad.
+_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # Candidate positions of a label lie in these directions, rad.
 _RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
-"""The candidates of a label lie at these distances, px, from its dot. The distance adds to the cost of a candidate."""
-_DOT = 6.0  # Labels keep out of a square around each dot. Half its side is this length, px.
+"""The candidate positions of a label lie at these distances, px, from its dot. A larger distance costs more."""
+_DOT = 6.0  # No label covers the square around a dot. Half the side of this square has this length, px.
 _PAD = 2.0  # Labels keep this distance, px, from each other.
 _CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
 _FAR = 14.0  # A label gets a leader line if it is farther than this, px, from its dot.
-_AMBIGUOUS = 2.0  # A label is ambiguous if its own dot is not nearer, by more than this distance, px, than every other dot.
+_AMBIGUOUS = 2.0  # A label is ambiguous if another dot is nearer than its own dot, or at most this distance, px, farther.
 _AMBIGUOUS_COST = 60.0  # This is the cost, px, of an ambiguous label. A larger cost moves it farther out.
 _COVER_COST = 1.5  # This is the cost, px, of each point in `avoid` that a label covers.
-_MOST_COVERED = 20  # At most this many covered points count.
+_MOST_COVERED = 20  # At most this many covered points add to the cost.
 _CROSSING_COST = 60.0  # This is the cost, px, of each line, label or dot that a leader line crosses.
-_OUTWARD_GAIN = 0.05  # Each px away from the mean of all dots lowers the cost by this, px, and keeps the middle free.
+_OUTWARD_GAIN = 0.05  # Each px farther away from the mean of all dots lowers the cost by this, px. The middle stays free.
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
-    """Place labels greedily, the labels of the most crowded dots first; all lengths are px.
+    """Place labels one by one. The labels of the most crowded dots come first. All lengths are in px.
 
-    Each label gets the cheapest of a fixed set of candidates around its dot. A candidate must lie in the frame, and must not
-    cover a dot or an earlier label. These properties of a candidate raise its cost: a large distance from the dot, covered
-    points of `avoid`, another dot that is nearer, and a leader line that crosses something.
+    Each label gets the cheapest of a fixed set of candidate positions around its dot. At this position, the label must lie
+    inside `frame`, and must not cover a dot or an earlier label. These properties of a candidate raise its cost: a large
+    distance from the dot, covered points of `avoid`, another dot that is nearer, a leader line that crosses something.
 
     Args:
         anchors: (N, 2) the dots.
         sizes: (N, 2) width and height of each label.
-        frame: (2, 2) the lower left and the upper right corner.
+        frame: (2, 2) the lower left and the upper right corner of the area for labels.
         avoid: (P, 2) points that the labels should not cover.
     Returns:
         The lower left corners (N, 2) of the labels, and a mask (N,) of the labels that were placed.
@@ -68,7 +68,7 @@ def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -
 
 
 def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
-    """Return boxes (C, 4) x1, y1, x2, y2 around a dot and their costs (C,), which favour the right side, then the left."""
+    """Return boxes (C, 4), x1, y1, x2, y2, around a dot and their costs (C,). The right side costs least, then the left."""
     direction = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
     centre = anchor + direction * (_RADII[:, None] + np.abs(direction) @ (size / 2))[..., None]
     reach = _RADII[:, None] + 2.0 * np.abs(direction[:, 1]) + 1.0 * (direction[:, 0] < -0.1)
@@ -84,18 +84,18 @@ def needs_leader(anchors: Floats, corners: Floats, sizes: Floats) -> Bools:
 
 
 def _nearest(boxes: Floats, points: Floats) -> Floats:
-    """Return the distance (A,) of each box (A, 4) from its nearest point (P, 2); infinite without points."""
+    """Return the distance (A,) from each box (A, 4) to the nearest of the points (P, 2). It is infinite without points."""
     near = np.clip(points[None], boxes[:, None, :2], boxes[:, None, 2:])
     return np.linalg.norm(near - points[None], axis=2).min(axis=1, initial=np.inf)
 
 
 def _overlaps(a: Floats, b: Floats) -> Bools:
-    """Return a mask (A, B): whether each box (A, 4) overlaps each box (B, 4)."""
+    """Return a mask (A, B), which is True where a box of `a` (A, 4) overlaps a box of `b` (B, 4)."""
     return np.all((a[:, None, :2] < b[None, :, 2:]) & (b[None, :, :2] < a[:, None, 2:]), axis=2)
 
 
 def _cross(a: Floats, b: Floats) -> Bools:
-    """Return a mask (A, B): whether each segment (A, 4) crosses each segment (B, 4)."""
+    """Return a mask (A, B), which is True where a segment of `a` (A, 4) crosses a segment of `b` (B, 4)."""
 
     def side(p: Floats, q: Floats, r: Floats) -> Floats:
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
@@ -106,6 +106,6 @@ def _cross(a: Floats, b: Floats) -> Bools:
 
 
 def _hits(lines: Floats, boxes: Floats) -> Bools:
-    """Return a mask (A, B): whether each segment (A, 4) crosses a diagonal of each box (B, 4)."""
+    """Return a mask (A, B), which is True where a line of `lines` (A, 4) crosses a diagonal of a box of `boxes` (B, 4)."""
     falling = np.stack([boxes[:, 0], boxes[:, 3], boxes[:, 2], boxes[:, 1]], axis=1)
     return _cross(lines, boxes) | _cross(lines, falling)

@@ -17,15 +17,15 @@ _MAX_REJECTED = 400  # The picture shows at most this many rejected rays, becaus
 _MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
 _MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
 _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
-_CROSS_POINTS = 5  # For labels, a true object counts as much as this many points of the path.
-_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map, and the smallest width of the figure, are in inches.
+_CROSS_POINTS = 5  # A label avoids a true object as much as this many points of the path.
+_LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the smallest width of the figure, inches.
 _FONT = 8.0  # Labels and legend have this font size, points.
 _USED, _REJECTED = "#8fbfee", "#ef8f86"  # Used rays are light blue, and rejected rays are light red.
-_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # The path before, the path after, objects in the legend.
+_BEFORE, _AFTER, _NEUTRAL = "#8a8a8a", "#30343b", "#555555"  # Colours of the path before, the path after, the legend.
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw a map from above as a PNG: paths, rays, objects, ground truth. OSError if the file cannot be written."""
+    """Draw the paths, rays, objects and ground truth from above as a PNG. OSError if the file cannot be written."""
     import matplotlib
 
     with matplotlib.rc_context():
@@ -44,7 +44,7 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
     width, height = (high - low) / (high - low).max() * _LONG_SIDE
-    size = max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3  # Title and legend take the margins.
+    size = max(width, _SHORT_SIDE) + 0.6, max(height, 0.5 * _SHORT_SIDE) + 1.3  # The added inches are for title and legend.
     figure = Figure(figsize=size, dpi=150, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -76,7 +76,7 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
 
 
 def _frame(result: RunResult, points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
-    """Return a mask of the shown objects, and the lower left and the upper right corner of the shown area."""
+    """Return a mask (N,) of the shown objects, and the lower left and the upper right corner of the shown area, m."""
     path = result.map_T_base[:, :2, 3]
     shown, low, high = frame_objects(np.concatenate([points, crosses]), path)
     side = (high - low).max()

@@ -1,4 +1,4 @@
-"""Colours, captions, ray lengths and the framed area of the map, for all pictures, recordings and exports."""
+"""Colours, captions, ray lengths and the shown area of the map, for all pictures, recordings and exports."""
 
 import colorsys
 from collections import Counter
@@ -20,26 +20,27 @@ _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _FENCE = (3.0, 0.5, 1.0)
-"""An object is framed up to the largest of three distances from the path: this multiple of the median distance, this share
-of the path's diagonal, and this length, m. Larger values frame more far objects and shrink the rest of the map."""
+"""A picture shows an object if its distance from the path is at most the largest of three distances: this multiple of the
+median distance of the objects, this share of the diagonal of the path's bounding box, and this length, m. Larger values show
+more far objects and shrink the rest of the map."""
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time: it lies more than three years after 0, and other clocks stay below."""
+    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
     return stamp > 1e8
 
 
 def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
-    """Return a mask (R,) of the rays of each kind."""
+    """Return, for each kind, a mask (R,) of the rays of this kind."""
     explained = result.association.object >= 0
     used = explained & (result.weight >= REJECTED_BELOW)
     return {"used": used, "rejected": explained & ~used, "unexplained": ~explained}
 
 
 def ray_ends(result: RunResult) -> Floats:
-    """Return the drawn end (R, 3), m in map, of each ray.
+    """Return the point (R, 3), m in map, at which the drawing of each ray ends.
 
-    A ray ends at the distance of its object. A ray without an object gets the median length of the other rays.
+    A ray is as long as the distance to its object. A ray without an object gets the median length of the other rays.
     """
     index = result.association.object
     reach = np.full(len(index), np.nan)
@@ -57,13 +58,13 @@ def captions(objects: ObjectMap) -> list[str]:
 
 
 def label_colours(objects: ObjectMap) -> dict[str, tuple[float, float, float]]:
-    """Return a colour (r, g, b in [0, 1]) for each label, dark enough for text on white (contrast at least 4.5)."""
+    """Return a colour (r, g, b in [0, 1]) for each label. Text in this colour on white has a contrast of at least 4.5."""
     names = sorted({o.label for o in objects.objects})
     return {name: _colour(i / len(names), i) for i, name in enumerate(names)}
 
 
 def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
-    """Return a colour for each object: the label's colour for the first object of a label, nearby hues for the others."""
+    """Return a colour for each object. The first object of a label has the label's colour, the others have nearby hues."""
     names = sorted({o.label for o in objects.objects})
     shared, earlier = Counter(o.label for o in objects.objects), Counter[str]()
     colours = []
@@ -76,17 +77,16 @@ def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
 
 def _colour(hue: float, number: int) -> tuple[float, float, float]:
     linear = np.array(colorsys.hsv_to_rgb(hue, _SATURATION, 1.0)) ** 2.2
-    linear *= _LUMINANCES[number % 2] / float(
-        linear @ [0.2126, 0.7152, 0.0722]
-    )  # These are the weights of red, green, blue.
+    # The luminance is the sum of red, green and blue with these weights.
+    linear *= _LUMINANCES[number % 2] / float(linear @ [0.2126, 0.7152, 0.0722])
     r, g, b = np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
     return float(r), float(g), float(b)
 
 
 def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
-    """Return the half axes (3,), m, of an object's 2-sigma ellipsoid, and their directions (3, 3), right-handed columns.
+    """Return the lengths (3,), m, of the half axes of an object's 2-sigma ellipsoid, and a rotation matrix (3, 3).
 
-    None if the object has no finite covariance.
+    The columns of the matrix are the directions of the axes. None if the object has no finite covariance.
     """
     if o.covariance is None or not np.isfinite(o.covariance).all():
         return None
@@ -107,15 +107,20 @@ def sample(mask: Bools, count: int) -> Ints:
 
 
 def evenly(count: int, most: int) -> Ints:
-    """Return at most `most` of the indices 0 to count - 1, evenly spaced, with the first and the last index."""
+    """Return at most `most` of the indices from 0 to `count` - 1. They are evenly spaced and include both ends."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
 
 
 def frame_objects(objects: Floats, path: Floats) -> tuple[Bools, Floats, Floats]:
-    """Return a mask (N,) of the objects (N, D) to show with the path (K, D), and the two corners (D,) of the shown area.
+    """Choose the objects and the area that a picture shows.
 
     A far object is left out, because it would shrink the rest of the map. `_FENCE` limits the distance of an object from the
     bounding box of the path. The box leaves out 1 % of the path on each side.
+
+    Args:
+        objects, path: positions (N, D) and (K, D), m in map.
+    Returns:
+        A mask (N,) of the shown objects, and the lowest and the highest corner (D,) of the shown area.
     """
     if len(path):
         low, high = np.quantile(path, 0.01, axis=0), np.quantile(path, 0.99, axis=0)

@@ -34,11 +34,11 @@ class Histogram:
 
 
 def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = None) -> Histogram | None:
-    """Count residuals (R,), deg, in bins, split into used and rejected rays; None if no residual is finite.
+    """Count residuals (R,), deg, in bins, with separate counts of used and rejected rays. None if no residual is finite.
 
     Args:
-        weight: (R,) robust weights; a ray with a low weight is rejected.
-        top: the end of the axis, deg; by default a round number above nearly all used residuals.
+        weight: (R,) robust weights. A ray with a weight below `REJECTED_BELOW` is rejected.
+        top: the end of the axis, deg. The default is a round number above nearly all residuals of used rays.
     """
     known = np.isfinite(residual)
     residual, used = residual[known], weight[known] >= REJECTED_BELOW

@@ -26,7 +26,7 @@ _FRAME = (60, 190, 255)  # The box is drawn in this BGR colour, orange.
 
 @dataclass(frozen=True)
 class Crop:
-    """The crop of a box."""
+    """A part of an image that shows one box."""
 
     jpeg: bytes
     width: int  # px.
@@ -37,19 +37,21 @@ class Crop:
 
 
 def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str | None]:
-    """Return the images of a log by camera, and a sentence that explains why there are none (None if there are some).
+    """Return the images of a log by camera name, and a sentence that explains why there are no images.
+
+    The sentence is None if there are images.
 
     Args:
-        path: the log; a value that is no path means that its place is unknown.
-        count: the number of images at the time of the run; None if unknown.
+        path: the path of the log. A value of another type means that the path is unknown.
+        count: the number of images that the log had at the time of the run; None if this is unknown.
     """
     if count == 0:
         return {}, "The log has no images."
     if not isinstance(path, str | Path):
-        return {}, "The result does not name its log: objslam report --log LOG names it."
+        return {}, "The result does not name its log: name it with objslam report --log LOG."
     log = Path(path)
     if not log.exists():
-        return {}, f"The log is not at {log} any more: objslam report --log LOG names its new place."
+        return {}, f"The log is not at {log} any more: name its new path with objslam report --log LOG."
     try:
         cameras = read(log, Ledger(), SourceOptions(with_range=False, with_images=False)).cameras
     except ObjslamError as error:
@@ -59,13 +61,13 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
 
 
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
-    """Return the indices of the best used rays of an object, at most `count`.
+    """Choose at most `count` of the best used rays of an object, and return their indices.
 
-    The used rays are split into `count` parts in the order of time. The ray with the best score (then the largest box) of
-    each part is returned.
+    The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. If
+    scores are equal, it has the largest box.
 
     Args:
-        mine: (M,) indices of the object's rays, in the order of time.
+        mine: (M,) the indices of the object's rays, in the order of time.
     """
     kept = mine[rays.weight[mine] >= REJECTED_BELOW]
     parts = np.array_split(kept, min(count, len(kept))) if count and len(kept) else []
@@ -76,7 +78,10 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 def cut_crops(
     rays: RaysTable, chosen: Ints, images: dict[str, Images], progress: Callable[[int, int], None]
 ) -> dict[int, Crop]:
-    """Return the crops of the chosen rays (C,), by ray; a ray without a readable image at its stamp has no crop."""
+    """Return a crop for each ray with an index in `chosen` (C,), by this index.
+
+    A ray has no crop if no readable image belongs to its stamp, or if its box is outside the image.
+    """
     by_file: dict[Path, list[int]] = {}
     for ray in chosen.tolist():
         listed = images.get(str(rays.camera[ray]))
@@ -99,7 +104,10 @@ def cut_crops(
 
 
 def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
-    """Cut a square around a box and draw the box: JPEG, width, height; None if the box is outside the image."""
+    """Cut the square around a box out of an image, and draw the box on it.
+
+    Returns the JPEG data, the width and the height, px, or None if the box is outside the image.
+    """
     import cv2
 
     height, width = image.shape[:2]

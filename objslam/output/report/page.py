@@ -39,7 +39,7 @@ _COUNTS = {
     "objects": "objects",
     "unresolved": "unresolved objects",
 }
-"""The words on the page for the counts of summary.json."""
+"""The words that the page shows for the counts in summary.json."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def write_report(
     """Write report.html into the result folder `out` and return its path.
 
     Args:
-        log: the log of the run, as the source of the pictures; by default the path in summary.json.
+        log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
         crops: the number of pictures per object.
         progress: is called with the stage, the steps done and the total number of steps.
     Raises:
@@ -133,7 +133,7 @@ def write_report(
 def _cards(
     objects: ObjectMap, rays: RaysTable, crops: dict[int, list[Crop]], errors: dict[int, tuple[float, str]], begin: float
 ) -> list[Card]:
-    """Return the cards, sorted by label; the times on the page are relative to `begin`, s."""
+    """Return the cards, sorted by label. The times on the cards count from the stamp `begin`, s."""
     residual_deg = np.degrees(rays.residual)
     kept = residual_deg[(rays.weight >= REJECTED_BELOW) & np.isfinite(residual_deg)]
     top = axis_end(kept) if len(kept) else None
@@ -160,10 +160,10 @@ def _cards(
 
 
 def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """Return the error and the match of each matched object by id, and the content of evaluation.json.
+    """Return the error, m, and the match, as text, of each matched object by id. Return also the content of evaluation.json.
 
-    Without evaluation.json, the map is compared with the ground truth here. A map in a frame of its own is first aligned
-    with the truth.
+    If this file does not exist, this function compares the map with the ground truth. A map in a coordinate frame of its
+    own is first aligned with the truth. Without a ground truth, there are no errors, and the content is None.
     """
     if (out / EVALUATION).is_file():
         scores = _json(out / EVALUATION)
@@ -191,14 +191,14 @@ def _json(file: Path) -> dict[str, Any]:
 
 
 def _changed(settings: Settings) -> list[tuple[str, str, str]]:
-    """Return name, value and default of each setting that differs from its default."""
+    """Return the name, the value and the default of each setting that differs from its default."""
     now, default = _flat(settings.model_dump(mode="json")), _flat(Settings().model_dump(mode="json"))
     shown = partial(json.dumps, ensure_ascii=False)
     return [(key, shown(value), shown(default.get(key))) for key, value in now.items() if value != default.get(key)]
 
 
 def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
-    """Join the keys of nested mappings with dots."""
+    """Return nested mappings as one mapping. Its keys start with `before` and join the nested keys with dots."""
     flat: dict[str, Any] = {}
     for key, value in data.items():
         flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}

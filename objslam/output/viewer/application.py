@@ -28,7 +28,7 @@ Viewer = subprocess.Popen[bytes]
 
 _LOOPBACK = "127.0.0.1"  # Viewers listen at this address. Other machines cannot reach it.
 _PATIENCE = 60.0  # A viewer has this time, s, to start and to load a recording.
-_SETTLE = 1.5  # A viewer has this time, s, to draw after its time is set. A larger value suits slower machines.
+_SETTLE = 1.5  # After a viewer is set to a moment, it has this time, s, to draw. Slower machines need a larger value.
 _NO_DRIVER = ("render context", "No graphics adapter", "Failed to find a suitable", "NoSuitableAdapter", "adapter was found")
 """On a machine without a Vulkan driver, the viewer's stderr contains one of these texts."""
 _NO_SCREEN = ("XOpenDisplay", "neither WAYLAND", "WAYLAND_DISPLAY", "WinitEventLoop", "Failed to open connection")
@@ -86,12 +86,12 @@ def address(port: int) -> str:
 
 
 def web_address(web: int, port: int) -> str:
-    """Return the address for a browser, from the port of the page and the port of the data."""
+    """Return the address for a browser. `web` is the port of the page, and `port` is the port of the data."""
     return f"http://{_LOOPBACK}:{web}?url={address(port).replace('+', '%2B')}"
 
 
 def start(*arguments: str) -> Viewer:
-    """Start the viewer on the loopback interface; by default rerun listens on every network interface."""
+    """Start the viewer on the loopback interface. By default, rerun would listen on every network interface."""
     return subprocess.Popen(
         [str(program()), "--bind", _LOOPBACK, *arguments],
         env={**os.environ, "RUST_LOG": "error"},
@@ -129,11 +129,12 @@ def serve(files: list[Path], say: Callable[[str], None]) -> None:
 def screenshot(
     files: list[Path], picture: Path, size: tuple[int, int] = (1600, 900), at: float = 0.5, timeline: str = STAMP
 ) -> None:
-    """Write a picture of recordings in their first layout; the function needs no screen.
+    """Write a picture of recordings in the layout in which the viewer first opens them. The function needs no screen.
 
     Args:
         size: width and height of the picture, points.
-        at: the time of the picture, as a share of the timeline's length.
+        at: the time of the picture, as a share of the timeline's length, in [0, 1].
+        timeline: the name of the timeline.
     Raises:
         ConfigError: the picture's name does not end in .png.
         OutputError: there is no Vulkan driver, the viewer fails, or the picture cannot be written.
@@ -173,7 +174,7 @@ def screenshot(
 
 
 def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:
-    """Call `attempt` until it returns a value, at most for `_PATIENCE`; OutputError if the viewer ends."""
+    """Call `attempt` until it returns a value, and return it; None after `_PATIENCE`. OutputError if the viewer ends."""
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
         if viewer.poll() is not None:
@@ -186,7 +187,7 @@ def _retry(viewer: Viewer, attempt: Callable[[], _T | None]) -> _T | None:
 
 
 def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
-    """Pause the viewer at a share of a timeline."""
+    """Pause the viewer at a moment of a timeline. `share`, in [0, 1], is the part of the timeline before the moment."""
     state = client.get_state()
     recording = next((r for r in state.recordings if r.store_id == state.active_recording), state.recordings[0])
     line = next((t for t in recording.timelines if t.name == timeline), None)
@@ -203,7 +204,7 @@ def _set_time(client: ViewerClient, share: float, timeline: str) -> None:
 
 
 def _failure(code: int | None, said: bytes | None, hint: str | None) -> OutputError:
-    """Make the error for a viewer that ended, from its exit code and its stderr."""
+    """Return the error for a viewer that ended, from its exit code and its stderr."""
     text = (said or b"").decode(errors="replace")
     if any(sign in text for sign in _NO_DRIVER):
         hint = "Debian and Ubuntu: apt install libvulkan1 mesa-vulkan-drivers"

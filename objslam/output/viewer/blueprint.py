@@ -11,22 +11,22 @@ from objslam.output.viewer.view_point import ViewPoint
 
 _ITERATIONS = 4.0  # Playback shows this many iterations of the solver per second.
 _HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before")
-"""The entities that are hidden until a click, because many opaque lines would hide the map."""
+"""The viewer hides these entities until the user clicks on them, because they are opaque and would hide the map."""
 
 
 def blueprint(view_point: ViewPoint, cameras: list[tuple[str, str]], *, solver: bool = True, live: bool = False) -> Any:
-    """Make the layout: the map on the left, cameras and curves on the right, the log below.
+    """Make the layout: the map on the left, cameras and curves on the right, the event log below.
 
     Args:
         cameras: the entity path and the name of each camera.
-        solver: whether the recording has iterations.
-        live: whether to show the curves of a running session.
+        solver: whether the recording has iterations of the solver.
+        live: whether to show the curves of a running session instead of the curves of a finished run.
     """
     views = [rrb.Spatial2DView(origin=path, name=name, background=[40, 44, 52]) for path, name in cameras]
     right = [rrb.Tabs(*views) if len(views) > 1 else views[0]] if views else []
     right.append(_live_curves() if live else _curves(solver))
     column = rrb.Vertical(*right, row_shares=[3, 2][-len(right) :])
-    # The log hides the entity path, which all lines share, and the times, because each text begins with its time.
+    # The log shows no entity path, because all lines share it, and no times, because each text begins with its time.
     shown = {"LogLevel": True, "Body": True, "EntityPath": False}
     columns = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(name, visible=False) for name in (STAMP, ITERATION)],
@@ -56,7 +56,7 @@ def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] =
 
 
 def _curves(solver: bool) -> Any:
-    # Each view has a curve of the drive and a curve of the solver. The chosen timeline selects one of them.
+    # Each view has a curve of the drive and a curve of the solver. The viewer shows the curve of the chosen timeline.
     pairs = {"residual": ("residual, deg", "cost"), "boxes": ("boxes", "rounds")}
     views = [
         _curve([f"plots/{drive}", *([f"plots/{step}"] if solver else [])], f"{name}; {step}" if solver else name)

@@ -20,9 +20,9 @@ from objslam.output.viewer.rays import RAY_COLOURS, kind_colours
 from objslam.output.viewer.times import moments, stamp_column
 from objslam.output.viewer.view_point import label_rows
 
-_BLOCK = 500_000  # This many pairs of an object and a frame are tested at once. A larger value takes more memory.
-_NEAR = 0.2  # A camera is expected to see an object from this distance, m.
-_BEYOND = 1.2  # A camera is expected to see an object up to this multiple of the length of its longest used ray.
+_BLOCK = 500_000  # This many pairs of an object and an image are tested at once. A larger value takes more memory.
+_NEAR = 0.2  # A camera is expected to see an object only if the object is farther away than this, m.
+_BEYOND = 1.2  # An object is expected to be seen up to this multiple of the length of its longest used ray.
 _LIGHTER = 0.35  # Colours of objects suit a white page. For images, they are lightened by this share, in [0, 1].
 _FRUSTUM = 0.05  # The frustum of a camera has this depth, as a share of the map's size.
 
@@ -33,11 +33,11 @@ def camera_path(camera: Camera) -> str:
 
 
 def log_cameras(recording: Any, result: RunResult, size: float) -> int:
-    """Log each camera that moves with the robot, `map/camera/NAME`, and return the number of unreadable images.
+    """Log each camera as an entity that moves with the robot, `map/camera/NAME`. Return the number of unreadable images.
 
-    `image` has the images. `boxes` has the boxes in the colours of their objects. `map` has the projected objects. The
-    setting `output.image_width` limits the width of the images. All pixel coordinates are scaled with the images.
-    The size of the map, `size`, m, sets the depth of the frusta.
+    Below this entity, `image` has the images, `boxes` has the boxes in the colours of their objects, and `map` has the
+    projected objects. The setting `output.image_width` limits the width of the images. All pixel coordinates are scaled with
+    the images. The size of the map, `size`, m, sets the depth of the frusta.
     """
     unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
@@ -62,7 +62,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
 
 
 def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
-    """Log the static frustum of a camera, with pixels scaled by `scale`, for a map of `size`, m."""
+    """Log the static frustum of a camera. `scale` multiplies its pixel coordinates. `size` is the size of the map, m."""
     matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
     pinhole = rr.Pinhole(
         image_from_camera=matrix,
@@ -76,9 +76,9 @@ def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: f
 
 
 def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
-    """Send the images of the stamps with indices `shown` (n,), and return the number of unreadable images.
+    """Send an image for each stamp with an index in `shown` (n,), and return the number of unreadable images.
 
-    The other stamps get no image, because boxes on the image of another stamp would mislead.
+    The other stamps get no image, because their boxes do not fit the image of another stamp.
     """
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
     for place, blob in zip(shown.tolist(), images, strict=True):
@@ -105,14 +105,14 @@ def _send_boxes(recording: Any, path: str, result: RunResult, mine: Ints, scale:
 
 
 def box_colours(result: RunResult) -> NDArray[np.uint8]:
-    """Return the RGB colour (R, 3) of each box: its object's colour, red if rejected, grey if unexplained."""
+    """Return the colour (R, 3), RGB, of each box: its object's light colour, red if rejected, or grey if unexplained."""
     colour, used = kind_colours(result), ray_kinds(result)["used"]
     colour[used] = light_colours(result.map)[result.association.object[used]]
     return colour
 
 
 def light_colours(objects: ObjectMap) -> NDArray[np.uint8]:
-    """Return an RGB colour (N, 3) for each object that is visible on an image."""
+    """Return the colour (N, 3), RGB, of each object, lightened so that it stands out on images."""
     light = [[round(c + _LIGHTER * (255 - c)) for c in colour] for colour in colours(objects)]
     return np.array(light, dtype=np.uint8).reshape(-1, 3)
 
@@ -120,7 +120,7 @@ def light_colours(objects: ObjectMap) -> NDArray[np.uint8]:
 def _send_objects(
     recording: Any, path: str, result: RunResult, camera: Camera, stamps: Floats, poses: Floats, scale: float
 ) -> None:
-    """Send the resolved objects in the image at each stamp, `.../map`, and their labels, `.../map/labels`."""
+    """Send, for each stamp, the resolved objects that are in view, `PATH/map`, and their labels, `PATH/map/labels`."""
     resolved = [i for i, o in enumerate(result.map.objects) if o.status == "ok"]
     if not resolved:
         return
@@ -147,12 +147,12 @@ def _send_objects(
 
 
 def points_in_frames(camera: Camera, map_T_camera: Floats, points: Floats, farthest: Floats) -> tuple[Ints, Ints, Floats]:
-    """Project points (N, 3), m in map, into the images at poses (K, 4, 4), and keep the points in view.
+    """Project points (N, 3), m in map, into images at the camera poses (K, 4, 4), and return the points that are in view.
 
     Args:
         farthest: (N,) m, the distance up to which a camera is expected to see each point.
     Returns:
-        Index of the pose (S,), index of the point (S,), and raw pixels (S, 2).
+        For each view of a point: the index of the pose (S,), the index of the point (S,), and the raw pixel (S, 2).
     """
     cos = np.cos(camera.view_angle)
     found: list[tuple[Ints, Ints, Floats]] = []

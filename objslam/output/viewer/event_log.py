@@ -1,4 +1,4 @@
-"""The texts of a recording: events of the drive, changes of each round, changes of a live map, a table of the run."""
+"""The texts of a recording: events of the drive, changes of each round, changes of a live map, and a table of the run."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,11 +16,11 @@ _MAX_CHANGES = 40  # The log lists at most this many changes of objects per roun
 _MERGED = 0.5  # A deleted object counts as merged if another object of its label lies within this distance, m.
 _WHY = {
     "fixed": "association at the fixed poses",
-    "labels": "every label taken for one object",
-    "association": "association at the poses so far",
-    "merge": "merge of objects that the new poses place together",
+    "labels": "one object assumed for each label",
+    "association": "association at the latest poses",
+    "merge": "merge of objects that the new poses move together",
 }
-"""The words in the log for the reason of a round."""
+"""The words that the log shows for the reason of each round."""
 _COUNTS = {
     "keyframes": "keyframes",
     "detections": "boxes",
@@ -30,7 +30,7 @@ _COUNTS = {
     "objects": "objects",
     "unresolved": "unresolved objects",
 }
-"""The words in the table for the counts of summary.json."""
+"""The words that the table shows for the counts in summary.json."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: the whole run first, then the events of the objects in the order of time."""
+    """Return the events of a drive: first those of the whole run, then those of the objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
@@ -74,7 +74,7 @@ def drive_events(result: RunResult) -> list[Event]:
 
 
 def _why_unresolved(o: MapObject, result: RunResult) -> str:
-    """Return the limit of the settings that makes an object unresolved, as text."""
+    """Return a text that tells why an object is unresolved, with the limit from the settings."""
     limits = result.settings.triangulation
     if o.rays < 2:
         return "a single ray gives a direction and no distance"
@@ -86,7 +86,11 @@ def _why_unresolved(o: MapObject, result: RunResult) -> str:
 
 
 def _enough_parallax(result: RunResult) -> Floats:
-    """Return the stamp (N,), s, of each object's first used ray with enough parallax to its first used ray; else NaN."""
+    """Return the stamp (N,), s, at which each object first has enough parallax.
+
+    This is the stamp of its first used ray with an angle of at least `triangulation.min_parallax_deg` to its earliest used
+    ray. It is NaN if there is no such ray.
+    """
     stamps = np.full(len(result.map), np.nan)
     used = np.flatnonzero(ray_kinds(result)["used"])
     order = used[np.lexsort((result.rays.keyframe[used], result.association.object[used]))]
@@ -104,7 +108,7 @@ def _enough_parallax(result: RunResult) -> Floats:
 
 
 def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list[Event]:
-    """Return the changes of each round at its first iteration, and the result of its solve at its last iteration."""
+    """Return the events of all rounds: changes at a round's first iteration, and the result of its solve at the last."""
     events: list[Event] = []
     at, before = 0, None
     for number, r in enumerate(trace):
@@ -129,7 +133,10 @@ def round_events(trace: tuple[Round, ...], label_names: tuple[str, ...]) -> list
 
 
 def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> list[str]:
-    """Return the new, merged and dropped objects between two rounds, by the objects of their rays."""
+    """Return a text for each object that is new, merged or dropped since the round `before`.
+
+    An object of the earlier round continues as the object that now has most of its rays.
+    """
     names = [f"{label_names[k]} #{j}" for j, k in enumerate(now.association.label.tolist())]
     rays = np.bincount(now.association.object[now.association.object >= 0], minlength=now.association.count)
     if before is None:
@@ -158,7 +165,7 @@ def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> 
 
 
 def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
-    """Return the changes of a live map by object id: new, resolved, unresolved, renamed, dropped."""
+    """Return the level and the text of each change of a live map: an id is new, resolved, unresolved, renamed or dropped."""
     old, new = ({o.id: o for o in m.objects} for m in (before, now))
     lines: list[tuple[Level, str]] = []
     for j, o in new.items():

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 _MAX_RAYS = 160  # The recording shows at most this many rays of each kind, evenly chosen.
 _FROM = np.array([0.62, -0.62, 0.55])  # The view point lies in this direction, in the axes of the slices: ahead, left, up.
-_DISTANCE = 4.2  # The view point lies at this distance, in half edges of a slice.
+_DISTANCE = 4.2  # The view point lies at this distance, as a multiple of half a slice's edge.
 _TEXT, _ESTIMATE, _MINIMUM = (255, 255, 255), (40, 44, 52), (90, 255, 120)  # The RGB colours: white, nearly black, green.
 _HIDDEN = ("map/objects/labels", "map/objects/extent", "map/rays", "map/reconstruction")
-"""The entities of the run's recording that are hidden until a click, because they would hide the field."""
+"""The viewer hides these entities of the run until the user clicks on them, because they would hide the field."""
 
 
 def write_field(out: Path, number: int, file: Path) -> ProximityField:
@@ -93,7 +93,7 @@ def heat(cost: Floats, low: float, high: float) -> NDArray[np.uint8]:
 
 
 def _log_field(recording: Any, f: ProximityField) -> None:
-    """Log the slices as points in the colours of their costs, `map/field/horizontal` and `map/field/vertical`."""
+    """Log both slices, `map/field/horizontal` and `map/field/vertical`, as points. The colour of a point shows its cost."""
     high = float(max(f.horizontal.cost.max(), f.vertical.cost.max()))
     for name, s in (("horizontal", f.horizontal), ("vertical", f.vertical)):
         spacing = float(np.linalg.norm(s.points[0, 1] - s.points[0, 0]))
@@ -102,7 +102,7 @@ def _log_field(recording: Any, f: ProximityField) -> None:
 
 
 def _log_rays(recording: Any, rays: RaysTable, pull: Bools, rejected: Bools, f: ProximityField) -> None:
-    """Log the used rays, `map/field/rays`, blue, and the rejected rays, `map/field/rejected`, red."""
+    """Log the used rays, `map/field/rays`, in blue, and the rejected rays, `map/field/rejected`, in red."""
     reach = float(np.linalg.norm(f.horizontal.points[0, 0] - f.minimum))
     drawn: tuple[tuple[str, Bools, RayKind], ...] = (("rays", pull, "used"), ("rejected", rejected, "rejected"))
     for name, mask, kind in drawn:
@@ -117,11 +117,11 @@ def _log_rays(recording: Any, rays: RaysTable, pull: Bools, rejected: Bools, f: 
 
 
 def _log_marks(recording: Any, f: ProximityField, o: MapObject, name: str, view_point: ViewPoint) -> None:
-    """Log the minimum of Eq. 1, `map/field/minimum`, and the run's estimate, `map/field/estimate`, with labels."""
+    """Log two labelled points: the minimum of Eq. 1, `map/field/minimum`, and the run's estimate, `map/field/estimate`."""
     size = float(np.ptp(f.vertical.points[..., 2]))
-    nearer = -0.03 * size * view_point.axes[2]  # The marks lie in front of the vertical slice.
+    nearer = -0.03 * size * view_point.axes[2]  # The labels lie in front of the vertical slice.
     for path, place, label, colour, lift in (
-        ("minimum", f.minimum, f"minimum of Eq. 1, {_metres(f.cost)} in the mean", _MINIMUM, 0.26),
+        ("minimum", f.minimum, f"minimum of Eq. 1, mean distance {_metres(f.cost)}", _MINIMUM, 0.26),
         ("estimate", o.position, name, _ESTIMATE, 0.42),
     ):
         if not np.isfinite(place).all():
@@ -159,7 +159,7 @@ def _text(f: ProximityField, objects: ObjectMap, o: MapObject, name: str, rays: 
         ("distance from the run's estimate", _metres(gap)),
     ]
     head = f"**{name}**, {o.status}, in a map of {len(objects)} objects"
-    colour = "The colour of a point is its mean distance from the used rays: Eq. 1's cost divided by the number of rays."
+    colour = "The colour of a point shows its mean distance from the used rays (Eq. 1's cost / the number of rays)."
     valley = "Bright points are close. A valley along the rays means that the distance of the object is uncertain."
     return "\n".join([head, "", *table(rows), "", f"{colour} {valley}"])
 

@@ -21,7 +21,10 @@ _AHEAD = 8  # Threads read this many images ahead. A larger value takes more mem
 
 
 def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
-    """Choose at most `most` of the stamps (N,), s, evenly, and return their indices and the indices of their images."""
+    """Choose evenly at most `most` of the stamps (N,), s, that have an image.
+
+    Returns the indices (n,) of these stamps and the indices (n,) of their images.
+    """
     if most == 0 or len(stamps) == 0 or len(images.paths) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     near = nearest_stamps(images.stamps, stamps)
@@ -31,7 +34,7 @@ def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints
 
 
 def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
-    """Return a function from a camera's name and a stamp, s, to the log's image (H, W, 3), uint8 BGR, or None."""
+    """Return a function that takes a camera's name and a stamp, s, and returns an image (H, W, 3), uint8 BGR, or None."""
     streams = {c.camera.name: c.rgb for c in log.cameras if c.rgb is not None}
 
     def find(camera: str, stamp: float) -> NDArray[np.uint8] | None:
@@ -45,7 +48,7 @@ def of_log(log: Log) -> Callable[[str, float], NDArray[np.uint8] | None]:
 
 
 def jpegs(images: Images, which: Ints, width: int, height: int) -> Iterator[bytes | None]:
-    """Yield the chosen images as JPEGs of a size, px; None for an image that cannot be read."""
+    """Yield the images with the indices `which` as JPEGs of the given size, px. Yield None for an unreadable image."""
 
     def jpeg(index: int) -> bytes | None:
         pixels = _read(images.paths[index])
@@ -62,7 +65,7 @@ def _read(path: Path) -> NDArray[np.uint8] | None:
 
 
 def pack(pixels: np.ndarray, size: tuple[int, int] | None = None) -> bytes:
-    """Encode pixels (H, W, 3) uint8 BGR, or (H, W), as a JPEG; `size` is (width, height), px, if it differs."""
+    """Encode an image (H, W, 3), uint8 BGR, or (H, W) as a JPEG. It is scaled to `size` (width, height), px, if given."""
     import cv2
 
     if size is not None and (pixels.shape[1], pixels.shape[0]) != size:

@@ -69,7 +69,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     places = np.array([every[i].position for i in named]).reshape(-1, 3)
     shown = len(named) <= _MAX_LABELS
     hung, ends = label_places(view_point, places, words, path) if shown else (places, places)
-    # The viewer writes a label in the colour of its point on a dark box, so only white is legible.
+    # The viewer writes a label in the colour of its point. The label is on a dark box, so only white is legible.
     names = rr.Points3D(hung, colors=[_TEXT], radii=0.0, labels=words, show_labels=shown)
     log("/labels", names, bool(named))
     lines = rr.LineStrips3D(np.stack([places, ends], axis=1), colors=[_LEADER], radii=rr.Radius.ui_points(0.4))

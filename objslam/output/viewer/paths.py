@@ -20,7 +20,7 @@ _MAX_STEPS = 400  # A recording has at most this many iterations, evenly chosen.
 
 
 def log_paths(recording: Any, result: RunResult, truth: Truth | None) -> None:
-    """Log the static paths `map/path/after`, `before` if it differs from `after`, and `truth` if it is known."""
+    """Log static paths in `map/path`: `after` the estimation, `before` it if the path differs, `truth` if it is known."""
     paths = {"after": (result.path_after, _AFTER, 2.0)}
     if not np.array_equal(result.path.poses, result.path_after.poses):
         paths["before"] = (result.path, _BEFORE, 1.0)
@@ -39,18 +39,18 @@ def log_base(recording: Any, result: RunResult) -> None:
 
 
 def send_poses(recording: Any, entity: str, stamps: Floats, poses: Floats) -> None:
-    """Move an entity along poses (N, 4, 4) in map at stamps (N,), s."""
+    """Send the poses (N, 4, 4), in map, of a moving entity at the stamps (N,), s."""
     columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternion(poses))
     recording.send_columns(entity, [stamp_column(stamps)], columns)
 
 
 def thinned(path: Trajectory, most: int) -> Floats:
-    """Return at most `most` positions (n, 3), m, of a path, evenly chosen, with the first and the last position."""
+    """Return at most `most` positions (n, 3), m, of a path. They are evenly chosen and include the first and the last."""
     return path.poses[evenly(len(path), most), :3, 3]
 
 
 def log_steps(recording: Any, result: RunResult) -> None:
-    """Log the path and the objects after each iteration, `map/steps/path` and `map/steps/objects`."""
+    """Log the path, `map/steps/path`, and the objects, `map/steps/objects`, after each iteration of the solver."""
     steps = [(r, i) for r in result.trace for i in r.iterations]
     if not steps:
         return

@@ -12,12 +12,12 @@ from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
 _GAP, _GAP_STEPS = 1.0, 5.0
-"""A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 median steps."""
+"""A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 times the median step of stamps."""
 _BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # Curves have these colours.
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
-    """Log the residuals of the used rays by stamp, `plots/residual`, deg, and the ray counts, `plots/boxes/KIND`."""
+    """Log by stamp: the residuals, deg, of used rays, `plots/residual`, and the ray counts by kind, `plots/boxes/KIND`."""
     stamps, moment = np.unique(result.keyframes.stamps, return_inverse=True)
     of = moment[result.rays.keyframe]
     kinds = ray_kinds(result)

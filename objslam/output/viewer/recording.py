@@ -33,7 +33,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     has the events on both timelines, and `summary` has a table. OSError if the file cannot be written.
     """
     recording = rr.RecordingStream("objslam")
-    # The recording stays in memory until the end. A file sink would write a full disk to stderr and raise no error.
+    # The recording stays in memory until the end. A file sink would report a full disk on stderr and raise no error.
     memory = recording.memory_recording()
     recording.send_recording_name(str(result.summary.get("log", "objslam")))
     view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])

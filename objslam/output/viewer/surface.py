@@ -14,7 +14,7 @@ _GROWTH = 1.25  # The cells grow by this factor until at most `_MAX_VERTICES` ve
 
 
 def log_surfaces(recording: Any, result: RunResult) -> None:
-    """Log the static surfaces `map/reconstruction/after` and `before`, if they exist.
+    """Log static surfaces in `map/reconstruction`: `after` the estimation of the poses, and `before` it, if they exist.
 
     Only the front of a wall is drawn, so that walls near the view point do not hide the room.
     """
@@ -33,7 +33,7 @@ def log_surfaces(recording: Any, result: RunResult) -> None:
 
 
 def coarser(surface: Surface, most: int) -> Surface:
-    """Simplify a surface to at most `most` vertices: each grid cell keeps their mean (Rossignac & Borrel 1993)."""
+    """Reduce a surface to at most `most` vertices. Vertices in one grid cell become their mean (Rossignac & Borrel 1993)."""
     cell = _CELL
     while len(surface.vertices) > most:
         cell *= _GROWTH
@@ -53,7 +53,7 @@ def coarser(surface: Surface, most: int) -> Surface:
         colours = surface.colours
         if colours is not None:
             colours = (_sums(colours, into, len(counts)) / counts[:, None]).round().astype(np.uint8)
-        # Triangles of a thin part flip if the part falls into one cell. Flipped triangles are removed.
+        # Triangles of a thin part can flip if both sides of the part fall into one cell. Flipped triangles are removed.
         a, b, c = (vertices[corner] for corner in triangles.T)
         upright = np.einsum("ti,ti->t", np.cross(b - a, c - a), normals[triangles].sum(axis=1)) > 0
         return Surface(vertices=vertices, normals=normals, colours=colours, triangles=triangles[upright])
@@ -61,5 +61,5 @@ def coarser(surface: Surface, most: int) -> Surface:
 
 
 def _sums(values: Any, into: Any, count: int) -> Any:
-    """Sum the rows of values (N, C) into `count` rows; `into` (N,) is the row of each."""
+    """Add up the rows of values (N, C) in `count` groups, one row per group. `into` (N,) is the group of each row."""
     return np.stack([np.bincount(into, column, count) for column in np.asarray(values, dtype=np.float64).T], axis=1)

@@ -11,7 +11,7 @@ STAMP, ITERATION = "stamp", "iteration"  # These are the timelines of the drive 
 
 
 def stamp_column(stamps: Floats) -> Any:
-    """Make a column of the timeline `stamp` from stamps (N,), s: dates if they are Unix time, else durations."""
+    """Make a column of the timeline `stamp` from stamps (N,), s. It has dates if they are Unix time, else durations."""
     import rerun as rr
 
     if len(stamps) and is_date(float(stamps[0])):
@@ -20,18 +20,18 @@ def stamp_column(stamps: Floats) -> Any:
 
 
 def iteration_column(numbers: Ints) -> Any:
-    """Make a column of the timeline `iteration` from numbers (N,)."""
+    """Make a column of the timeline `iteration` from the numbers (N,) of iterations."""
     import rerun as rr
 
     return rr.TimeColumn(ITERATION, sequence=numbers)
 
 
 def moments(stamps: Floats, of: Ints) -> tuple[Floats, Ints, Ints]:
-    """Group items by their stamp; a stamp without items gets a row too, because the row clears the earlier items.
+    """Group items by their stamp. A stamp without items is kept, so that the viewer clears the earlier items there.
 
     Args:
         stamps: (K,) s, ascending.
-        of: (R,) the index into `stamps` of each item.
+        of: (R,) for each item, the index of its stamp in `stamps`.
     Returns:
         The distinct stamps (M,), the number of items at each stamp (M,), and the order (R,) of the items by stamp.
     """

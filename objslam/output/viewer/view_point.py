@@ -9,12 +9,12 @@ from objslam.core.object_map import ObjectMap
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
 
-_FOV = np.radians(55.0)  # The viewer has this field of view, rad, from the lower to the upper edge.
+_FOV = np.radians(55.0)  # The viewer has this vertical field of view, rad.
 _VIEW = np.array([900.0, 620.0])  # The view of the map has this width and height, px, in a window of 1600 x 900.
 _FILLED = 0.86  # The map fills this share of the view.
 _FROM = np.array([-0.28, -0.80, 0.78])  # The first view point lies in this direction: south, slightly west, 43 deg up.
 _LINE = 24.0  # A label on the map has this height, px.
-_LETTER, _PADDING = 7.3, 12.0  # A letter, and both margins of a label together, have these widths, px on the screen.
+_LETTER, _PADDING = 7.3, 12.0  # The width of a letter, and the width of both margins of a label, px on the screen.
 _IMAGE_LINE = 21.0  # A label in an image has this height, px on the screen.
 _IMAGE_VIEW = (580.0, 350.0)  # The view of a camera has this width and height, px, in a window of 1600 x 900.
 _ROWS = 6  # A label hangs at most this many rows below its dot.
@@ -31,11 +31,11 @@ class ViewPoint:
 
     @property
     def distance(self) -> float:
-        """The distance of the view point from its target, m."""
+        """Return the distance from the view point to its target, m."""
         return float(np.linalg.norm(self.position - self.target))
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return pixels (N, 2), x right, y down, and depths (N,), m, of points (N, 3), m in map."""
+        """Project points (N, 3), m in map. Return their pixels (N, 2), x right and y down, and their depths (N,), m."""
         x, y, depth = ((points - self.position) @ self.axes.T).T
         safe = np.maximum(depth, 1e-6)
         return np.column_stack([x, -y]) * self.focal / safe[:, None] + _VIEW / 2, depth
@@ -58,7 +58,7 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
     centre = (low + high) / 2
     axes = _axes(_FROM)
     tangent = _FILLED * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
-    for _ in range(4):  # Perspective enlarges the near half, so the centre takes iterations.
+    for _ in range(4):  # Perspective enlarges the near half, so the centre is found by iteration.
         x, y, ahead = ((points - centre) @ axes.T).T
         distance = max(float(np.max(np.abs(x) / tangent[0] - ahead)), float(np.max(np.abs(y) / tangent[1] - ahead)), 1.0)
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
@@ -68,7 +68,7 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
 
 
 def look_at(target: Floats, back: Floats, distance: float) -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map, in the direction `back` (3,)."""
+    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from the target to it."""
     axes = _axes(back)
     return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
 
@@ -83,13 +83,13 @@ def _axes(back: Floats) -> Floats:
 def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid: Floats) -> tuple[Floats, Floats]:
     """Place labels so that, from the view point, no label covers another label or a dot.
 
-    A label that finds no free place hangs below its object.
+    A label without a free place hangs below its object.
 
     Args:
         anchors: (N, 3) the objects, m in map; a label has the depth of its object.
         avoid: (P, 3) points, m in map, that the labels should not cover.
     Returns:
-        The centres of the labels' upper edges (N, 3), and the ends of their leader lines (N, 3); m in map.
+        The centres (N, 3) of the labels' upper edges, and the points (N, 3) at which leader lines meet the labels; m in map.
     """
     if len(anchors) == 0:
         return anchors, anchors
@@ -104,15 +104,15 @@ def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid
 
 
 def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, float]) -> tuple[Floats, Bools]:
-    """Place labels in rows, from left to right; each label gets the first free row below its dot.
+    """Place labels in the rows of their images, from left to right. Each label gets the first free row below its dot.
 
     Args:
         frame: (S,) the image of each dot.
         dots: (S, 2) px of the image.
-        letters: (S,) the length of each label.
+        letters: (S,) the number of letters of each label.
         size: width and height of the images, px; the viewer scales an image to its view.
     Returns:
-        The places (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
+        The positions (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
     """
     scale = min(_IMAGE_VIEW[0] / size[0], _IMAGE_VIEW[1] / size[1])  # px on the screen per px of the image
     half = (letters * _LETTER + _PADDING) / 2 / scale
@@ -122,10 +122,10 @@ def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, floa
     rank = np.arange(len(order)) - first
     row = np.ceil(dots[:, 1] / line).astype(np.int64)
     frames = int(frame.max()) + 1 if len(frame) else 0
-    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Each row is occupied up to this px.
+    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Each row is full up to this x, px.
     hung, found = dots.copy(), np.zeros(len(dots), dtype=bool)
     for k in range(int(rank.max()) + 1 if len(rank) else 0):
-        mine = order[rank == k]  # the k-th label of each frame
+        mine = order[rank == k]  # the k-th label of each image
         for below in range(_ROWS):
             at = row[mine] + below
             free = until[frame[mine], at] <= dots[mine, 0] - half[mine]

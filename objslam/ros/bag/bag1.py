@@ -1,6 +1,6 @@
-"""ROS 1 bags (format 2.0), read record by record from the front, so that damage affects only the records that it hits.
+"""Read ROS 1 bags (format 2.0) record by record from the front, so that damage affects only the records that it hits.
 
-The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes only reveal missing messages.
+The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes are used only to detect missing messages.
 """
 
 import io
@@ -18,7 +18,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 _OPS = _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
 _OP_FIELD = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04\x05\x06\x07]")
 _MAX_HEADER = 1 << 16  # The length limit of a record header, bytes. A longer header counts as damage.
-_MAX_SEARCHED_HEADER = 512  # The longest header found by the search after damage, bytes. A larger value slows the search.
+_MAX_SEARCHED_HEADER = 512  # The longest header that the search after damage finds, bytes. A larger value slows it.
 _BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
@@ -30,7 +30,7 @@ class _Reading(Reading):
     chunk_at: int = 0  # The byte where the current chunk starts.
 
     def next_chunk(self, at: int) -> None:
-        """Report the damage of the current chunk and start the chunk at byte `at`."""
+        """Report the damage of the current chunk, and start the next chunk at byte `at`."""
         lost = self.chunk_indexed - self.chunk_read
         if self.chunk_indexed and lost > 0 and not self.chunk_problem:
             self.report.damage(f"the chunk at byte {self.chunk_at} lacks messages that its index lists", lost)
@@ -39,7 +39,7 @@ class _Reading(Reading):
 
 
 def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of a bag, even damaged or unclosed, in file order. `report` lists the missing parts."""
+    """Yield the wanted messages of a bag in file order. A bag may be damaged or unclosed. `report` lists missing parts."""
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
         reading = _Reading(report, wanted)
@@ -49,7 +49,8 @@ def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 
 
 def _walk(stream: BinaryIO, at: int, end: int, reading: _Reading, chunks: bool = True) -> Messages:
-    """Yield the messages between two bytes of a file, or of an unpacked chunk, which contains no chunks."""
+    """Yield the messages from byte `at` to byte `end` of a file, or of an unpacked chunk.
+    chunks: whether the records may include chunks. An unpacked chunk never contains chunks."""
     report = reading.report
     while at < end:
         stream.seek(at)
@@ -111,7 +112,7 @@ def _unpack_chunk(
 
 
 def _read_header(stream: BinaryIO, at: int, end: int) -> tuple[bytes, _Fields, int, int] | None:
-    """Return operation, fields, data start and data size of the record at byte `at`, None without a valid record."""
+    """Return operation, fields, data start and data size of the record at byte `at`, None if the record is not valid."""
     size = int.from_bytes(stream.read(4), "little")
     if not 0 < size <= _MAX_HEADER:
         return None
@@ -142,13 +143,13 @@ def _parse_fields(header: bytes) -> _Fields | None:
 
 
 def _number(fields: _Fields, name: bytes) -> int:
-    """Return an unsigned number of a header, -1 without such a field."""
+    """Return the unsigned number in the header field `name`, -1 if the field is missing."""
     value = fields.get(name)
     return -1 if value is None else int.from_bytes(value, "little")
 
 
 def _find_record(stream: BinaryIO, at: int, end: int) -> int | None:
-    """Return the byte of the next plausible record header, None without one."""
+    """Return the byte where the next plausible record header starts, None if there is none."""
     while at < end:
         stream.seek(at)
         block = stream.read(_BLOCK + _MAX_SEARCHED_HEADER)
@@ -170,7 +171,7 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
         return
     name, definition = (details.get(key, b"").decode("utf-8", "replace") for key in (b"type", b"message_definition"))
     connection, key = make_connection(topic, name, "ros1", definition, "msg"), _number(fields, b"conn")
-    if reading.connections.get(key) != connection:  # An equal connection keeps its identity, which readers use as a key.
+    if reading.connections.get(key) != connection:  # Readers use id(connection) as a key, so an equal connection stays.
         reading.connections[key] = connection
 
 

@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 from objslam.ros.bag.records import MAX_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # The first bytes of zstd data.
-_PIECE = 1 << 22  # The size limit of one unpacked piece, bytes. A larger value detects an exceeded size limit later.
+_PIECE = 1 << 22  # The size limit of one unpacked piece, bytes. With a larger value, data over the limit use more memory.
 
 
 class CorruptDataError(ValueError):
@@ -18,7 +18,8 @@ class CorruptDataError(ValueError):
 def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
     """Return the data unpacked by `method`, which is "" or "none", "bz2", "lz4" (frame format) or "zstd".
 
-    With `cut`, the readable part is enough. Raises CorruptDataError for broken data, an unknown method or excessive size.
+    Raises CorruptDataError for an unknown method, excessive size or broken data. With `cut`, broken data are returned as far
+    as they can be unpacked.
     """
     if method in ("", "none"):
         return data

@@ -1,6 +1,6 @@
-"""MCAP files, read record by record from the front, so that neither index nor footer is needed.
+"""Read MCAP files record by record from the front, so that neither index nor footer is needed.
 
-See https://mcap.dev/spec. The summary only supplies the message count and channels whose first description is lost.
+See https://mcap.dev/spec. The summary is used only for the message count, and for channels whose first description is lost.
 """
 
 import os
@@ -24,18 +24,18 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _CHUNK_START = re.compile(rb"\x06.{5}\0\0\0.{21}\0\0\0.{4}(\0\0\0\0|\x03\0\0\0lz4|\x04\0\0\0zstd).{5}\0\0\0", re.DOTALL)
-"""A chunk record has length, two timestamps, unpacked size, CRC, compression and packed size. Sizes are below 2^40."""
+"""The head of a chunk record: length, two timestamps, unpacked size, CRC, compression, packed size. Sizes are below 2^40."""
 _BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
 _LATEST = 2**63 - 1  # The largest recording time that a signed 64-bit integer holds, ns.
 
 
 @dataclass
 class _Reading(Reading):
-    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)  # Name, language and definition by number.
+    schemas: dict[int, tuple[str, str, str]] = field(default_factory=dict)  # Name, language and definition by schema id.
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of an MCAP file, even damaged or unclosed, in file order. `report` lists missing parts.
+    """Yield the wanted messages of an MCAP file in file order. It may be damaged or unclosed. `report` lists missing parts.
 
     A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC is skipped.
     """
@@ -171,7 +171,7 @@ def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
 
 
 def _find_chunk(file: BinaryIO, at: int, end: int) -> int | None:
-    """Return the byte of the next whole chunk with consistent sizes, None without one."""
+    """Return the byte where the next whole chunk with consistent sizes starts, None if there is none."""
     while at < end:
         file.seek(at)
         block = file.read(_BLOCK + 64)

@@ -26,7 +26,7 @@ _FORMATS = {
 _METADATA = "metadata.yaml"
 _MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
 _MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
-_MAX_RATIO = 1000  # The limit of the ratio of unpacked to packed file size. No recording compresses further.
+_MAX_RATIO = 1000  # The limit of the unpacked size of a file divided by its packed size. No recording compresses further.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 
@@ -59,11 +59,11 @@ def is_bag(path: Path) -> bool:
 
 
 def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
-    """Find the recording that one or several files, or one folder, contain.
+    """Find the recording in one or several files, or in one folder.
 
     The metadata.yaml of a folder lists its files. Listed files that are missing or outside the folder are counted as drops.
-    Without metadata.yaml, which a killed recorder does not write, the files of the folder may only differ in their number.
-    Raises LogError for no recording or several recordings.
+    A killed recorder writes no metadata.yaml. Without it, file names may differ only in the number before the suffix.
+    Raises LogError if there is no recording or more than one.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -116,7 +116,7 @@ def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport
 
 
 def _bag_file(path: Path) -> BagFile | None:
-    """Return the bag file at a path, None for another file. Name and first bytes decide."""
+    """Return the bag file at a path, None for another file. The suffix decides, or the first bytes if it is unknown."""
     suffixes = [suffix for suffix in path.suffixes if suffix != ".active"]
     packed = bool(suffixes) and suffixes[-1] == ".zstd"
     suffix = suffixes[-2 if packed else -1] if len(suffixes) > packed else ""
@@ -133,7 +133,7 @@ def _bag_file(path: Path) -> BagFile | None:
 
 
 def _split(path: Path) -> tuple[str, int]:
-    """Return the name of a file without number and suffixes, and the number, -1 without one."""
+    """Return a file name without its number and suffixes, and the number, -1 if the name has none."""
     match = _SPLIT.fullmatch(path.name)
     return (match[1], int(match[2] or -1)) if match else (path.name, -1)
 
@@ -172,12 +172,13 @@ def _read_metadata(file: Path, ledger: Ledger) -> dict[str, Any]:
         return dict(data["rosbag2_bagfile_information"])
     except (LogError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
         reason = error.message if isinstance(error, LogError) else "not what rosbag2 writes"
-        ledger.warn(f"{file}: {reason}: left out, all bag files of the folder are read")
+        ledger.warn(f"{file}: {reason}: left out, so all bag files of the folder are read")
         return {}
 
 
 def _listed(metadata: dict[str, Any], here: list[str], ledger: Ledger) -> list[str]:
-    """Return the names of the listed files that exist in the folder. Old metadata list files with their folder."""
+    """Return the listed file names that `here` contains. Only the last part of a listed path counts, because old
+    metadata also list the folder."""
     names = []
     given = metadata.get("relative_file_paths")
     for entry in given if isinstance(given, list) else []:

@@ -17,7 +17,7 @@ class Connection:
     topic: str
     type: str  # The message type in ROS 2 form, package/msg/Name.
     encoding: str  # The encoding of messages: "ros1", "cdr", or another name from the file.
-    definition: str = ""  # The text of the message type, empty if the file does not contain it.
+    definition: str = ""  # The text that defines the message type, empty if the file does not contain it.
     language: str = "msg"  # The language of the definition, "msg" or "idl".
 
 
@@ -37,7 +37,7 @@ class FileReport:
     problems: list[str] = field(default_factory=list)  # One text per kind of damage.
 
     def damage(self, problem: str, lost: int | None = None) -> None:
-        """Add a damaged place. `lost` is the number of messages lost there, None if unknown."""
+        """Add damage of the kind `problem`. `lost` is the number of messages lost by it, None if unknown."""
         if problem not in self.problems:
             self.problems.append(problem)
         if lost is None:
@@ -46,7 +46,7 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """Compute the final number of lost messages. A count stated by the file overrides the sum over damaged places."""
+        """If the file states its message count, raise `lost` to the number of missing messages, which is then complete."""
         if self.expected is not None:
             self.lost = max(self.lost, self.expected - self.messages)
             self.complete = True

@@ -1,4 +1,4 @@
-"""ROS 2 bags of the sqlite3 storage, read in rowid order. A damaged database is read page by page."""
+"""Read ROS 2 bags that are sqlite3 databases, in rowid order. A damaged database is read page by page."""
 
 import shutil
 import sqlite3
@@ -16,9 +16,9 @@ MAGIC = b"SQLite format 3\0"
 
 
 def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the messages of the wanted topics in rowid order. Raises LogError if the file is no database of messages.
+    """Yield the messages of the wanted topics in rowid order. Raises LogError if the file is not a database of messages.
 
-    All whole rows of a damaged file are read. The journal of a killed recorder is applied to a temporary copy of the file.
+    All whole rows of a damaged file are read. A killed recorder leaves a journal, which is applied to a temporary copy.
     """
     with _settled(path, report) as (file, mode), _open(file, mode, path) as database:
         topics = _read_topics(database, path)
@@ -33,7 +33,7 @@ def read_sqlite(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 
 @contextmanager
 def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
-    """Yield the file or its temporary copy, and the mode in which to open it. Only a killed recorder leaves siblings."""
+    """Yield the file to read and its open mode. The file is a temporary copy if a killed recorder left a journal."""
     names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
     siblings = [file for file in names if file.is_file() and file.stat().st_size]
     if not siblings:
@@ -47,7 +47,7 @@ def _settled(path: Path, report: FileReport) -> Iterator[tuple[Path, str]]:
                 report.damage(f"never closed, {sibling.name} was applied to a copy", 0)
         except OSError as error:
             message = f"cannot be copied to be repaired: {error.strerror or error}"
-            raise LogError(message, where=str(path), hint=f"is there room in {tempfile.gettempdir()}?") from error
+            raise LogError(message, where=str(path), hint=f"is the disk full at {tempfile.gettempdir()}?") from error
         yield copy, "mode=rw"
 
 

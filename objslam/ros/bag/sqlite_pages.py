@@ -24,7 +24,7 @@ class _CellError(ValueError):
 
 
 def missing_pages(path: Path) -> tuple[int, int]:
-    """Return the number of whole pages of a file and the number of missing pages, 0 if the header is not reliable."""
+    """Return how many whole pages a file has and how many are missing. The latter is 0 if the header is not reliable."""
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:
@@ -35,9 +35,10 @@ def missing_pages(path: Path) -> tuple[int, int]:
 
 
 def rows_of_pages(path: Path, columns: tuple[int, int, int], topics: frozenset[int], after: int) -> Iterator[Row]:
-    """Yield the whole rows with rowids above `after` on all leaf pages of a file, in rowid order.
+    """Yield the whole rows on all leaf pages of a file, in rowid order, if their rowid is above `after`.
 
-    A leaf page does not name its table. A row counts if its `columns` (topic id, time, message) and its topic are valid.
+    columns: the column indices of topic id, time and message. A leaf page does not name its table, so a row counts as a
+    message if these columns have valid values and the topic id is in `topics`.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         size = _page_size(data[:100])
@@ -70,7 +71,7 @@ def _page_size(header: bytes) -> int:
 
 
 def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
-    """Return the variable-length integer at a byte, and the byte behind it."""
+    """Return the variable-length integer at byte `at`, and the byte after it."""
     value = 0
     for i in range(8):
         byte = data[at + i]
@@ -84,11 +85,11 @@ def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
 def _read_row(
     data: mmap.mmap, at: int, page: int, columns: tuple[int, int, int], topics: frozenset[int], whole: bool
 ) -> tuple[int, int, bytes]:
-    """Return topic, time and message of the cell at a byte of a leaf page. The message is empty unless `whole`."""
+    """Return topic id, time and message of the cell at byte `at` of the file. The message is empty unless `whole` is set."""
     size, at = _varint(data, at)
     _, at = _varint(data, at)  # The rowid.
     usable = page - data[20]
-    local = size  # The bytes of the payload in the cell itself. The rest is on overflow pages.
+    local = size  # The number of payload bytes in the cell itself. The rest is on overflow pages.
     if size > usable - 35:
         least = (usable - 12) * 32 // 255 - 23
         local = least + (size - least) % (usable - 4)

@@ -17,18 +17,19 @@ _MODELS = {
     "plumb bob": "plumb_bob",
     "rational polynomial": "rational_polynomial",
 }  # The distortion models by the alternative names that drivers use.
-_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # No distortion if D is zero.
+_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # Models without distortion if D is zero.
 _MAX_PIXELS = 1 << 16  # The limit of width and height, px. A calibration with a larger image counts as damaged.
 _MAX_FOCAL = 1e7  # The limit of a camera matrix element, px. A calibration with a larger element counts as damaged.
 _HINT = "--camera-info FILE can give the calibration"
 
 
 def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera, Floats]:
-    """Return the camera of a sensor_msgs/CameraInfo of ROS 1 or 2, and frame_T_camera (4, 4) in the header frame.
+    """Return the camera of a sensor_msgs/CameraInfo (ROS 1 or 2), and its pose frame_T_camera (4, 4) in the header frame.
 
-    If `rectified`, the left 3x3 part of P is the camera matrix, without distortion. Otherwise, K and D apply, and the camera
-    is rotated by R against the header frame, which is rectified, as in image_geometry. Binning and region of interest are
-    applied. Raises LogError if the camera is not calibrated or its distortion model is unknown.
+    If `rectified`, the left 3x3 part of P is the camera matrix, and there is no distortion. Otherwise, K and D apply, and R
+    is the rotation of frame_T_camera, because the header frame belongs to the rectified camera (as in image_geometry).
+    The camera is for the image after binning and region of interest. Raises LogError if the camera is not calibrated or
+    its distortion is invalid.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
     if rectified and not values.any() and not _values(info, "D").any():  # P is unset, and nothing is to rectify.
@@ -58,7 +59,7 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
 
 
 def camera_names(frames: Iterable[str]) -> list[str]:
-    """Return a unique name for each frame that is valid as a file name."""
+    """Return a unique camera name for each coordinate frame. The names are valid as file names."""
     names: list[str] = []
     for frame in frames:
         plain = re.sub(r"[^A-Za-z0-9_-]+", "_", frame.removesuffix("_optical_frame"))[:60].strip("_-") or "camera"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _MAX_DEFINITION = 1 << 18  # The length limit of a definition, characters. The limit bounds the parsing time.
 _MAX_TYPES, _MAX_FIELDS, _MAX_ELEMENTS = 200, 2000, 50_000
-"""The limits of types, fields and array elements of a definition. The limits bound the size of the generated code."""
+"""How many types, fields and array elements a definition may have. The limits bound the size of the generated code."""
 _WRONG = (ValueError, LookupError, ArithmeticError, AssertionError, RecursionError, TypeError, AttributeError, struct.error)
 """The errors that the type library raises for malformed definitions and messages, besides its own errors."""
 
@@ -25,13 +25,14 @@ class DecodeError(ValueError):
 
 
 def read_head(data: bytes, encoding: str) -> tuple[int, str, int]:
-    """Return timestamp (ns) and frame_id of a message that starts with a std_msgs/Header, and the next u32 number.
+    """Return timestamp (ns) and frame_id from the std_msgs/Header at the start of a message, and the u32 number after it.
 
-    The number is an array length, or 0 at the end of the message. Raises DecodeError if the header is cut off.
+    If an array follows the header, the number is its length. It is 0 if the message ends after the header. Raises
+    DecodeError if the header is cut off.
     """
     order = ">" if encoding == "cdr" and data[1:2] == b"\0" else "<"
     try:
-        seconds, nanoseconds, size = struct.unpack_from(order + "III", data, 4)  # ROS 1 and CDR use the same bytes.
+        seconds, nanoseconds, size = struct.unpack_from(order + "III", data, 4)  # After the ROS 1 seq or the CDR header.
     except struct.error as error:
         raise DecodeError("shorter than a header") from error
     end = 16 + size
@@ -45,7 +46,7 @@ def read_head(data: bytes, encoding: str) -> tuple[int, str, int]:
 
 
 def read_length(data: bytes, encoding: str) -> int:
-    """Return the length of a message that is only an array (tf2_msgs/TFMessage), 0 if the message is too short."""
+    """Return the array length of a message that is only an array (tf2_msgs/TFMessage), 0 if the message is too short."""
     at = 4 if encoding == "cdr" else 0
     big = encoding == "cdr" and data[1:2] == b"\0"
     return int.from_bytes(data[at : at + 4], "big" if big else "little") if len(data) >= at + 4 else 0
@@ -81,7 +82,7 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 @lru_cache(maxsize=256)
 def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
-    """Return a cached type store for each known layout of a type. Raises DecodeError if no definition can be used."""
+    """Return a cached type store for each possible definition of a type. Raises DecodeError if one cannot be used."""
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 

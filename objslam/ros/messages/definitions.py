@@ -1,6 +1,6 @@
 """Message definitions that bags before ROS 2 Iron do not contain and that the type library does not know.
 
-The source is the documentation of the packages. vision_msgs 3.x and 4.x have equal bytes, and 2.x (Foxy) has more fields.
+They are from the documentation of the packages. Messages of vision_msgs 3.x and 4.x have equal bytes, 2.x (Foxy) differs.
 """
 
 _TYPES = {
@@ -35,7 +35,7 @@ _TAG = (
 
 
 def _array(element: str, fields: str, types: dict[str, str] = _TYPES) -> str:
-    """Return the definition of an array message, followed by the definitions of all types, as bags store it."""
+    """Return the definition of an array message, followed by the definitions of the types it may use, as bags store them."""
     parts = "".join(f"{'=' * 80}\nMSG: {name}\n{part}" for name, part in {**types, element: fields}.items())
     return f"std_msgs/Header header\n{element}[] detections\n{parts}"
 

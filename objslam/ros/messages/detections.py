@@ -23,7 +23,7 @@ class Found(NamedTuple):
     label: str  # The label may be empty.
     score: float
     track: str = ""  # The track name may be empty.
-    points: Floats | None = None  # (5, 3) m, in the camera frame, centre and corners of a tag without image corners.
+    points: Floats | None = None  # Centre and corners (5, 3) of a tag, m, in the camera frame. None if `box` is known.
 
 
 def find_boxes(type_: str, message: Any) -> Iterator[Found]:
@@ -32,7 +32,8 @@ def find_boxes(type_: str, message: Any) -> Iterator[Found]:
 
 
 def track_number(name: str, tracks: dict[str, int]) -> int:
-    """Return the track id of a track name: -1 for "", the number in the name, or a new number stored in `tracks`."""
+    """Return the track id of a track name. A name of digits is the id itself. Any other name gets a new id, which `tracks`
+    keeps. The empty name has the id -1."""
     if not name:
         return -1
     if name.isascii() and name.isdigit() and len(name) < 18:
@@ -41,7 +42,8 @@ def track_number(name: str, tracks: dict[str, int]) -> int:
 
 
 def boxes_of_points(camera: Camera, points: Floats) -> Floats:
-    """Return boxes (M, 4), raw px, centred on the first of tag points (M, 5, 3). Boxes outside the lens field are NaN."""
+    """Return the boxes (M, 4) of tags, px of the raw image, from centre and corners (M, 5, 3), m, in the camera frame.
+    The tag centre is the centre of the box. A box with a point outside of the lens field is NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
@@ -51,7 +53,8 @@ def boxes_of_points(camera: Camera, points: Floats) -> Floats:
 
 
 def vision_boxes(message: Any) -> Iterator[Found]:
-    """Yield the detections of a vision_msgs/Detection2DArray, with the best hypothesis and the bounds of a rotated box."""
+    """Yield the detections of a vision_msgs/Detection2DArray. Each has the label and score of its best hypothesis.
+    A rotated box is replaced by the upright box around it."""
     for detection in message.detections:
         centre, label, score = detection.bbox.center, "", 0.0
         width, height, turn = detection.bbox.size_x, detection.bbox.size_y, centre.theta
@@ -75,7 +78,7 @@ def vision_boxes(message: Any) -> Iterator[Found]:
 def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
-    The box centre is the intersection of the tag diagonals. The box extends to the furthest corner.
+    The box centre is the intersection of the tag diagonals. The box is symmetric about this centre and contains all corners.
     Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:

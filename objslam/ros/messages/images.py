@@ -40,7 +40,8 @@ def colour_image(message: Any) -> NDArray[Any]:
 
 
 def depth_image(message: Any) -> NDArray[Any]:
-    """Return the depth (H, W), uint16, 1 / `DEPTH_SCALE` m, 0 if unknown. Raises DecodeError for other messages."""
+    """Return the depth (H, W) in an image message, uint16, in 1 / `DEPTH_SCALE` m, 0 if unknown. Raises DecodeError if the
+    message is malformed or not a depth image."""
     if (packing := _packing(message)) is None:
         return _depth_units(_pixels(message)[0])
     if "compresseddepth" in packing:
@@ -49,9 +50,9 @@ def depth_image(message: Any) -> NDArray[Any]:
 
 
 def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
-    """Return file content and file suffix of an image message. Raises DecodeError if the message is malformed.
+    """Return the content and the suffix of a file for an image message. Raises DecodeError if the message is malformed.
 
-    JPEG and PNG data are not changed. Other images become PNG. Depth becomes a PNG of the array of `depth_image`.
+    JPEG and PNG data are not changed. Other images become PNG. A depth image becomes a PNG of the result of `depth_image`.
     """
     packing = _packing(message)
     if depth or "compresseddepth" in (packing or ""):
@@ -110,7 +111,7 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 
 
 def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
-    """Decode compressed_depth_image_transport: a header and a PNG. The PNG of floats has inverse depth a / depth + b."""
+    """Decode data of compressed_depth_image_transport, a header and a PNG. For float images, the PNG has a / depth + b."""
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise DecodeError("its compressed depth is not PNG")
     image = decode_depth(data[_DEPTH_HEADER:])

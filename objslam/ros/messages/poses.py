@@ -34,7 +34,8 @@ class PoseRows:
         return len(self.stamps)
 
     def checked(self, what: str, ledger: Ledger) -> tuple[Floats, Floats]:
-        """Return the timestamps (N,), s, and poses (N, 4, 4) in the order of arrival. Invalid poses are counted as drops."""
+        """Return timestamps (N,), s, and valid poses (N, 4, 4) in the order of arrival.
+        Invalid poses are counted as drops. `what` is the name of a pose in the drop reason."""
         values = np.frombuffer(self.values).reshape(-1, 7)
         good = _are_poses(values)
         stamps = choose_times(self.stamps, self.logged) / 1e9
@@ -50,12 +51,12 @@ def one_pose(place: Any, turn: Any) -> Floats | None:
 
 
 def _are_poses(values: Floats) -> Bools:
-    """Return which rows (N, 7) of x, y, z, qx, qy, qz, qw are valid poses, (N,)."""
+    """Return the mask (N,) of valid poses among rows (N, 7) of x, y, z, qx, qy, qz, qw."""
     good = np.asarray((np.abs(values) < _MAX_VALUES).all(axis=1))
     return np.asarray(good & (np.linalg.norm(np.where(good[:, None], values[:, 3:], 0.0), axis=1) > _SHORT))
 
 
 def choose_times(stamps: array[int], logged: array[int]) -> Ints:
-    """Return the header timestamps (N,), ns, or the recording times if all timestamps are zero, which means unset."""
+    """Return the header timestamps (N,), ns. If all are zero, they are unset, and the recording times are returned."""
     times = np.frombuffer(stamps, dtype=np.int64)
     return times if times.any() else np.frombuffer(logged, dtype=np.int64)

@@ -5,7 +5,7 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 CAMERA_INFO, DETECTIONS = "sensor_msgs/msg/CameraInfo", "vision_msgs/msg/Detection2DArray"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 IMAGES = (IMAGE, COMPRESSED)
-LATCHED = (*TRANSFORMS, CAMERA_INFO)  # The types whose publishers may send a message only once, even before a subscription.
+LATCHED = (*TRANSFORMS, CAMERA_INFO)  # Types whose publishers may send only one message, possibly before a subscription.
 
 
 def is_tags(type_: str) -> bool:
@@ -15,5 +15,5 @@ def is_tags(type_: str) -> bool:
 
 
 def is_boxes(type_: str) -> bool:
-    """Return whether messages of a type contain boxes, from detections or tags."""
+    """Return whether messages of a type contain boxes, either detections or AprilTags."""
     return type_ == DETECTIONS or is_tags(type_)

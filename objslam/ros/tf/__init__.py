@@ -1,1 +1,1 @@
-"""Look up transforms between frames of a recording or a live session. `ros.messages` decodes the transform messages."""
+"""Look up transforms between coordinate frames in a recording or live session. `ros.messages` decodes their messages."""

@@ -1,4 +1,4 @@
-"""Buffer the transforms of /tf and /tf_static of a live robot, for as long as tf2 does."""
+"""A buffer of the transforms on /tf and /tf_static of a live robot. It keeps them as long as tf2 does by default (10 s)."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ _MAX_KEPT = 10_000  # The limit of buffered transforms per pair of frames, enoug
 
 
 class UnknownTransform(LookupError):
-    """A transform is unknown at the requested time. `later` is whether a later message may supply it."""
+    """A transform is unknown at the requested time. `later`: whether a later message may supply it."""
 
     def __init__(self, message: str, later: bool) -> None:
         super().__init__(message)
@@ -25,7 +25,7 @@ class UnknownTransform(LookupError):
 
 @dataclass
 class _Edge:
-    """parent_T_child at increasing stamps, s. `still` is whether the pose has never changed."""
+    """The poses parent_T_child of a child frame at increasing timestamps, s. `still`: whether the pose has never changed."""
 
     parent: str
     static: bool
@@ -34,7 +34,8 @@ class _Edge:
     still: bool = True
 
     def add(self, stamp: float, pose: Floats) -> bool:
-        """Add a pose, or return False if it is late. A timestamp more than `MAX_GAP` s back clears the buffer."""
+        """Add a pose, or return False if it is older than the newest pose.
+        If it is older by more than `MAX_GAP` s, the clock was set back. Then the buffer is cleared and the pose is added."""
         if self.stamps and stamp < self.stamps[-1] - MAX_GAP:
             self.stamps.clear()
             self.poses.clear()
@@ -51,7 +52,7 @@ class _Edge:
         return True
 
     def at(self, stamp: float) -> Floats:
-        """Return the interpolated pose at a stamp, s. Raises UnknownTransform outside of the buffered time."""
+        """Return the interpolated pose at a timestamp, s. Raises UnknownTransform outside of the buffer or in a long gap."""
         if self.still:
             return self.poses[-1]
         after = bisect_left(self.stamps, stamp)
@@ -71,14 +72,15 @@ class _Edge:
 class TfBuffer:
     """The latest transforms of all frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame keeps its parent unless the parent is silent for `MAX_GAP` s. A static transform never replaces a moving one.
+    A frame gets a new parent only `MAX_GAP` s after the last transform to its old parent. A static transform never replaces
+    a moving one.
     """
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transform: Any, received: float, static: bool) -> str:
-        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is invalid."""
+        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is refused."""
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
         if pose is None:
@@ -101,7 +103,7 @@ class TfBuffer:
 
     @property
     def frames(self) -> set[str]:
-        """All frames."""
+        """The names of all frames."""
         return set(self._edges) | {edge.parent for edge in self._edges.values()}
 
     def above(self, frame: str) -> Sequence[str]:
@@ -119,13 +121,13 @@ class TfBuffer:
         return ways
 
     def at(self, a: str, b: str, stamp: float) -> Floats:
-        """Return the interpolated a_T_b (4, 4) at a stamp, s. Raises UnknownTransform if it is unknown."""
+        """Return the interpolated a_T_b (4, 4) at a timestamp, s. Raises UnknownTransform if it is unknown."""
         up, down = self._between(a, b)
         top_T_a, top_T_b = self._down(up, stamp), self._down(down, stamp)
         return np.asarray(inverse(top_T_a) @ top_T_b) if up else top_T_b
 
     def newest(self, a: str, b: str) -> float | None:
-        """Return the newest stamp, s, with all transforms from a to b known, None if all of them are static."""
+        """Return the newest timestamp, s, at which all transforms from a to b are known, None if all of them are static."""
         moving = [edge.stamps[-1] for way in self._between(a, b) for child in way if not (edge := self._edges[child]).static]
         return min(moving, default=None)
 

@@ -11,7 +11,7 @@ from objslam.ros.bag.records import frame_name
 
 MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. The limit bounds memory.
 MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. tf2 has the same default buffer length.
-_STILL = 1e-9  # The largest change of a pose element of a static frame, far below the resolution of any sensor.
+_STILL = 1e-9  # A pose is static if no element changes by more. No sensor resolves such a small change.
 BASES = ("base_footprint", "base_link")  # The base frames of a robot (REP 105) without namespaces, by priority.
 _WORLDS = {"map", "world"}
 
@@ -21,7 +21,7 @@ def _leaf(frame: str) -> str:
 
 
 def is_world(frame: str) -> bool:
-    """Return whether a frame is fixed in the world, such as map, world or robot1/map, but not odom."""
+    """Return whether the name of a frame says that it is fixed in the world, such as map, world or robot1/map, not odom."""
     return not _WORLDS.isdisjoint(re.split(r"[^a-z]+", _leaf(frame).lower()))
 
 
@@ -36,7 +36,7 @@ def find_world(frames: Iterable[str]) -> str:
 
 
 def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
-    """Return the base frame: the given frame, else the child frame of the odometry, else base_footprint or base_link."""
+    """Return the base frame: `given`, else `moved` (the child frame of the odometry), else base_footprint or base_link."""
     if given is not None:
         return given.lstrip("/")
     known = set(frames)
@@ -47,7 +47,7 @@ def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
 
 
 def link(transform: Any) -> tuple[str, str]:
-    """Return parent and child of a geometry_msgs/TransformStamped. Raises ValueError if they are invalid."""
+    """Return the parent and child frame of a geometry_msgs/TransformStamped. Raises ValueError if they are invalid."""
     parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
     if not parent or not child or parent == child:
         raise ValueError("transform without a frame, or of a frame to itself")
@@ -55,7 +55,8 @@ def link(transform: Any) -> tuple[str, str]:
 
 
 def climb(frame: str, parent_of: Callable[[str], str | None]) -> tuple[tuple[str, ...], str | None]:
-    """Return the frames from a frame up to the root, and the first repeated frame of a cycle, None without a cycle."""
+    """Return the frames from a frame up to the root, and None.
+    In a cycle, the frames end before the first repeated frame, which is returned in place of None."""
     way, seen = [frame], {frame}
     while (parent := parent_of(way[-1])) is not None:
         if parent in seen:
@@ -66,7 +67,7 @@ def climb(frame: str, parent_of: Callable[[str], str | None]) -> tuple[tuple[str
 
 
 def part(above_a: Sequence[str], above_b: Sequence[str]) -> tuple[Sequence[str], Sequence[str]] | None:
-    """Cut two ways to the root before their first common frame. Return None without a common frame."""
+    """Return two ways to the root, both cut before their first common frame. Return None if they have no common frame."""
     both = set(above_b)
     common = next((frame for frame in above_a if frame in both), None)
     return None if common is None else (above_a[: above_a.index(common)], above_b[: above_b.index(common)])

@@ -20,7 +20,7 @@ _NAMED = 6  # The limit of frames listed in a message. The limit keeps the messa
 
 @dataclass
 class TfRows:
-    """Transforms by (parent, child): all moving transforms in the order of arrival, and the last static transform."""
+    """Transforms by (parent, child). `moving` has all transforms in the order of arrival, `static` only the last."""
 
     moving: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
     static: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class TfRows:
 
 @dataclass(frozen=True)
 class _Edge:
-    """parent_T_child at increasing stamps (N,), s. A static transform has one pose (1, 4, 4)."""
+    """The poses parent_T_child of a child frame at increasing timestamps (N,), s. A static frame has one pose (1, 4, 4)."""
 
     parent: str
     stamps: Floats
@@ -59,9 +59,9 @@ class _Edge:
 
 
 class TfTree:
-    """The tree of frames. A pose a_T_b transforms b coordinates to a coordinates.
+    """The tree of coordinate frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame with several parents keeps the parent of most transforms. The last of transforms with equal timestamps is used.
+    A frame with several parents keeps the parent with the most transforms. Of equal timestamps, the last transform is used.
     Methods raise LogError if two frames are not connected or the tree has a cycle.
     """
 
@@ -79,7 +79,7 @@ class TfTree:
 
     @cached_property
     def frames(self) -> frozenset[str]:
-        """All frames."""
+        """The names of all frames."""
         return frozenset(self._parent) | frozenset(self._parent.values())
 
     def chain(self, a: str, b: str) -> tuple[str, ...]:
@@ -94,7 +94,7 @@ class TfTree:
         return self.at(a, b, np.zeros(1))[0][0] if still else None
 
     def stamps(self, a: str, b: str) -> Floats:
-        """Return the stamps (N,), s, of the moving transforms between a and b, within the time range of all of them."""
+        """Return the timestamps (N,), s, of all moving transforms between a and b, within the time range that all cover."""
         moving = [edge for way in self._ways(a, b) for child in way if not (edge := self._edge(child)).still]
         if not moving:
             return np.zeros(0)
@@ -111,7 +111,7 @@ class TfTree:
         return way
 
     def at(self, a: str, b: str, stamps: Floats) -> tuple[Floats, Bools]:
-        """Return the interpolated a_T_b (Q, 4, 4) at stamps (Q,), s, and the mask (Q,) of known poses."""
+        """Return the interpolated a_T_b (Q, 4, 4) at timestamps (Q,), s, and the mask (Q,) of known poses."""
         up, down = self._ways(a, b)
         top_T_a, known_a = self._down(up, stamps)
         top_T_b, known_b = self._down(down, stamps)

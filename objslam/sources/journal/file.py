@@ -1,8 +1,9 @@
 """Write and read the journal, the file of all messages that a live session accepted.
 
-The file starts with 8 magic bytes. Each record is its length (4 bytes, little endian), CRC-32 (4 bytes) and content.
-A record is in the kernel's cache before its message counts, so a killed process loses no message. It is on the disk at most
-`_SYNC_EVERY` later, so a power failure loses at most the messages of that time.
+The file starts with 8 magic bytes. A record holds the length of its content (4 bytes, little endian), the CRC-32 of its
+content (4 bytes, little endian) and its content. A message is accepted only when its record is in the kernel's cache, so a
+killed process loses no accepted message. The record is on the disk at most `_SYNC_EVERY` later, so a power failure loses at
+most the messages of that time.
 """
 
 import fcntl
@@ -36,21 +37,21 @@ from objslam.sources.journal.records import (
 NAME = "journal.objslam"
 MAGIC = b"OBJSLAM1"
 _HEAD = struct.Struct("<II")
-_LONGEST = 1 << 26  # The longest record, bytes. A length above it is taken as damage.
+_LONGEST = 1 << 26  # The largest content of a record, bytes. A record that states a greater length counts as damaged.
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
 
 
 class Journal:
     """A journal open for writing. Only one process may write it.
 
-    torn: the number of bytes of an incomplete last record, which `resume` removed.
+    torn: how many bytes of an incomplete record were removed from the end of a resumed journal, else 0.
     """
 
     def __init__(self, file: Path, resume: bool = False) -> None:
-        """Open a new journal, or with `resume` append to the existing journal after removing its torn end.
+        """Open a new journal. With `resume`, open an existing journal to append to it.
 
-        Without `resume`, an existing journal with messages is renamed first (`set_aside`).
-        Raises OutputError if another session writes the journal or the disk refuses.
+        Without `resume`, an existing journal with messages is renamed first (`set_aside`). With `resume`, an incomplete
+        record at the end is removed. Raises OutputError if another session writes the journal or it cannot be opened.
         """
         self.file = file
         if not resume:
@@ -74,7 +75,7 @@ class Journal:
         self._syncing.start()
 
     def write(self, message: Message) -> None:
-        """Append one message. Raises OutputError if the message is too long or the disk refuses."""
+        """Append one message. Raises OutputError if the message is too long or cannot be written."""
         if self._broken is not None:
             raise OutputError(f"cannot write the journal: {self._broken.strerror}", where=str(self.file))
         content = encode(message)
@@ -83,7 +84,7 @@ class Journal:
         self._append(_HEAD.pack(len(content), zlib.crc32(content)) + content)
 
     def close(self) -> None:
-        """Sync the journal to the disk and close it. Raises OutputError if the disk refuses."""
+        """Sync the journal to the disk and close it. Raises OutputError if it cannot be synced."""
         if self._stream < 0:
             return
         self._closed.set()
@@ -96,7 +97,7 @@ class Journal:
             os.close(stream)
 
     def _sync(self) -> None:
-        """Sync in a thread of its own, so that no message waits for the disk."""
+        """Sync the journal every `_SYNC_EVERY` until it is closed. A thread runs this, so no message waits for the disk."""
         synced = 0
         while not self._closed.wait(_SYNC_EVERY):
             end = self._end
@@ -124,10 +125,11 @@ class Journal:
 
 
 def set_aside(file: Path) -> Path | None:
-    """Rename a journal with messages to NAME.1.objslam, or to the next free number, and return the new path.
+    """Rename the journal `file` so that a new one can be written, and return its new path.
 
-    Returns None if there is no journal, or none with messages.
-    Raises OutputError if another session writes the journal, the file is no journal, or the disk refuses.
+    The new name is journal.1.objslam, or has the next free number. If there is no journal, or one without messages, nothing
+    is renamed and None is returned.
+    Raises OutputError if another session writes the journal, the file is no journal, or it cannot be renamed.
     """
     with _refusals("set the journal aside", file):
         if not file.is_file():
@@ -146,7 +148,10 @@ def set_aside(file: Path) -> Path | None:
 
 
 def put_back(aside: Path, file: Path) -> bool:
-    """Rename a journal from `set_aside` back, unless the new journal has messages. Returns whether it was renamed."""
+    """Rename `aside`, a journal that `set_aside` renamed, back to `file`. Returns whether it was renamed.
+
+    If `file` is by now a journal with messages, nothing is renamed. Raises OutputError if the journal cannot be renamed.
+    """
     with _refusals(f"put {aside} back", file):
         if file.is_file() and file.stat().st_size > len(MAGIC):
             return False
@@ -172,7 +177,11 @@ def is_journal(path: Path) -> bool:
 
 
 def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
-    """Read the messages of a journal in order. A torn end is dropped and counted. Raises LogError if it is no journal."""
+    """Read the messages of a journal in order. Raises LogError if it is no journal.
+
+    Records of other versions of objslam are dropped and counted. If a record is damaged or incomplete, the journal is not
+    read further, and the rest is dropped and counted once.
+    """
     file = _file(path)
     if not is_journal(path):
         raise LogError("this is no journal", where=str(path))
@@ -188,7 +197,7 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
 
 
 def read_journal(path: Path, ledger: Ledger) -> Log:
-    """Read a journal as a log, with stamps on the session's clock. Raises LogError if the journal holds no frames."""
+    """Read a journal as a log, with the stamps that the session gave the messages. Raises LogError if it holds no frames."""
     poses: dict[str, list[PoseMessage]] = {"odometry": [], "localization": []}
     cameras: dict[str, Camera] = {}
     frames: dict[str, list[FrameMessage]] = {}
@@ -217,7 +226,7 @@ def _file(path: Path) -> Path:
 
 
 def _records(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the content of each record. Stops with the stream at the start of the first torn record or the file's end."""
+    """Yield the contents of the records before the first damaged one. The stream then stands at the end of these records."""
     stream.seek(len(MAGIC))
     while True:
         start = stream.tell()

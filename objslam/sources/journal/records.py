@@ -14,8 +14,8 @@ from objslam.errors import LogError
 
 PathKind = Literal["odometry", "localization"]
 
-_POSE = struct.Struct("<c13d")  # The layout of a pose: its kind, its stamp and its upper three rows.
-_MOUNT = struct.Struct("<cd12dH")  # The layout of a mount: as a pose, then the length of the camera's name.
+_POSE = struct.Struct("<c13d")  # The bytes of a pose message: its kind, its stamp and the upper three rows of the matrix.
+_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the same, then the length of the camera's name.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
@@ -23,7 +23,7 @@ _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
 
 @dataclass(frozen=True)
 class PoseMessage:
-    """A pose of the robot at a stamp (s): odom_T_base or map_T_base (4, 4), by the kind of path."""
+    """The robot's pose at a stamp (s). For odometry, `pose` is odom_T_base (4, 4). For localisation, it is map_T_base."""
 
     path: PathKind
     stamp: float
@@ -32,7 +32,7 @@ class PoseMessage:
 
 @dataclass(frozen=True)
 class MountMessage:
-    """base_T_camera (4, 4) of a camera, valid from a stamp (s) on."""
+    """The pose base_T_camera (4, 4) of a moving camera on the robot. It holds from its stamp (s) until the next mount."""
 
     stamp: float
     camera: str
@@ -40,15 +40,16 @@ class MountMessage:
 
 
 class HeldMounts:
-    """The mounts of one camera. Each mount holds until the next. most: how many of the newest are kept. None keeps all."""
+    """The mounts of one camera, which are its poses on the robot. Each mount holds until the next."""
 
     def __init__(self, most: int | None = None) -> None:
+        """Start without mounts. most: how many of the newest mounts are kept. None keeps all."""
         self._most = most
         self._stamps: list[float] = []
         self._poses: list[Floats] = []
 
     def add(self, message: MountMessage) -> None:
-        """Add a mount. It replaces an earlier mount with the same stamp."""
+        """Add a mount. It replaces a mount that was added before with the same stamp."""
         at = bisect_right(self._stamps, message.stamp)
         self._stamps.insert(at, message.stamp)
         self._poses.insert(at, message.pose)
@@ -56,7 +57,7 @@ class HeldMounts:
             del self._stamps[0], self._poses[0]
 
     def at(self, stamp: float, camera: Camera) -> Floats:
-        """Return base_T_camera (4, 4) at a stamp (s). Before the first mount, this is the camera's own base_T_camera."""
+        """Return base_T_camera (4, 4) at a stamp (s). Before the first mount, it is the one in `camera`."""
         at = bisect_right(self._stamps, stamp)
         return self._poses[at - 1] if at else camera.base_T_camera
 
@@ -70,7 +71,7 @@ class CameraMessage:
 
 @dataclass(frozen=True)
 class FrameMessage:
-    """The B boxes of one image: boxes (B, 4) and scores, depths and track_ids (B,), each as in `types.Detections`."""
+    """The B boxes of one image. The fields boxes (B, 4), scores, depths, track_ids (B,) and whole are as in `Detections`."""
 
     stamp: float
     camera: str
@@ -87,7 +88,7 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """The offsets of a session. clock: the seconds added to all stamps. odometry: start_T_odom (4, 4)."""
+    """The offsets of a session from now on. clock: the seconds added to stamps. odometry: start_T_odom (4, 4)."""
 
     clock: float
     odometry: Floats
@@ -126,7 +127,7 @@ def decode(data: bytes) -> Message:
             _, stamp, *rows, length = _MOUNT.unpack_from(data)
             name = data[_MOUNT.size :]
             if len(name) != length:
-                raise ValueError("the camera's name has another length")
+                raise ValueError("the camera's name has not the length that the record states")
             return MountMessage(stamp, name.decode(), _pose(rows))
         if kind == _NOTE_KIND:
             clock, odometry = json.loads(data[1:])

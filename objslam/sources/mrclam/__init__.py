@@ -10,6 +10,6 @@ from objslam.sources.options import Option, WithRange
 class MrclamOptions:
     """Choices that the folder leaves open: the robot, the use of ranges, and whether all landmarks share one label."""
 
-    robot: Annotated[int | None, Option("--robot", "MRCLAM: which robot.")] = None
+    robot: Annotated[int | None, Option("--robot", "MRCLAM: the number of the robot.")] = None
     with_range: WithRange = True
     anonymous: Annotated[bool, Option("--anonymous", "MRCLAM: every landmark gets the same label.")] = False

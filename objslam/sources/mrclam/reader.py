@@ -1,7 +1,7 @@
-"""Read UTIAS MRCLAM datasets: wheel odometry, and the range and bearing from a camera to landmarks with barcodes.
+"""Read UTIAS MRCLAM datasets: wheel odometry, and ranges and bearings that a camera measured to landmarks with barcodes.
 
 Source: Leung, Halpern, Barfoot, Liu, The UTIAS multi-robot cooperative localization and mapping dataset, IJRR 30(8), 2011.
-The reader converts bearings into pixels of a virtual pinhole camera in the origin of base that looks forward.
+The reader converts bearings into pixels of a virtual pinhole camera. It is in the origin of base and looks forward.
 """
 
 import re
@@ -19,16 +19,16 @@ from objslam.io.text import Table, count_drops, in_order, read_table, reading, s
 from objslam.sources.mrclam import MrclamOptions
 
 ROBOTS, LANDMARKS = range(1, 6), range(6, 21)
-"""The dataset's numbers of the subjects that are robots, and of the subjects that are landmarks."""
+"""The subject numbers of robots and of landmarks in the dataset."""
 _FOCAL = 380.0
-"""The focal length of the virtual camera, px. With it, the default noise of 3 px is the bearings' noise of 0.45 degrees."""
+"""The focal length of the virtual camera, px. With it, the bearings' noise of 0.45 degrees is the default noise of 3 px."""
 _WIDTH, _HEIGHT = 640, 480
 """The image size of the virtual camera, px. It sees +-40 degrees, more than the +-30 degrees of the real camera."""
 _MATRIX = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 _FORWARD = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """base_T_camera of the virtual camera. The camera is in the origin of base and looks along base x."""
-_HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes. The value is chosen small.
-_MARGIN = 6.0  # The least distance of a bearing from the image's edge, px. Nearer boxes would count as cut off.
+_HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes, so a small box is made.
+_MARGIN = 6.0  # The least distance of a box centre from the image's edge, px. Boxes nearer to it would count as cut off.
 
 
 def is_mrclam(path: Path) -> bool:
@@ -37,7 +37,7 @@ def is_mrclam(path: Path) -> bool:
 
 
 def robots(folder: Path) -> tuple[int, ...]:
-    """Return the numbers of the robots with odometry in the folder."""
+    """Return the numbers of the robots whose odometry is in the folder."""
     found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat(\.gz)?", file.name) for file in folder.glob("Robot*_Odometry.dat*"))
     return tuple(sorted({int(match[1]) for match in found if match}))
 
@@ -45,8 +45,9 @@ def robots(folder: Path) -> tuple[int, ...]:
 def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
     """Read one robot of an MRCLAM folder (files .dat or .dat.gz).
 
-    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement is a frame, even if its only
-    measurements are of other robots. Depths are range * cos(bearing). Labels are landmark_<subject>, or "landmark" for all.
+    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes an image, even if
+    all its measurements are dropped. Depths are range * cos(bearing). Labels are landmark_<subject>, or all "landmark" with
+    `options.anonymous`.
     The ground truth holds the landmark positions (z = 0) and the robot's path.
     Measurements of other robots and of unknown barcodes are dropped and counted.
     Raises LogError if a file is unusable or the folder lacks the robot.
@@ -71,9 +72,10 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
 
 
 def integrate(stamps: Floats, velocities: Floats) -> Floats:
-    """Integrate velocities (N, 2), forward (m/s) and turn (rad/s), at stamps (N,), s, from the identity.
+    """Integrate the velocities of a robot. Returns x, y (m) and yaw (rad) at each stamp, (N, 3), from zero on.
 
-    Each velocity holds until the next stamp, so the robot drives an exact arc. Returns (N, 3) x, y (m) and yaw (rad).
+    stamps: (N,) s. velocities: (N, 2) forward (m/s) and turn (rad/s). Each holds until the next stamp, so that the robot
+    drives exact arcs.
     """
     way, turn = (velocities[:-1] * np.diff(stamps)[:, None]).T
     half = turn / 2

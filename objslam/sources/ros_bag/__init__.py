@@ -1,1 +1,1 @@
-"""Read ROS 1 and ROS 2 bags, including damaged ones, without a ROS installation. The formats themselves are in `ros`."""
+"""Read ROS 1 and ROS 2 bags, including damaged ones, without a ROS installation. The formats are in `objslam.ros`."""

@@ -19,9 +19,9 @@ from objslam.sources.ros_bag.trajectories import tf_path
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of one camera, and the name of its optical frame.
+    """The topics of one camera. frame: the name of its optical coordinate frame.
 
-    calibration: the calibration from a file, if any. rectified: whether boxes and images are of the rectified image.
+    calibration: the calibration from a file, if any. rectified: whether boxes and images are rectified.
     """
 
     name: str
@@ -39,10 +39,11 @@ def find_cameras(
 ) -> tuple[CameraTopics, ...]:
     """Find the cameras of a recording and their topics.
 
-    With calibrations from a file, each calibration is a camera. Its topics have the camera's name as a part of their name or
-    frame. A single calibration without such topics takes all topics. Without calibrations, each frame with detections is a
-    camera. Without detections, each frame with colour images and a CameraInfo is a camera. A camera's other topics share its
-    frame. If several topics fit a role, the one with the closest name is taken with a warning.
+    With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the camera's
+    name as a part. A single calibration without such topics takes all topics. Without calibrations, each frame_id of
+    detections is a camera. Without detections too, each frame_id of both colour images and a CameraInfo is a camera, and so
+    is a single topic of colour images. The other topics of a camera have the same frame_id. If several topics fit a role,
+    the one with the most similar name is taken with a warning.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images
@@ -52,10 +53,10 @@ def find_cameras(
         if alone and not any(named.values()):
             named = {name: list(seeds) for name in named}
         for name in (name for name, topics in named.items() if not topics):
-            pool.ledger.warn(f"the camera {name!r} has no topics: left out (--topic {name}.detections=/name, or image)")
+            pool.ledger.warn(f"camera {name!r}: no topics, left out (--topic {name}.detections=/name or {name}.image=/name)")
         taken = {topic.name for topics in named.values() for topic in topics}
         for topic in (topic for topic in detections if topic.name not in taken):
-            pool.ledger.warn(f"{topic.name}: left out, no calibration has a name that fits ({', '.join(named)})")
+            pool.ledger.warn(f"{topic.name}: left out, because no calibration has a fitting name ({', '.join(named)})")
         cameras = []
         for calibration in calibrations:
             name = calibration.camera.name
@@ -74,9 +75,9 @@ def find_cameras(
 
 
 def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) -> tuple[Camera, Trajectory | None]:
-    """Build a camera, and base_T_camera over time if the camera moves on the robot, else None.
+    """Build a camera from its topics. Returns it with base_T_camera over time, or None if the camera does not move on base.
 
-    Raises LogError if the calibration or the tf from base to the camera is missing.
+    Raises LogError if the calibration is missing or tf does not connect base with the camera.
     """
     given = topics.calibration
     if given is not None and given.placed:
@@ -111,7 +112,11 @@ def _gather(
     rectified: bool | None,
     alone: bool,
 ) -> CameraTopics:
-    """Find all topics of a camera. A single camera takes topics of any frame if the user chose them or it has no frame."""
+    """Find all topics of a camera. They have its frame_id.
+
+    If it is the only camera (`alone`), it also takes topics with other frame_ids that the user chose. Without a frame_id of
+    its own, it takes topics with any frame_id.
+    """
 
     def mine(role: str) -> list[Topic]:
         rest = alone and (not frame or bool(pool.choices.of(role)))

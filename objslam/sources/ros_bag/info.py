@@ -22,8 +22,8 @@ from objslam.sources.summary import FIND_BOXES, Timing, off_path, timing
 class TopicInfo:
     """One topic of a bag.
 
-    messages: the number of messages. timing: the timing of the usable messages by their header stamps. Topics that objslam
-    does not use are timed by when they were recorded. role: the role in a run, "" for none. frame: the frame_id.
+    messages: the number of messages. timing: the timing of the usable messages by their header stamps, or by the times of
+    recording if objslam does not use the topic. role: the role in a run, "" for none. frame: the frame_id.
     detail: a short description of the messages. refused: the reasons why messages are unusable, with counts.
     """
 
@@ -39,7 +39,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """An optical frame. chain: the tf frames from base to it. base_T_frame: (4, 4), None if the frame moves on the robot."""
+    """An optical frame in tf. chain: the frames from base to it. base_T_frame: (4, 4), None if it moves on the robot."""
 
     frame: str
     chain: tuple[str, ...]
@@ -50,10 +50,11 @@ class CameraPlace:
 class BagInfo:
     """The summary of a bag.
 
-    start, end: the first and last time of recording, s. messages, lost: the numbers of messages that were read and lost.
-    base: the base frame. odometry, localization: the sources of the robot's path, "" for none. places: the optical frames
-    that tf connects to base. missing: one line for each thing that a run needs but the bag lacks.
-    damage, warnings: the lines that a run would report.
+    start, end: the times at which the first and the last message were recorded, s. messages: the number of messages that
+    were read. lost: the number of messages that damage made unreadable. base: the base frame. odometry, localization: the
+    topic or transform that gives this path, "" for none. places: the optical frames that tf connects to base. missing: one
+    line for each thing that a run needs but the bag lacks. damage: one line for each kind of damage in each file.
+    warnings: the warnings that a run would give.
     """
 
     name: str
@@ -156,6 +157,6 @@ def _places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
     for frame in sorted(frame for frame in tree.frames if frame.endswith(("optical_frame", "optical"))):
         try:
             places.append(CameraPlace(frame, tree.chain(base, frame), tree.still(base, frame)))
-        except LogError:  # tf does not connect the frame to base. If a camera needs the frame, `missing` has a line.
+        except LogError:  # tf does not connect the frame to base. If a camera needs it, `missing` reports that.
             continue
     return tuple(places)

@@ -1,4 +1,4 @@
-"""Read ROS bags into a log."""
+"""Read a ROS bag into a `Log`."""
 
 import re
 import tempfile
@@ -33,15 +33,16 @@ from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
 _KEPT: list[tempfile.TemporaryDirectory[str]] = []
-"""The folders of images from bags that were read without `extract`. They are removed when the program ends."""
+"""The temporary folders for the images of bags that are read without `extract`. They are removed when the program ends."""
 
 
 @dataclass(frozen=True)
 class Assembly:
     """A recording whose topics have their roles.
 
-    cast: the topics of every camera. cameras: (topics, camera, mount) of each usable camera. problems: the errors that make
-    a run impossible. left_out: the errors of the unusable cameras.
+    cast: the topics of every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is
+    base_T_camera over time, None if the camera does not move. problems: the errors that make a run impossible. left_out: the
+    errors of the unusable cameras, if others are usable.
     """
 
     survey: Survey
@@ -56,7 +57,7 @@ class Assembly:
 def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions | None = None) -> Log:
     """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
 
-    The first pass reads all messages but images, the second pass the images. Stamps come from the message headers.
+    The first pass reads everything except the images. The second pass reads the images. Stamps are those of the headers.
     Damaged files are read as far as possible and never changed. The ledger counts the lost messages.
     Raises LogError if the robot's path or every camera is missing, and ConfigError for options that do not fit the bag.
     """
@@ -158,9 +159,9 @@ def _camera_log(
 def extract_images(recording: Recording, folders: Mapping[str, tuple[Path, bool]], ledger: Ledger) -> dict[str, Images]:
     """Write the images of topics into files, and return the written images by topic.
 
-    folders: the target folder of each topic, and whether the topic is depth. JPEG and PNG data is copied. Other images are
-    written as PNG. Depth is written as 16 bit PNG in `DEPTH_SCALE` units per metre, with 0 for unknown depth. The name of a
-    file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
+    folders: the target folder of each topic, and whether it has depth images. Colour images in JPEG or PNG are copied. Other
+    colour images become PNG. Depth images become 16 bit PNG with `DEPTH_SCALE` units per metre and 0 for unknown depth. The
+    name of a file is its stamp. Images that cannot be decoded, or whose stamp repeats or goes back, are dropped and counted.
     Only one image is in memory at a time. Raises LogError if a file cannot be written.
     """
     written: dict[str, dict[int, Path]] = {topic: {} for topic in folders}

@@ -6,11 +6,11 @@ from typing import Annotated
 
 from objslam.sources.options import Label, Option, WithRange
 
-_TOPIC = """ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info; \
-with several cameras CAMERA.ROLE=/NAME). none: no topic. tf: the path from the transforms. May be repeated."""
-_RECTIFIED = "ROS bags, dds, rclpy: images and boxes are those of the rectified image, or not. [default: by name]"
-_CALIBRATION = "ROS bags, dds, rclpy: calibration, as in camera.yaml; several cameras below `cameras:`."
-_BASE = "ROS bags, dds, rclpy: the frame that is the robot's base."
+_TOPIC = """ROS bags, dds, rclpy: the topic for a role (odometry, localization, detections, image, depth, camera_info). \
+With several cameras: CAMERA.ROLE=/NAME. ROLE=none uses no topic. ROLE=tf takes the path from tf. May be repeated."""
+_RECTIFIED = "ROS bags, dds, rclpy: whether images and boxes are rectified or raw. [default: by topic name]"
+_CALIBRATION = "ROS bags, dds, rclpy: a calibration file like camera.yaml. Several cameras are below `cameras:`."
+_BASE = "ROS bags, dds, rclpy: the name of the robot's base frame."
 
 
 @dataclass(frozen=True)

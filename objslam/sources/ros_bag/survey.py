@@ -34,10 +34,10 @@ _Handler = Callable[[bytes, int], None]
 class Topic:
     """The content of a topic.
 
-    logged: the times of recording, ns. stamps: the header stamps, ns, of types that objslam uses. frames: the count of each
-    frame_id. refused: the count of unusable messages by reason. poses: the poses by (frame, child frame). tracks: the number
-    of each tracker id. points: the corner points of tags that come without a box, by the index of the box.
-    infos: the distinct CameraInfo messages. image: the first image, decoded.
+    logged: the times of recording, ns. stamps: the header stamps, ns, if objslam uses messages of this type. frames: how
+    many messages have each frame_id. refused: the count of unusable messages by reason. poses: the poses by (frame, child
+    frame). tracks: the track id of each track whose name is no number. points: the points of each tag without a box, by the
+    index of its place in `boxes`. infos: up to two distinct CameraInfo messages. image: the first image, decoded.
     """
 
     connection: Connection
@@ -162,7 +162,7 @@ def _add_transforms(connection: Connection, decode: _Decoder, tf: TfRows, data: 
 
 def _add_info(connection: Connection, topic: Topic, decode: _Decoder, data: bytes, logged: int) -> None:
     _note_header(connection, topic, data)
-    body = data[12:]  # The message without its stamp: the frame and the calibration.
+    body = data[12:]  # The message without its stamp: the frame_id and the calibration.
     if body not in topic.infos:
         info = decode(data)
         if len(topic.infos) < 2:
@@ -184,7 +184,7 @@ def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: st
     try:
         found = list(find_boxes(connection.type, decode(data)))
     except WRONG_LAYOUT as error:
-        raise DecodeError(f"not laid out as detections are ({error})") from error
+        raise DecodeError(f"the fields are not those of detections ({error})") from error
     _note_header(connection, topic, data)
     place = f"{topic.name} at {logged / 1e9:.3f} s"
     topic.boxes.add_frame(logged / 1e9, place)

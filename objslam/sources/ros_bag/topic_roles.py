@@ -9,7 +9,7 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, OD
 from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, Choices, warn_of_choice
 from objslam.sources.ros_bag.survey import Survey, Topic
 
-_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings that only depth images have. Grey images may have mono16 too.
+_DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings of depth images only. Grey images also have mono16.
 
 
 def check_choices(choices: Choices, survey: Survey) -> None:
@@ -40,7 +40,10 @@ class TopicPool:
         return [topic for topic in candidates(self.survey, role) if not names or topic.name in names]
 
     def choose(self, role: str, fitting: Sequence[Topic], camera: str = "") -> Topic | None:
-        """Return the user's choice for a role of a camera, else the first fitting topic. Warn if several topics fit."""
+        """Return the topic that the user chose for a role of a camera. Without a choice, return the first fitting topic.
+
+        Warns if several topics fit. Returns None if no topic fits, or if the user chose `none` or `tf`.
+        """
         names = self.choices.names.get((camera, role))
         if names:
             return None if names[0] in (NONE, TF) else self.survey.topics[names[0]]
@@ -51,7 +54,7 @@ class TopicPool:
 
 
 def candidates(survey: Survey, role: str) -> list[Topic]:
-    """Return the topics with usable messages of a type that fits the role, in the order of the length of their names."""
+    """Return the topics with usable messages of a type that fits the role. The topic with the shortest name is first."""
     topics = sorted(survey.topics.values(), key=lambda topic: (len(topic.name), topic.name))
     return [topic for topic in topics if _fits(topic, role)]
 

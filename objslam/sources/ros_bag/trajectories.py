@@ -17,15 +17,15 @@ from objslam.sources.ros_bag.survey import Survey, Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _NOT_THE_ROBOT = ("goal", "target", "initial", "setpoint", "waypoint", "truth", "mocap", "vrpn", "vicon")
-"""Words in the names of pose topics that are not the robot's own estimate of its pose."""
+"""A topic of poses with one of these words in its name does not hold the robot's own estimate of its pose."""
 
 
 @dataclass(frozen=True)
 class Paths:
     """The odometry odom_T_base and the localisation map_T_base. base: the name of the base frame.
 
-    odometry_from, localization_from: the source of each path for messages, "" if the path is missing.
-    roles: the role of each topic that is used.
+    odometry_from, localization_from: the topic or transform that gives the path, as text for the user, "" without the path.
+    roles: the role of each topic that is used, by the topic's name.
     """
 
     base: str
@@ -38,7 +38,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class _Odometry:
-    """Poses (N, 4, 4) of the frame `child` in `frame` at stamps (N,), s."""
+    """Poses (N, 4, 4) of the frame `child` in `frame` at stamps (N,), s. source: the topic or transform that gives them."""
 
     frame: str
     child: str
@@ -50,9 +50,10 @@ class _Odometry:
 def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     """Read the odometry and the localisation of the robot's base.
 
-    Odometry is a nav_msgs/Odometry topic, else tf from odom to base. Localisation is tf from map to odom, composed with the
-    odometry at the odometry's stamps, else a topic of poses in map. If map never moves against odom, the odometry is given
-    in map and there is no localisation. Raises LogError if both are missing, or if tf does not connect a necessary frame.
+    The odometry comes from a nav_msgs/Odometry topic. Without such a topic, it is tf from odom to base. The localisation is
+    tf from map to odom, composed with the odometry at the odometry's stamps. Without this tf, it comes from a topic of poses
+    in map. If map never moves against odom, the odometry is converted to map and there is no localisation.
+    Raises LogError if both are missing, or if tf does not connect a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]
@@ -61,7 +62,7 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(pool.survey)), "")
     base = find_base(tree.frames, base_frame, moved)
     if base_frame is None and moved not in ("", base):
-        ledger.warn(f"the path is that of {moved!r}, which is not in tf: {base!r} is taken as the same frame")
+        ledger.warn(f"the path is that of the frame {moved!r}, which is not in tf: {base!r} is taken as the same frame")
     if odometry is not None:
         odometry = _moved_to(base, odometry, tree, ledger)
     elif pool.choices.of("odometry") != [NONE]:
@@ -83,7 +84,7 @@ def _main_pair(topic: Topic) -> tuple[str, str]:
 
 
 def _from_topic(topic: Topic, what: str, ledger: Ledger) -> _Odometry:
-    """Read the poses of the most frequent pair of frames. Messages with other frames are dropped and counted."""
+    """Read the poses of a topic. Messages with other frames than most messages are dropped and counted."""
     pair = _main_pair(topic)
     for other, rows in topic.poses.items():
         if other != pair:
@@ -102,7 +103,7 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
     if child in ("", base):
         return odometry
     if child not in tree.frames or base not in tree.frames:
-        ledger.warn(f"the path is that of {child!r}, which tf does not connect to {base!r}: taken as the same frame")
+        ledger.warn(f"tf does not connect the path's frame {child!r} to {base!r}: both are taken as the same frame")
         return odometry
     child_T_base, known = tree.at(child, base, odometry.stamps)
     ledger.drop(f"odometry message with a stamp at which tf {child} -> {base} is not known", int((~known).sum()))
@@ -122,14 +123,14 @@ def _odometry_from_tf(tree: TfTree, base: str) -> _Odometry | None:
 
 
 def tf_path(tree: TfTree, frame: str, child: str) -> tuple[Floats, Floats]:
-    """Return the known poses (N, 4, 4) of a tf frame in another one, and their stamps (N,), s."""
+    """Return the stamps (N,), s, at which tf knows the pose of the frame `child` in `frame`, and these poses (N, 4, 4)."""
     stamps = tree.stamps(frame, child)
     poses, known = tree.at(frame, child, stamps)
     return stamps[known], poses[known]
 
 
 def _localized(pool: TopicPool, tree: TfTree, odometry: _Odometry | None, base: str) -> Paths:
-    """Add the localisation that the user chose, else the first available one, to the odometry."""
+    """Return the odometry with the localisation, which is the one that the user chose or else the first one found."""
     chosen = pool.choices.of("localization")
     path, source = (None, "") if odometry is None else (Trajectory(odometry.stamps, odometry.poses), odometry.source)
     if chosen in ([], [TF]):
@@ -154,7 +155,11 @@ def _pose_topics(survey: Survey) -> list[Topic]:
 
 
 def _from_tf(tree: TfTree, odometry: _Odometry | None, base: str) -> tuple[Floats, Floats, str] | None:
-    """Return the stamps, map_T_base, and the source in words. If map does not move: no stamps, and the fixed map_T_odom."""
+    """Read the localisation from tf. Returns its stamps (N,), s, the poses map_T_base (N, 4, 4), and their source as text.
+
+    If map does not move against odom, there are no stamps, and the fixed map_T_odom (4, 4) takes the place of the poses.
+    Returns None if tf has no localisation.
+    """
     frame = odometry.frame if odometry is not None and odometry.frame in tree.frames else base
     if frame not in tree.frames:
         return None

@@ -1,8 +1,9 @@
 """Read RGB-D recordings of the TUM benchmark (Sturm et al., IROS 2012) with text files of detector boxes.
 
-The numbered layout is that of the cube_slam sample. truth_cam_poses.txt has a pose for each frame. The names of files in
-boxes/, raw_imgs/ and depth_imgs/ begin with the frame's number, from 0. The stamped layout is that of the benchmark, with
-groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are the camera's, so base is the camera.
+The numbered layout is that of the cube_slam sample. truth_cam_poses.txt has a pose for each image. The names of files in
+boxes/, raw_imgs/ and depth_imgs/ begin with the number of the image, from 0. The stamped layout is that of the benchmark,
+with groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are those of the camera, so the base
+frame is the camera's frame.
 """
 
 import lzma
@@ -31,7 +32,7 @@ from objslam.sources.log_folder import read_truth
 from objslam.sources.tum_rgbd import TumOptions
 
 _POSES, _BOXES, _IMAGES = "truth_cam_poses.txt", "boxes", ("raw_imgs", "depth_imgs")  # The names in the numbered layout.
-_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The names of the path in the stamped layout.
+_PATHS = ("groundtruth.txt", "groundtruth.txt.gz")  # The possible names of the file of poses in the stamped layout.
 _LABEL = "object"  # The default label of boxes without a class.
 _DEPTH_SCALE = 5000.0  # The units per metre of the benchmark's depth images.
 _FREIBURG3 = np.array([[535.4, 0.0, 320.1], [0.0, 539.2, 247.6], [0.0, 0.0, 1.0]])
@@ -54,7 +55,7 @@ def is_stamped(path: Path) -> bool:
 
 
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the numbered layout. Files whose names begin with n belong to pose line n, not counting comments.
+    """Read the numbered layout. A file whose name begins with n belongs to the n-th pose line, from 0, without comments.
 
     Without camera.yaml, the calibration is that of freiburg3. Files without a pose, and further files with the same number,
     are dropped and counted. Raises LogError if the poses or the boxes are unusable.
@@ -73,10 +74,11 @@ def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()
 
 
 def read_stamped(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the stamped layout. Boxes are optional if the folder has rgb.txt. Raises the errors of `read_numbered`.
+    """Read the stamped layout. Boxes are optional if the folder has rgb.txt.
 
-    The box files are in a folder or a tar archive, which is not unpacked to disk. Files that are not regular, files that are
-    too large, and files not named after a stamp are dropped and counted.
+    The box files are in a folder or in a tar archive. The archive is not unpacked to disk. Box files that are not regular
+    files, that are not named after a stamp, or that are too large (in an archive) are dropped and counted.
+    Raises LogError if the poses or the boxes are unusable, or if the folder has several sets of boxes.
     """
     with reading(path):
         file = _stamped_path(path)
@@ -125,7 +127,7 @@ def _numbered_images(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -
 
 
 def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[int, Path]:
-    """Map the number at the start of each file's name to the file, sorted by number."""
+    """Return the files of a folder by the number at the start of their name, in the order of the numbers."""
     inside = Inside(folder)
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()):
@@ -137,7 +139,7 @@ def _numbered(folder: Path, stamp_of: dict[int, float], ledger: Ledger) -> dict[
         elif number not in stamp_of:
             ledger.drop("numbered file that no pose belongs to", where=str(file))
         elif number in found:
-            ledger.drop("numbered file with the number of another file", where=str(file))
+            ledger.drop("second file with the same number", where=str(file))
         else:
             found[number] = file
     return dict(sorted(found.items()))
@@ -162,7 +164,7 @@ def _read_box_set(source: Path, label: str, ledger: Ledger) -> Detections:
 
 
 def _add_boxes(data: bytes, place: str, label: str, collector: BoxCollector, ledger: Ledger) -> None:
-    """Add the boxes of a file to the collector's last frame. x, y is the top left corner of a box, px."""
+    """Add the boxes of a file to the collector's last frame. In a line, x and y are the top left corner of the box, px."""
     for number, text in split_lines(data, place, ledger):
         where = f"{place}:{number}"
         values = parse_numbers(text.split())

@@ -154,7 +154,7 @@ def test_g2o_needs_odometry_of_the_same_run(result, tmp_path):
     shutil.copy(result / "motions.parquet", copy)
     lines = (copy / "trajectory.txt").read_text().splitlines()
     (copy / "trajectory.txt").write_text("\n".join(lines[:-1]) + "\n")
-    with pytest.raises(OutputError, match="not of one run"):
+    with pytest.raises(OutputError, match="from different runs"):
         write_export(copy, "g2o")
 
 

@@ -31,12 +31,12 @@ def test_where_the_rays_go_says_what_became_of_an_object() -> None:
     )
     lines = [(line.at, line.level, line.text) for line in round_events(trace, ("cup",))]
     assert lines == [
-        (0, "INFO", "round 1, association at the poses so far: 3 objects, 1 unexplained rays"),
+        (0, "INFO", "round 1, association at the latest poses: 3 objects, 1 unexplained rays"),
         (0, "INFO", "new: cup #0, 3 rays"),
         (0, "INFO", "new: cup #1, 2 rays"),
         (0, "INFO", "new: cup #2, 3 rays"),
         (0, "INFO", "solved in 1 iterations, cost 1 to 1, 0 rays rejected"),
-        (1, "INFO", "round 2, association at the poses so far: 2 objects, 2 unexplained rays"),
+        (1, "INFO", "round 2, association at the latest poses: 2 objects, 2 unexplained rays"),
         (1, "INFO", "merged: cup #0 (3 rays), cup #1 (2 rays) are cup #0, 0.50 m apart"),
         (1, "INFO", "new: cup #1, 2 rays of other objects or unexplained"),
         (1, "INFO", "dropped: cup #2, 2 of its 3 rays are now unexplained"),
@@ -46,7 +46,7 @@ def test_where_the_rays_go_says_what_became_of_an_object() -> None:
 
 def test_labels_that_are_no_identities_are_said() -> None:
     texts = [line.text for line in round_events((a_round("labels", [0, 0], 1), a_round("association", [0, 0], 1)), ("cup",))]
-    assert "round 1, every label taken for one object: 1 objects, 0 unexplained rays" in texts
+    assert "round 1, one object assumed for each label: 1 objects, 0 unexplained rays" in texts
     assert "a label is not one object: too many rays disagreed with the only object of their label" in texts
     assert round_events((), ("cup",)) == []
 

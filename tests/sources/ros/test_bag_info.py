@@ -73,7 +73,7 @@ def test_frames_of_another_clock(makers, tmp_path, log):
         ("/front/detections", rows[-1][1], maker.detections(stamp, [(0, 0, 9, 9, "cup", 0.5)], "front_optical_frame"))
     )
     (line,) = describe(write_bag(tmp_path / "x", "mcap-none", maker, rows)).missing
-    assert line.startswith("camera front: none of its frames (1.000 to 1.000 s) is on the path")
+    assert line.startswith("camera front: none of its frames (1.000 to 1.000 s) is within the time of the path")
 
 
 def test_all_that_is_missing_is_listed(makers, tmp_path):

@@ -312,7 +312,7 @@ def test_a_calibration_file_stands_in(makers, tmp_path):
     assert camera_log.detections.label_names == ("mug",)
     assert camera_log.camera.distortion_model == "equidistant"
     np.testing.assert_allclose(camera_log.camera.base_T_camera, left.base_T_camera, atol=1e-12)
-    assert ledger.warnings == ["/rig/front/tags: left out, no calibration has a name that fits (left)"]
+    assert ledger.warnings == ["/rig/front/tags: left out, because no calibration has a fitting name (left)"]
 
 
 def test_a_calibration_file_without_a_place_leaves_that_to_tf(makers, tmp_path):

@@ -22,7 +22,7 @@ _UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows a
 
 
 def _dump(content: Content) -> bytes:
-    """Write the objects as UTF-8 text; every number is read back as the same float."""
+    """Return the objects as UTF-8 text. A reader gets each number back as the same float."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(_COLUMNS)

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 
 def _dump(content: Content) -> bytes:
-    """Write the pose graph as text.
+    """Return the pose graph as text.
 
-    A vertex is a map_T_base of trajectory.txt. An edge is an odometry measurement. The first vertex of each connected part
-    is fixed. The information matrix of an edge is over x, y, z (m) and the rotation about x, y, z (rad), in the frame of
-    the edge's second pose, as GTSAM reads it.
+    Each map_T_base of trajectory.txt is a vertex, and each odometry measurement is an edge. The first vertex of each
+    connected part is fixed. The information matrix of an edge is over x, y, z (m) and the rotation about x, y, z (rad), in
+    the coordinate frame of the edge's second pose, as GTSAM reads it.
     """
     import numpy as np
 
@@ -30,7 +30,7 @@ def _dump(content: Content) -> bytes:
         )
     before = np.minimum(np.searchsorted(path.stamps, motions.before), max(len(path) - 2, 0))
     if not (np.array_equal(path.stamps[before], motions.before) and np.array_equal(path.stamps[before + 1], motions.after)):
-        raise OutputError("trajectory.txt and motions.parquet are not of one run: run again", where=str(content.out))
+        raise OutputError("trajectory.txt and motions.parquet are from different runs: run again", where=str(content.out))
     information = np.linalg.inv(motions.covariance)[:, *np.triu_indices(6)]
     lines = [f"VERTEX_SE3:QUAT {i} {numbers}" for i, numbers in enumerate(_numbers(path.poses))]
     lines += [f"FIX {i}" for i in np.setdiff1d(np.arange(len(path)), before + 1).tolist()]
@@ -40,7 +40,7 @@ def _dump(content: Content) -> bytes:
 
 
 def _numbers(poses: Floats, *more: Any) -> list[str]:
-    """Write x, y, z, the quaternion (x, y, z, w) and the columns of `more` (N, C), for each pose (N, 4, 4)."""
+    """Return a text for each pose (N, 4, 4): x, y, z, its quaternion (x, y, z, w), and its row of each array in `more`."""
     import numpy as np
 
     from objslam.core.geometry import quaternion

@@ -18,10 +18,10 @@ _METRE_DIGITS = 6  # Coordinates, m, have this many decimal places. 1e-6 m is fa
 
 
 def _dump(content: Content) -> bytes:
-    """Write the map as a FeatureCollection.
+    """Return the map as a FeatureCollection.
 
-    With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are m in
-    the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
+    With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are in m,
+    in the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
     above the ellipsoid is unknown. An unresolved object is a feature without a geometry.
     """
     datum, path = content.datum, content.path

@@ -21,13 +21,14 @@ _LATCHED = (
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
 """The offered QoS in the format of rosbag2: reliable and transient local, so that an RViz that joins late gets the map."""
-_LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows from this stamp, s. It has no stamps below 0.
+_LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s. It has no negative stamps.
 
 
 def _dump(content: Content) -> bytes:
-    """Write the objects, the markers and the path once, at the start, and the robot's pose at each stamp of the path.
+    """Return the content of the file.
 
-    One message contains all resolved objects with their covariances. Each chunk has a CRC.
+    The resolved objects with their covariances, the markers and the path have one message each, at the first stamp. The
+    robot's pose has a message at each stamp of the path. Each chunk has a CRC.
     """
     from mcap.writer import CompressionType, Writer
 
@@ -35,7 +36,7 @@ def _dump(content: Content) -> bytes:
 
     stamps = content.path.stamps
     if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < _LAST_STAMP:
-        raise OutputError("stamps that are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
+        raise OutputError("the stamps are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
     messages = MapMessages(content.objects.frame)
     start = float(stamps[0]) if len(stamps) else 0.0
     buffer = io.BytesIO()

@@ -19,9 +19,10 @@ _PROPERTIES = (
 
 
 def _dump(content: Content) -> bytes:
-    """Write one vertex per object: position (m), colour, id, label, and the largest standard deviation (m, 0 if unknown).
+    """Return a file with a vertex for each resolved object. A vertex has position (m), colour, id, label and sigma.
 
-    `label` is an index into the labels that are listed in the header's comments.
+    `label` is an index into the labels that the header's comments list. `sigma` is the standard deviation along the least
+    certain direction (m), or 0 if it is unknown.
     """
     import numpy as np
 

@@ -1,10 +1,11 @@
 """The process that logs the snapshots of a session to a viewer or a file.
 
-A hanging viewer blocks rerun's connection and the end of the connected process. This process can be killed.
+If a viewer hangs, rerun's connection blocks, and the process with this connection cannot end. Therefore the connection is in
+a process of its own, which the session can kill.
 
 Start: `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`. The process reads messages from
-stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if this is
-uncertain.
+stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if this
+is uncertain.
 """
 
 import argparse
@@ -69,7 +70,7 @@ def _connect(recording: Any, options: argparse.Namespace) -> None:
 
 
 def _delivered(recording: Any, parent: int) -> bool:
-    """Wait until the logged data have arrived; return False if they are lost, and exit if the session has ended."""
+    """Wait until the logged data have arrived. Return False if they are lost. Exit if the session has ended meanwhile."""
     while True:
         try:
             recording.flush(timeout_sec=1.0)
@@ -82,7 +83,7 @@ def _delivered(recording: Any, parent: int) -> bool:
 
 
 class LiveLog:
-    """Logs snapshots to a recording; only one thread may use it."""
+    """A logger that adds snapshots to a recording. Only one thread may use it."""
 
     def __init__(self, recording: Any) -> None:
         self._recording = recording
@@ -99,7 +100,7 @@ class LiveLog:
         self._view_point = None
 
     def show(self, shown: ShownSnapshot, frames: list[CameraFrame]) -> None:
-        """Log a snapshot and its frames."""
+        """Log a snapshot and its camera frames."""
         view_point = self._look(shown, frames)
         for frame in sorted(frames, key=lambda f: f.stamp):
             self._at(frame.stamp)
@@ -112,7 +113,7 @@ class LiveLog:
         self._recording.set_time(STAMP, **{"timestamp" if is_date(stamp) else "duration": stamp})
 
     def _look(self, shown: ShownSnapshot, frames: list[CameraFrame]) -> ViewPoint:
-        """Return the view point; send a new layout for a new camera, or if the map outgrows the old view."""
+        """Return the view point. Send a new layout if there is a new camera, or if the map outgrows the old view."""
         view_point, before = first_view_point(shown.map, shown.path), self._view_point
         places = np.concatenate([np.array([o.position for o in shown.map.objects]).reshape(-1, 3), shown.path])
         new = [f.camera for f in frames if f.camera.name not in self._cameras]
@@ -165,7 +166,10 @@ def _transform(pose: Floats) -> rr.Transform3D:
 
 
 def _rays(frame: CameraFrame, objects: ObjectMap, index: Ints) -> NDArray[np.float32]:
-    """Return the rays (B, 2, 3) of the boxes, from the camera to the distance of their objects."""
+    """Return the rays of the boxes as lines (B, 2, 3), m in map. `index` (B,) is the object of each box, or -1.
+
+    A ray starts at the camera and is as long as the distance to its object, or `_FREE_REACH` long without an object.
+    """
     directions, _ = undistort(frame.camera, (frame.boxes[:, :2] + frame.boxes[:, 2:]) / 2)
     origin = frame.map_T_camera[:3, 3]
     ahead = directions @ frame.map_T_camera[:3, :3].T

@@ -28,7 +28,7 @@ _MAX_WAITING = 4  # At most this many snapshots wait for the viewer. Beyond that
 _ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # The address of a viewer has this form.
 
 Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
-"""A function from a camera's name and a stamp, s, to an image, or None if there is no image."""
+"""A function that takes a camera's name and a stamp, s, and returns an image, or None if there is no image."""
 
 
 def open_view(where: str, say: Callable[[str], None], image: Image | None = None) -> LiveView:
@@ -37,7 +37,7 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
     Args:
         where: `window`, `web` for a browser, the name of a recording (.rrd), or the address of a viewer.
         say: receives a line with the address for the browser.
-        image: returns the images of frames.
+        image: finds the images of camera frames.
     """
     if where.endswith(".rrd"):
         return LiveView(file=Path(where), image=image)
@@ -55,10 +55,10 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
 
 
 class LiveView:
-    """Shows snapshots; if the viewer is too slow, snapshots are dropped and counted.
+    """A view that shows the snapshots of a session. If the viewer is too slow, snapshots are dropped and counted.
 
     A separate process logs the snapshots, and a thread feeds this process, so a hanging viewer cannot block the session or
-    its end. If the viewer is killed, the process retries its address every few seconds. A new viewer at this address
+    its end. If the viewer is killed, the process tries its address again every few seconds. A new viewer at this address
     receives the later snapshots.
     """
 
@@ -69,7 +69,7 @@ class LiveView:
 
         Args:
             file: the recording; it can be read at any time.
-            image: returns the images of frames; the thread of the view calls it.
+            image: finds the images of camera frames. The thread of the view calls this function.
             server: a viewer to stop at the end.
         Raises:
             ConfigError: the address is malformed.
@@ -105,7 +105,7 @@ class LiveView:
         self._thread.start()
 
     def show(self, snapshot: Snapshot) -> bool:
-        """Queue a snapshot and return at once, from any thread; False if an older snapshot was dropped."""
+        """Queue a snapshot and return at once; any thread may call this. Return False if an older snapshot was dropped."""
         with self._changed:
             full = len(self._waiting) >= _MAX_WAITING
             if full:
@@ -116,7 +116,7 @@ class LiveView:
         return not full
 
     def close(self, timeout: float = 3.0) -> None:
-        """Show the waiting snapshots for at most `timeout`, s, then end the process."""
+        """Wait at most `timeout`, s, until the waiting snapshots are shown, then end the process."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

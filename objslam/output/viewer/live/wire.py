@@ -30,13 +30,13 @@ class ShownSnapshot:
     map: ObjectMap
     path: Floats  # (n, 3) positions of the base, m in map, evenly chosen.
     base: Floats | None  # (4, 4) the newest map_T_base; None without keyframes.
-    numbers: dict[str, float]  # Counts of keyframes, rebuilds and missed snapshots ("unseen"), and times in s.
+    numbers: dict[str, float]  # Counts: keyframes, rebuilds, unseen snapshots. Times, s: lag; p50, p99 of an update.
     counters: dict[str, int]  # The number of accepted messages by kind.
     dropped: dict[str, int]  # The number of dropped messages by reason.
 
 
 def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
-    """Encode a snapshot as one message; `unseen` is the number of snapshots dropped before it."""
+    """Encode a snapshot as one message; `unseen` is the number of snapshots that were dropped before it."""
     frames, path, (p50, p99) = snapshot.frames, snapshot.path, snapshot.update
     numbers = {"lag": snapshot.lag, "p50": p50, "p99": p99, "unseen": unseen}
     numbers |= {"keyframes": snapshot.keyframes, "rebuilds": snapshot.rebuilds}
@@ -57,7 +57,7 @@ def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
 
 
 def read_snapshot(stream: BinaryIO) -> tuple[ShownSnapshot, list[CameraFrame]] | None:
-    """Read the next message of a stream: the snapshot and its frames; None at the end or if the message is cut off."""
+    """Return the snapshot and the camera frames of a stream's next message; None at the end or if the message is cut off."""
     start = stream.read(_LENGTH.size)
     if len(start) < _LENGTH.size:
         return None
