@@ -74,7 +74,10 @@ def test_the_corrected_log_has_the_same_keyframes(clean):
     values = vector(errors, {**ERRORS, "front.x": 0.1, "front.focal": 0.03})
     found, rays, _ = errors.at(values)
     again, again_rays, _ = measured(errors.corrected_log(values))
-    ours, theirs = np.isin(found.frame, again.frame), np.isin(again.frame, found.frame)  # one that leaves the path is dropped
+    ours, theirs = (
+        np.isin(found.frame, again.frame),
+        np.isin(again.frame, found.frame),
+    )  # one that leaves the path is dropped
     assert ours.sum() > 110
     assert_allclose(found.odom_T_base[ours], again.odom_T_base[theirs], atol=1e-9)
     assert_allclose(found.base_T_camera[ours], again.base_T_camera[theirs], atol=1e-9)

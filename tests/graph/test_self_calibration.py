@@ -30,7 +30,7 @@ ERRORS = {
 def drive(errors, seed=1, overrides=(), **changes):
     settings = load_settings(None, ("mode=joint", "depth.bias=0", *overrides))
     changes = {"frames": 300, "objects": 12, "classes": 12, "localization": None, "odometry": Odometry(), **changes}
-    log = simulate(preset("demo", pixel_sigma=3.0, **changes), seed)
+    log = simulate(preset("demo", **{"pixel_sigma": 3.0, **changes}), seed)
     log = add_shared_errors(log, errors)
     made = drive_of(log, settings)
     return made, shared_errors(log, made.keyframes, made.rays, settings)
@@ -51,11 +51,15 @@ def optimum(errors: SharedErrors, theta, made, start):
     return read_poses(found.values), places, found.cost_after, graph, found.values, measured
 
 
-@pytest.mark.parametrize("localization", [None, PoseNoise(xy=0.02, yaw=0.005)])
+@pytest.mark.parametrize("localization", [None, PoseNoise()])
 def test_the_reduced_system_is_that_of_solving_anew(localization):
-    """Brute force: solve at parameters that differ a little; the positions move as the sensitivity says."""
+    """Brute force: solve at parameters that differ a little; the positions move as the sensitivity says.
+
+    Without noise, because Gauss and Newton leave out the curvature of what does not fit, and of robust losses.
+    """
     more = ("calibration.focal=0.01", "calibration.translation=0.01")
-    made, errors = drive({}, overrides=more, frames=200, depth=DepthNoise(), missed=0.0, false=0.0, localization=localization)
+    exact = {"pixel_sigma": 0.0, "depth": DepthNoise(sigma=0, sigma_per_m=0), "odometry": PoseNoise(), "missed": 0.0}
+    made, errors = drive({}, overrides=more, frames=200, false=0.0, localization=localization, **exact)
     theta = np.zeros(len(errors.names))
     true = made.map_T_base @ made.keyframes.base_T_camera
     start = (made.keyframes.map_T_camera[0] @ inverse(true[0])) @ true, made.points
@@ -66,7 +70,7 @@ def test_the_reduced_system_is_that_of_solving_anew(localization):
     for k, step in enumerate(0.1 * errors.steps):
         ahead, behind = (optimum(errors, theta + s * step * np.eye(len(theta))[k], made, (poses, places)) for s in (1, -1))
         moved = (ahead[1] - behind[1]) / (2 * step)
-        assert_allclose(told[..., k], moved, atol=0.05 * np.abs(moved).max() + 1e-6, err_msg=errors.names[k])
+        assert_allclose(told[..., k], moved, atol=0.01 * np.abs(moved).max() + 1e-5, err_msg=errors.names[k])
         slope = (ahead[2] - behind[2]) / (2 * step)
         assert -system.gradient[k] == pytest.approx(slope, abs=0.1 * np.sqrt(system.information[k, k]), rel=0.1)
 
@@ -91,7 +95,7 @@ def test_what_bearings_do_not_tell_stays_at_its_prior_and_widens_the_map():
     found, held = solve(made, errors), solve(*drive(ERRORS, overrides=("calibration.scale=0",)))
     k = errors.names.index("odometry.scale")
     assert abs(found.calibration.values[k]) < 0.4 * 0.05
-    assert found.calibration.sigma[k] > 0.95 * 0.05
+    assert found.calibration.sigma[k] > 0.85 * 0.05
     assert not found.calibration.to_dict()["parameters"]["odometry.scale"]["observable"]
     away = found.positions - made.keyframes.map_T_base[0, :3, 3]
     distance = np.linalg.norm(away, axis=1)
