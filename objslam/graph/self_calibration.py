@@ -74,7 +74,7 @@ def calibrate(
         if signal is None:
             signal = _signal_shares(state, system, errors, remeasure, theta)
         curvature, covariance = _curvature(system.information, signal, prior)
-        step = np.linalg.solve(curvature, system.gradient - prior @ theta)
+        step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ theta), dtype=np.float64)
         if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
             break
         history = [*history[-_MEMORY:], (theta, step)]

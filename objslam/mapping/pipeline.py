@@ -20,6 +20,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import Progress, seen_something, solve
 from objslam.mapping.describe import describe, summarise
+from objslam.mapping.plausibility import warn_of_large_errors
 from objslam.mapping.reconstruction import reconstruct
 
 
@@ -45,6 +46,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     if errors is not None and estimate.calibration is not None:
         log = errors.corrected_log(estimate.calibration.values)
         cameras = tuple(c.camera for c in log.cameras)
+        warn_of_large_errors(estimate.calibration, ledger)
     objects, residual = describe(solution, cameras, settings)
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     path = log.localization or log.odometry
