@@ -59,30 +59,33 @@ class SharedErrors:
         """Return keyframes, rays and settings with the errors (P,) taken out.
 
         The noise of what is scaled is scaled with it. Otherwise a smaller world would fit the odometry better.
-        Keyframes stay on their path: a stamp that leaves it takes the path's end.
+        Keyframes stay on their path: a stamp that leaves it takes the nearest pose of the path.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
-        keyframes, rays = self.keyframes, self.rays
+        keyframes, rays, max_gap = self.keyframes, self.rays, self.settings.poses.max_gap
+        path = self.log.localization or self.log.odometry
+        assert path is not None
         stamps, base_T_camera, direction = keyframes.stamps.copy(), keyframes.base_T_camera.copy(), rays.direction
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
-            stamps[mine] += error.get(f"{one.camera.name}.clock", 0.0)
+            stamps[mine] = np.clip(
+                stamps[mine] + error.get(f"{one.camera.name}.clock", 0.0), path.stamps[0], path.stamps[-1]
+            )
             if one.mount is not None:
-                base_T_camera[mine] = _at_stamps(one.mount, stamps[mine])
+                base_T_camera[mine] = _at_stamps(one.mount, stamps[mine], max_gap)
             base_T_camera[mine] = _corrected_mount(base_T_camera[mine], error, one.camera.name)
             direction = _refocused(direction, mine[rays.keyframe], error.get(f"{one.camera.name}.focal", 0.0))
         odometry, localization = self._odometry(error), self.log.localization
         odom_T_base, gathered = keyframes.odom_T_base, keyframes.drift
         settings = _scaled_noise(self.settings, error)
-        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, stamps)
+        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, stamps, max_gap)
         if odometry is not None:
-            at = _at_stamps(odometry, stamps)
+            at = _at_stamps(odometry, stamps, max_gap)
             map_T_base = at if localization is None else map_T_base
             if odom_T_base is not None:
                 odom_T_base = inverse(odometry.poses[0]) @ at
-                if (
-                    drift
-                ):  # clocks that differ may change the order of frames: drift never shrinks from one keyframe to the next
+                if drift:
+                    # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
                     gathered = gathered_drift(odometry, np.maximum.accumulate(stamps), settings.odometry)
         moved = replace(
             keyframes,
@@ -209,6 +212,10 @@ def _corrected_camera(one: CameraLog, error: dict[str, float]) -> CameraLog:
     )
 
 
-def _at_stamps(path: Trajectory, stamps: Floats) -> Floats:
-    """Poses (Q, 4, 4) of a path at stamps (Q,); a stamp beyond an end of the path takes the pose there."""
-    return interpolate(path.stamps, path.poses, np.clip(stamps, path.stamps[0], path.stamps[-1]), np.inf)[0]
+def _at_stamps(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
+    """Poses (Q, 4, 4) of a path at stamps (Q,). A stamp beyond an end of the path, or in a gap, takes the nearest pose."""
+    known = np.clip(stamps, path.stamps[0], path.stamps[-1])
+    after = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
+    before, after = path.stamps[after - 1], path.stamps[np.minimum(after, len(path) - 1)]
+    nearest = np.where(known - before < after - known, before, after)
+    return interpolate(path.stamps, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]

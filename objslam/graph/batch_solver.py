@@ -131,7 +131,7 @@ def solve_joint(
                 trace.take(attempt)
     calibrated = None
     if errors is not None and theta is not None:
-        calibrated = calibrate(errors, remeasure, association, found, theta)
+        calibrated = calibrate(errors, remeasure, association, found, theta, trace)
         measured, found = calibrated.measured, calibrated.found
         keyframes, rays = measured.keyframes, measured.rays
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
@@ -156,6 +156,7 @@ def solve_joint(
     if calibrated is not None:
         by_error = calibrated.sensitivity
         covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
+        covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     return Estimate(
         map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
         positions=positions,

@@ -15,6 +15,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
 from objslam.core.geometry import exp_se3
+from objslam.core.trace import Trace
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
@@ -57,6 +58,7 @@ def calibrate(
     association: Association,
     found: JointSolution,
     theta: Floats,
+    trace: Trace | None = None,
 ) -> CalibratedSolution:
     """Estimate the shared errors from a joint solution at `theta` (P,).
 
@@ -89,8 +91,11 @@ def calibrate(
         else:
             break
         theta, state = other, trial.settled()
+        if trace is not None:
+            trace.base_T_camera = state.measured.keyframes.base_T_camera
+            trace.iteration("solve", state.cost, state.map_T_camera, state.positions)
     nothing = np.zeros(len(state.used), dtype=bool)
-    final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, None)
+    final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
     system = state.reduced(errors, theta)
     assert signal is not None

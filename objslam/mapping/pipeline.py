@@ -94,7 +94,7 @@ def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Fl
     way = log.odometry
     if settings.mode == "fixed" or way is None or way is path:
         return after
-    before, _ = interpolate(way.stamps, way.poses, keyframes.stamps, float("inf"))
+    before, _ = interpolate(way.stamps, way.poses, np.clip(keyframes.stamps, way.stamps[0], way.stamps[-1]), float("inf"))
     smooth = correct_path(way, keyframes.stamps, before, map_T_base)
     poses, inside = interpolate(way.stamps, smooth.poses, path.stamps, settings.poses.max_gap)
     return Trajectory(path.stamps, np.where(inside[:, None, None], poses, after.poses))

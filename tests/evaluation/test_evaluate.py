@@ -90,6 +90,7 @@ def test_exact_counts() -> None:
         "truth_id": 0,
         "label": "cup",
         "error": pytest.approx(0.3),
+        "mahalanobis": None,
         "offset": pytest.approx([0.3, 0, 0]),
     }
     assert data["missed_objects"] == [{"truth_id": 2, "label": "book"}, {"truth_id": 3, "label": "cup"}]
@@ -365,23 +366,29 @@ def test_where_no_truth_was_found_is_named(tmp_path: Path) -> None:
 def test_honest_covariances_hold_the_truth_as_often_as_they_say(kind):
     """Errors drawn from the covariances themselves: 95 % of them lie inside, and the median is chi-squared's."""
     rng = np.random.default_rng(5)
-    count = 3000
-    places = rng.uniform(-50, 50, (count, 3))
-    roots = rng.normal(scale=0.02, size=(count, 3, 3))
-    pose, scale = lift_se2(np.array([3.0, -2.0, 0.7])), 1.0 if kind != "sim2" else 1.3
-    pose = np.eye(4) if kind == "none" else pose
-    errors = (roots @ rng.standard_normal((count, 3, 1)))[..., 0]
-    labels = [f"thing {i}" for i in range(count)]
-    turned = (places + errors) @ pose[:3, :3].T * scale + pose[:3, 3]
-    covariances = scale**2 * pose[:3, :3] @ roots @ np.swapaxes(roots, 1, 2) @ pose[:3, :3].T
-    objects = [
-        dataclasses.replace(an_object(i, label, at), covariance=c)
-        for i, (label, at, c) in enumerate(zip(labels, turned, covariances, strict=True))
-    ]
-    data = evaluate(ObjectMap(tuple(objects)), a_truth(places, labels), align=kind).to_dict()
-    assert data["matched"] == count
-    assert data["inside_95"] == pytest.approx(0.95, abs=0.02)
-    assert data["mahalanobis_median"] == pytest.approx(1.386, rel=0.1)
+    pose = np.eye(4) if kind == "none" else lift_se2(np.array([3.0, -2.0, 0.7]))
+    scale = 1.3 if kind == "sim2" else 1.0
+    labels, squared = [f"thing {i}" for i in range(40)], []
+    for _ in range(30):
+        places = rng.uniform(-50, 50, (40, 3))
+        roots = rng.normal(scale=0.02, size=(40, 3, 3))
+        errors = (roots @ rng.standard_normal((40, 3, 1)))[..., 0]
+        turned = (places + errors) @ pose[:3, :3].T * scale + pose[:3, 3]
+        covariances = scale**2 * pose[:3, :3] @ roots @ np.swapaxes(roots, 1, 2) @ pose[:3, :3].T
+        map_ = ObjectMap(
+            tuple(
+                dataclasses.replace(an_object(i, labels[i], at), covariance=c)
+                for i, (at, c) in enumerate(zip(turned, covariances, strict=True))
+            )
+        )
+        data = evaluate(map_, a_truth(places, labels), align=kind).to_dict()
+        assert data["matched"] == 40
+        one = [row["mahalanobis"] for row in data["objects"]]
+        assert data["inside_95"] == pytest.approx(np.mean(np.array(one) < 5.991))
+        assert data["mahalanobis_median"] == pytest.approx(np.median(one))
+        squared += one
+    assert np.mean(np.array(squared) < 5.991) == pytest.approx(0.95, abs=0.02)
+    assert np.median(squared) == pytest.approx(1.386, rel=0.1)
 
 
 def test_objects_without_a_covariance_say_nothing_of_honesty():
