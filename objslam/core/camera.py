@@ -133,8 +133,8 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     flat: Floats = np.asarray(cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0], float)
     valid = _misses(camera, flat, pixels) < 0.1
-    if not valid.all():
-        missed = np.flatnonzero(~valid & np.isfinite(pixels).all(axis=1))
+    missed = np.flatnonzero(~valid & np.isfinite(pixels).all(axis=1))
+    if len(missed):
         flat[missed] = _undistort_newton(camera, pixels[missed])
         valid[missed] = _misses(camera, flat[missed], pixels[missed]) < 0.1
     directions = np.column_stack([np.where(valid[:, None], flat, 0.0), np.ones(len(flat))])
