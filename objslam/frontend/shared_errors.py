@@ -215,7 +215,7 @@ def _corrected_camera(one: CameraLog, error: dict[str, float]) -> CameraLog:
 def _at_stamps(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
     """Poses (Q, 4, 4) of a path at stamps (Q,). A stamp beyond an end of the path, or in a gap, takes the nearest pose."""
     known = np.clip(stamps, path.stamps[0], path.stamps[-1])
-    after = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
-    before, after = path.stamps[after - 1], path.stamps[np.minimum(after, len(path) - 1)]
+    index = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
+    before, after = path.stamps[index - 1], path.stamps[np.minimum(index, len(path) - 1)]
     nearest = np.where(known - before < after - known, before, after)
     return interpolate(path.stamps, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]

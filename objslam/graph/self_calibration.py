@@ -71,6 +71,7 @@ def calibrate(
     state = _State.of(remeasure(theta), association, found.map_T_camera, found.positions, found.used)
     history: list[tuple[Floats, Floats]] = []
     signal: Floats | None = None
+    steps = 0
     for _ in range(_ROUNDS):
         system = state.reduced(errors, theta)
         if signal is None:
@@ -90,7 +91,7 @@ def calibrate(
             target, history = theta + (target - theta) / 2, []
         else:
             break
-        theta, state = other, trial.settled()
+        theta, state, steps = other, trial.settled(), steps + 1
         if trace is not None:
             trace.base_T_camera = state.measured.keyframes.base_T_camera
             trace.iteration("solve", state.cost, state.map_T_camera, state.positions)
@@ -102,7 +103,7 @@ def calibrate(
     _, covariance = _curvature(system.information, signal, prior)
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     sensitivity[state.landmarks] = system.sensitivity[: 3 * len(state.landmarks)].reshape(-1, 3, len(theta))
-    final = replace(final, cost_before=found.cost_before, iterations=found.iterations + final.iterations)
+    final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     return CalibratedSolution(Calibration(errors.names, theta, covariance, errors.prior), state.measured, final, sensitivity)
 
 

@@ -15,6 +15,7 @@ from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, Tr
 from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START
 
 MODES = ["fixed", "joint"]
@@ -383,3 +384,27 @@ def test_the_path_after_is_as_smooth_as_the_odometry_where_the_localisation_jitt
     # and it goes through the poses that were solved
     at, _ = interpolate(after.stamps, after.poses, result.keyframes.stamps, np.inf)
     np.testing.assert_allclose(at[:, :3, 3], result.map_T_base[:, :3, 3], atol=0.01)
+
+
+def test_a_shared_error_far_beyond_its_prior_names_its_cause():
+    log = small_log(localization=None, frames=200)
+    log = add_shared_errors(log, {f"{log.cameras[0].camera.name}.tilt": 0.09})
+    result = run(log, "joint")
+    (warning,) = [text for text in result.summary["warnings"] if "shared error" in text]
+    assert "tilt" in warning
+    assert "base_T_camera" in warning
+    assert not any(
+        "shared error" in text for text in run(small_log(localization=None, frames=200), "joint").summary["warnings"]
+    )
+
+
+def test_boxes_of_a_mirrored_image_are_said_to_be_wrong_input():
+    def mirrored(camera):
+        found, width = camera.detections, camera.camera.width
+        boxes = found.boxes[:, [2, 1, 0, 3]] * [-1, 1, -1, 1] + [width - 1, 0, width - 1, 0]
+        return replace(camera, detections=replace(found, boxes=boxes))
+
+    log = simulate(preset("demo", objects=15, classes=5), 0)
+    for said, one in ((False, log), (True, replace(log, cameras=tuple(map(mirrored, log.cameras))))):
+        result = run(one, "fixed")
+        assert any("the input may be wrong" in text for text in result.summary["warnings"]) == said
