@@ -43,9 +43,11 @@ def tangent_basis(direction: Floats) -> Floats:
 
 
 def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
-    """Return the pairs of a ray and a landmark that accepts its label whose squared bearing deviation is at most `gate`.
+    """Return the possible matches of a ray and a landmark.
 
-    pose: (R, 6, 6) covariance of the camera pose of each ray, rotations about the map axes (rad) before the position (m).
+    The landmark accepts the label of the ray, and the squared bearing deviation of the match is at most `gate`.
+    pose: (R, 6, 6) covariance of the camera pose of each ray. Its first three rows are rotations about the map axes (rad),
+    its last three the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]

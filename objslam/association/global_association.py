@@ -195,7 +195,8 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
-    If both of two neighbours fail, only the weaker one is dropped, because it may hold boxes of the stronger one.
+    Of two neighbours of one label that both fail, the one with more rays is kept in this call. It may get back its boxes
+    from the other one, and is then judged again.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():

@@ -99,9 +99,11 @@ def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints
 
 
 class _Scorer:
-    """A scorer of points by rays of one label, sorted so that the best ray of a frame is a running maximum over slices.
+    """Scores points by the rays of one label.
 
-    Slice k holds the k-th ray of every frame with more than k rays. Frames with more rays come first.
+    The rays are sorted into slices. Slice k, from 0, holds one more ray of every frame with more than k rays. Frames with
+    more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices gives the
+    best support in each frame.
     """
 
     def __init__(self, obs: Observations, search: Search) -> None:

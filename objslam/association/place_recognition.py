@@ -39,7 +39,11 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Return the landmarks. Their covariances grow with the distance from the pivot (2,) m, because neighbourhoods bend."""
+    """Make a constellation of all these landmarks, with larger covariances.
+
+    The added standard deviation grows with the horizontal distance from the pivot (2,) m, because a neighbourhood may be
+    deformed.
+    """
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
 
@@ -111,9 +115,13 @@ def recognise_place(
 
 @dataclass(frozen=True)
 class _Problem:
-    """A matching problem. offset, target: (N, 3) and (M, 3) m, landmarks here and there relative to the pivot. information:
-    (N, M, 3, 3) m^-2 of the difference between two landmarks. spread: (N, M) m, its horizontal standard deviation. peak:
-    (N, M) the largest gain of each pair. weight: (3, 3) inverse of the prior."""
+    """The matching problem of `recognise_place`, with N landmarks `here` and M landmarks `there`.
+
+    offset: (N, 3) m, the landmarks `here` relative to the pivot. target: (M, 3) m, the landmarks `there` relative to the
+    pivot. Each pair has a landmark of both. information: (N, M, 3, 3) m^-2, the inverse covariance of the position
+    difference of a pair. spread: (N, M) m, the horizontal standard deviation of this difference. peak: (N, M) the gain of a
+    pair without a difference. weight: (3, 3) inverse of the prior. prior, possible: as in `recognise_place`.
+    """
 
     offset: Floats
     target: Floats

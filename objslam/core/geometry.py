@@ -76,7 +76,8 @@ def log_se3(pose: Floats) -> Floats:
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """Return for `log_se3` of poses (N, 4, 4) the norms of the rotation half (N,), rad, and the translation half (N,), m."""
+    """Return two norms of `log_se3` of poses (N, 4, 4): of its rotation half (N,), rad, and of its translation half (N,),
+    m."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))

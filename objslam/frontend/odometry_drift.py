@@ -32,10 +32,10 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
 
 
 def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:
-    """Return the covariance (N-1, 6, 6) that each step between poses (N, 4, 4) adds, in the frame of these poses.
+    """Return the covariance (N-1, 6, 6), rotation first, of the noise of each step between poses (N, 4, 4).
 
-    The noise of a step grows with its length and with its angle. On a planar path it affects x, y and yaw. On other paths it
-    affects all six directions.
+    It is in the frame `start`. The noise of a step grows with its length and with its angle. On a planar path it affects x,
+    y and yaw of the base. On other paths it affects all six directions.
     """
     turn, way = twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
     angle, x, y = _step_variances(turn, way, settings)

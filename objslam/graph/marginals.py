@@ -11,8 +11,9 @@ from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
-"""The standard deviation (m) of the prior that holds undetermined landmarks. A larger value holds them less. With too large
-a value, the linear system is indeterminate. A landmark that only this prior holds counts as undetermined."""
+"""The standard deviation (m) of the prior that each landmark gets if the linear system is indeterminate. A landmark counts
+as undetermined if, with this prior, its largest standard deviation is still above half of this value. A larger value holds
+the landmarks less. With too large a value, the system stays indeterminate."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:

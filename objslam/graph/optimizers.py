@@ -86,10 +86,10 @@ def levenberg_marquardt(
 def graduated(
     graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, max_iterations: int, known_inliers: Sequence[int]
 ) -> Optimum:
-    """Minimise by graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020) over LM.
+    """Minimise by graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020).
 
-    known_inliers: indices of the factors that are never rejected (odometry, priors). SolveError if the linear system is
-    indeterminate, or if the cost is not finite.
+    Levenberg-Marquardt solves each of its steps. known_inliers: indices of the factors that are never rejected (odometry,
+    priors). SolveError if the linear system is indeterminate, or if the cost is not finite.
     """
     inner = gtsam.LevenbergMarquardtParams()
     inner.setMaxIterations(max_iterations)

@@ -46,7 +46,7 @@ class Counters:
         self.ledger.drop(reason, count, where)
 
     def drop_frame(self, frame: FrameMessage, reason: str) -> None:
-        """Count a dropped frame, and count its boxes for the same reason."""
+        """Count a dropped frame under `reason`, and its boxes under the same text with "boxes" in place of "frames"."""
         self.drop(reason, f"camera {frame.camera}, stamp {frame.stamp:.3f}")
         self.drop(reason.replace("frames", "boxes", 1), count=len(frame))
 

@@ -271,7 +271,10 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
 
 
 def _may_be_by_label(settings: Settings, rays: Rays) -> bool:
-    """Return whether every label may be one object: by the settings, or because no frame has two boxes of one label."""
+    """Return whether to try one object for each label.
+
+    association.method decides. If it is auto, this is tried if no keyframe has two rays of one label.
+    """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
     pairs = np.stack([rays.keyframe, rays.label])

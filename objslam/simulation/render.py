@@ -29,7 +29,7 @@ TRUTH_BOXES = "boxes.jsonl"
 """The name of the file of true boxes, which is in the groundtruth folder. Its format is that of detections.jsonl."""
 ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
 LOOK_AHEAD = 4
-"""The factor by which images are smaller when a room is tried than when the drive is rendered."""
+"""When a room is tried, the width and the height of the images are divided by this factor."""
 
 
 class BoxLimits(Section):

@@ -113,7 +113,7 @@ class DriveSettings(CourseSettings):
         if 2 * self.margin >= min(self.room):
             raise ValueError("the margin leaves no room for the path")
         if self.moving and not self.objects and not self.placed:
-            raise ValueError("moving objects have the classes of standing objects, so a drive needs one of these")
+            raise ValueError("moving objects take their classes from standing objects, so set objects or placed")
         if not self.cameras or len({camera.name for camera in self.cameras}) < len(self.cameras):
             raise ValueError("a drive needs cameras, and each needs a name of its own")
         return self

@@ -49,7 +49,10 @@ def flags(kind: type[Any]) -> dict[str, tuple[Any, Option]]:
 
 
 def unused(options: Any, kind: type[Any], taken: Collection[str]) -> list[str]:
-    """Return the flags of the options of `kind` that differ from the default, except those of the fields in `taken`."""
+    """Return the flags of the options that are set but not used.
+
+    These are the fields of the class `kind` that are not in `taken` and whose value is not the default.
+    """
     called = {name: option.flag.partition("/")[0] for name, (_, option) in flags(kind).items()}
     return [
         called.get(field.name, f"--{field.name.replace('_', '-')}")

@@ -20,7 +20,7 @@ _MAX_RAYS = 240  # The map shows at most this many static rays of each kind. Lin
 
 
 def log_rays(recording: Any, result: RunResult) -> None:
-    """Log the rays at each stamp, `map/rays/now`, and a static sample of each kind, `map/rays/KIND`."""
+    """Log the rays at each stamp to `map/rays/now`, and a static sample of each kind of ray to `map/rays/KIND`."""
     strips = np.stack([result.origins, ray_ends(result)], axis=1).astype(np.float32)
     for kind, mask in ray_kinds(result).items():
         index = sample(mask, _MAX_RAYS)

@@ -46,7 +46,8 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """If the file states its message count, raise `lost` to the number of missing messages, which is then complete."""
+        """If the file states its message count, increase `lost` to at least the stated count minus the messages read, and
+        set `complete`."""
         if self.expected is not None:
             self.lost = max(self.lost, self.expected - self.messages)
             self.complete = True

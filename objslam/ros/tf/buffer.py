@@ -57,15 +57,15 @@ class _Edge:
             return self.poses[-1]
         after = bisect_left(self.stamps, stamp)
         if after == len(self.stamps):
-            raise UnknownTransform("not yet", later=True)
+            raise UnknownTransform("is not known yet", later=True)
         if self.stamps[after] == stamp:
             return self.poses[after]
         if after == 0:
-            raise UnknownTransform("no longer known", later=False)
+            raise UnknownTransform("is no longer known", later=False)
         near = slice(after - 1, after + 1)
         pose, valid = interpolate(np.array(self.stamps[near]), np.array(self.poses[near]), np.array([stamp]), MAX_GAP)
         if not valid[0]:
-            raise UnknownTransform("not known", later=False)
+            raise UnknownTransform("is not known", later=False)
         return np.asarray(pose[0])
 
 
