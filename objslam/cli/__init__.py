@@ -5,6 +5,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from objslam.cli.calibrate import calibrate
 from objslam.cli.config import config_dump
 from objslam.cli.console import say
 from objslam.cli.convert import convert
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 app.command()(run)
 app.command()(live)
+app.command()(calibrate)
 app.command(name="eval")(evaluate_result)
 app.command(name="report")(report_result)
 app.command()(view)

@@ -31,13 +31,20 @@ Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
+CalibrationFile = Annotated[
+    Path | None, typer.Option("--calibration", help="File of `objslam calibrate` with the robot's shared errors.")
+]
 
 
-def settings_of(mode: str | None, config: Path | None, set_: list[str] | None) -> Settings:
-    """Load the settings from --config, --set and --mode. --set overrides --mode, and --mode overrides --config."""
+def settings_of(mode: str | None, config: Path | None, set_: list[str] | None, calibration: Path | None = None) -> Settings:
+    """Load the settings from --config, --set, --calibration and --mode. --set overrides the other flags, and these override
+    --config."""
+    import yaml
+
     from objslam.config import load_settings
 
-    return load_settings(config, ((f"mode={mode}",) if mode else ()) + tuple(set_ or ()))
+    more = () if calibration is None else (f"calibration.file={yaml.safe_dump(str(calibration.resolve()))}",)
+    return load_settings(config, ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ()))
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from objslam.cli.console import console, progress_bar, report, say
-from objslam.cli.options import Config, DetectorModel, Mode, Out, Set, settings_of, with_options
+from objslam.cli.options import CalibrationFile, Config, DetectorModel, Mode, Out, Set, settings_of, with_options
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
@@ -30,12 +30,13 @@ def run(
     *,
     options: SourceOptions,
     detector: DetectorModel = None,
+    calibration: CalibrationFile = None,
 ) -> None:
     """Map the objects of a log and write a result folder."""
     from objslam.core.diagnostics import Ledger
     from objslam.output.result_folder import output_folder
 
-    settings = settings_of(mode, config, set_)
+    settings = settings_of(mode, config, set_, calibration)
     ledger = Ledger()
     with output_folder(out):
         run_log(read(log, ledger, options), settings, ledger, out, detector)
@@ -78,7 +79,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")
     console().print(table)
     if calibration := result.summary.get("calibration"):
-        console().print(_calibration_table(calibration))
+        console().print(calibration_table(calibration))
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(
@@ -90,7 +91,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     say(f"wrote {out}")
 
 
-def _calibration_table(calibration: dict[str, Any]) -> Table:
+def calibration_table(calibration: dict[str, Any]) -> Table:
     """Return a table of the shared errors, and which of them the log does not determine."""
     from rich.table import Table
 

@@ -10,6 +10,8 @@ class CalibrationSettings(Section):
 
     use: Literal["auto"] | bool = "auto"
     """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off."""
+    file: str | None = None
+    """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it."""
     scale: NotNegative = 0.03
     """share by which all ways of the odometry are too long or too short."""
     turn_scale: NotNegative = 0.05

@@ -1,5 +1,6 @@
 """Errors that all measurements of a robot share: what they are called, and what a solve found of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -64,6 +65,26 @@ class Calibration:
         return {"parameters": parameters, "traded_off": [list(pair) for pair in self.traded_off()]}
 
 
+def combine(calibrations: Sequence[Calibration]) -> Calibration:
+    """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
+
+    A parameter that only some of the logs have is taken from these logs.
+    """
+    names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
+    sigma = {name: prior for one in calibrations for name, prior in zip(one.names, one.prior, strict=True)}
+    prior = np.array([sigma[name] for name in names])
+    information, vector = np.diag(prior**-2.0), np.zeros(len(names))
+    for one in calibrations:
+        at = np.array([names.index(name) for name in one.names])
+        own = np.linalg.inv(one.covariance) - np.diag(one.prior**-2.0)
+        size, axes = np.linalg.eigh((own + own.T) / 2)
+        own = (axes * np.maximum(size, 0.0)) @ axes.T  # rounding must not take information away
+        information[np.ix_(at, at)] += own
+        vector[at] += np.linalg.inv(one.covariance) @ one.values
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return Calibration(names, covariance @ vector, covariance, prior)
+
+
 class CalibratedMeasurements(Protocol):
     """What a log measured, as a function of the shared errors that are taken out of it."""
 
@@ -72,8 +93,12 @@ class CalibratedMeasurements(Protocol):
         """The P parameters."""
 
     @property
+    def mean(self) -> Floats:
+        """(P,) expected values of the parameters before the solve."""
+
+    @property
     def prior(self) -> Floats:
-        """(P,) standard deviations of the parameters before the solve."""
+        """(P, P) covariance of the parameters before the solve."""
 
     @property
     def steps(self) -> Floats:

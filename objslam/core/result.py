@@ -5,6 +5,7 @@ from typing import Any
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
@@ -21,7 +22,7 @@ class RunResult:
     object. weight: (R,) robust weight in [0, 1]. summary: the content of summary.json. path, path_after: the path of the log
     at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image files of each
     camera. surface: the surroundings, None without depth images. surface_before: the same at the poses before the
-    estimation, if the settings ask for it.
+    estimation, if the settings ask for it. calibration: the shared errors that were estimated, None if none were.
     """
 
     map: ObjectMap
@@ -42,3 +43,4 @@ class RunResult:
     images: tuple[Images | None, ...] = ()
     surface: Surface | None = None
     surface_before: Surface | None = None
+    calibration: Calibration | None = None

@@ -5,6 +5,7 @@ The parameters change what was measured, never the factors that a graph makes of
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -17,6 +18,7 @@ from objslam.core.camera import Camera
 from objslam.core.geometry import interpolate, inverse, make_pose
 from objslam.core.types import CameraLog, Images, Keyframes, Log, Rays, Trajectory
 from objslam.frontend.odometry_drift import gathered_drift
+from objslam.io.calibration_yaml import load_calibration
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -32,7 +34,8 @@ _AXES = ("roll", "tilt", "yaw")
 class SharedErrors:
     """The measurements of some keyframes of a log, as a function of its shared errors.
 
-    keyframes, rays: as the log measured them. names: the P parameters. prior: (P,) standard deviations.
+    keyframes, rays: as the log measured them. names: the P parameters. mean: (P,) and prior: (P, P), their expected
+    values and covariance before the solve.
     """
 
     log: Log
@@ -40,6 +43,7 @@ class SharedErrors:
     rays: Rays
     settings: Settings
     names: tuple[str, ...]
+    mean: Floats
     prior: Floats
 
     @property
@@ -51,9 +55,8 @@ class SharedErrors:
     def bounds(self) -> Floats:
         """(P,) the largest absolute values."""
         clock = self.settings.calibration.max_clock
-        return np.array(
-            [clock if kind(n) == "clock" else _MOST_SIGMAS * s for n, s in zip(self.names, self.prior, strict=True)]
-        )
+        widest = np.abs(self.mean) + _MOST_SIGMAS * np.sqrt(np.diagonal(self.prior))
+        return np.array([clock if kind(n) == "clock" else w for n, w in zip(self.names, widest.tolist(), strict=True)])
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings with the errors (P,) taken out.
@@ -142,17 +145,24 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
     auto = settings.mode == "joint" and keyframes.odom_T_base is not None
     if not (auto if of.use == "auto" else of.use):
         return None
-    prior: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
     if keyframes.odom_T_base is not None:
-        prior |= {f"odometry.{name}": getattr(of, name) for name in ("scale", "turn_scale", "turn_bias")}
+        sigmas |= {f"odometry.{name}": getattr(of, name) for name in ("scale", "turn_scale", "turn_bias")}
     for index, one in enumerate(log.cameras):
         if (keyframes.camera == index).any():
-            prior |= {f"{one.camera.name}.{name}": getattr(of, name) for name in ("clock", *_AXES, "focal")}
-            prior |= {f"{one.camera.name}.{axis}": of.translation for axis in "xyz"}
+            sigmas |= {f"{one.camera.name}.{name}": getattr(of, name) for name in ("clock", *_AXES, "focal")}
+            sigmas |= {f"{one.camera.name}.{axis}": of.translation for axis in "xyz"}
     if np.isfinite(rays.range).any():
-        prior["range_scale"] = of.range_scale
-    prior = {name: sigma for name, sigma in prior.items() if sigma > 0}
-    return SharedErrors(log, keyframes, rays, settings, tuple(prior), np.array(list(prior.values()))) if prior else None
+        sigmas["range_scale"] = of.range_scale
+    known = None if of.file is None else load_calibration(Path(of.file))
+    names = tuple(name for name, sigma in sigmas.items() if sigma > 0)
+    if not names:
+        return None
+    mean, prior = np.zeros(len(names)), np.diag([sigmas[name] ** 2 for name in names])
+    if known is not None:
+        here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
+        mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
+    return SharedErrors(log, keyframes, rays, settings, names, mean, prior)
 
 
 def _scaled_noise(settings: Settings, error: dict[str, float]) -> Settings:

@@ -14,6 +14,7 @@ from objslam.core.geometry import angles_off, inverse
 from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
+from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
@@ -97,7 +98,7 @@ def solve_joint(
     If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
     solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
     start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors,
-    which are then estimated from theta (P,) on, or from 0. Their covariance enters the covariance of the objects.
+    which are then estimated from theta (P,) on, or from their mean. Their covariance enters the covariance of the objects.
     """
 
     def remeasure(values: Floats) -> Measurements:
@@ -108,7 +109,7 @@ def solve_joint(
     if errors is None:
         measured = Measurements.of(keyframes, _share_bias(rays, association, settings), settings)
     else:
-        theta = np.zeros(len(errors.names)) if theta is None else theta
+        theta = errors.mean if theta is None else theta
         measured = remeasure(theta)
     keyframes, rays = measured.keyframes, measured.rays
     positions = np.full((association.count, 3), np.nan)
@@ -131,9 +132,13 @@ def solve_joint(
                 trace.take(attempt)
     calibrated = None
     if errors is not None and theta is not None:
-        calibrated = calibrate(errors, remeasure, association, found, theta, trace)
-        measured, found = calibrated.measured, calibrated.found
-        keyframes, rays = measured.keyframes, measured.rays
+        try:
+            calibrated = calibrate(errors, remeasure, association, found, theta, trace)
+        except (SolveError, np.linalg.LinAlgError) as error:
+            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+        else:
+            measured, found = calibrated.measured, calibrated.found
+            keyframes, rays = measured.keyframes, measured.rays
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
 
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))

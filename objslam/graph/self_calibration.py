@@ -67,7 +67,13 @@ def calibrate(
     Raises:
         SolveError: a linear system has no single solution.
     """
-    prior = np.diag(errors.prior**-2.0)
+    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
+    sigma = np.sqrt(np.diagonal(errors.prior))
+
+    def deviation(values: Floats) -> float:
+        """Half the squared Mahalanobis distance of parameters (P,) from their prior."""
+        return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
+
     state = _State.of(remeasure(theta), association, found.map_T_camera, found.positions, found.used)
     history: list[tuple[Floats, Floats]] = []
     signal: Floats | None = None
@@ -77,16 +83,16 @@ def calibrate(
         if signal is None:
             signal = _signal_shares(state, system, errors, remeasure, theta)
         curvature, covariance = _curvature(system.information, signal, prior)
-        step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ theta), dtype=np.float64)
+        step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
         if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
             break
         history = [*history[-_MEMORY:], (theta, step)]
-        target = _accelerated(history, errors.prior)
-        before = state.cost + 0.5 * float(theta @ prior @ theta)
+        target = _accelerated(history, sigma)
+        before = state.cost + deviation(theta)
         for _ in range(_HALVINGS + 1):
             other = np.clip(target, -errors.bounds, errors.bounds)
             trial = state.moved(system, other - theta, remeasure(other))
-            if trial.cost + 0.5 * float(other @ prior @ other) <= before:
+            if trial.cost + deviation(other) <= before:
                 break
             target, history = theta + (target - theta) / 2, []
         else:
@@ -104,7 +110,7 @@ def calibrate(
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     sensitivity[state.landmarks] = system.sensitivity[: 3 * len(state.landmarks)].reshape(-1, 3, len(theta))
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
-    return CalibratedSolution(Calibration(errors.names, theta, covariance, errors.prior), state.measured, final, sensitivity)
+    return CalibratedSolution(Calibration(errors.names, theta, covariance, sigma), state.measured, final, sensitivity)
 
 
 def _signal_shares(

@@ -84,6 +84,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         images=tuple(c.rgb for c in log.cameras),
         surface=surface,
         surface_before=before,
+        calibration=estimate.calibration,
     )
 
 

@@ -19,8 +19,11 @@ from waiting import LIMIT, pause, wait_for
 
 from objslam import __version__
 from objslam.cli import main
-from objslam.config import Settings
+from objslam.config import Odometry, Settings
+from objslam.io.calibration_yaml import load_calibration
 from objslam.results.read import load_map, load_trajectory
+from objslam.simulation import preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START
 from objslam.sources.log_folder import write_log_folder
 
@@ -773,3 +776,32 @@ def test_a_camera_without_a_picture_of_its_own_is_left_to_others(objslam, tmp_pa
     write_log_folder(replace(log, cameras=(camera_log, blind)), tmp_path / "log")
     assert objslam("run", tmp_path / "log", "-o", tmp_path / "out", *LEAN).code == 0
     assert len(load_map(tmp_path / "out").resolved()) == 4
+
+
+def test_calibrate_and_run_with_what_it_found(objslam, tmp_path):
+    drives = []
+    for seed in (1, 2):
+        log = simulate(preset("demo", classes=12, frames=200, localization=None, odometry=Odometry()), seed)
+        write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / f"log{seed}")
+        drives.append(str(tmp_path / f"log{seed}"))
+    file = tmp_path / "robot.yaml"
+    done = objslam("calibrate", *drives, "-o", str(file), "--set", "association.method=by_label")
+    assert done.code == 0, done.err
+    assert "from 2 logs" in done.out
+    found = load_calibration(file)
+    clock = found.names.index("front.clock")
+    assert abs(found.values[clock] - 0.15) < 4 * found.sigma[clock]
+    done = objslam("run", drives[0], "--mode", "joint", "--calibration", str(file), "-o", str(tmp_path / "out"))
+    assert done.code == 0, done.err
+    parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
+    assert parameters["front.clock"]["prior_sigma"] == pytest.approx(found.sigma[clock], rel=1e-6)
+    assert "front.clock" in done.out
+
+
+def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
+    log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
+    write_log_folder(log, tmp_path / "log")
+    done = objslam("calibrate", str(tmp_path / "log"), "-o", str(tmp_path / "robot.yaml"))
+    assert done.code == 2
+    assert "nothing to calibrate" in done.err
+    assert not (tmp_path / "robot.yaml").exists()

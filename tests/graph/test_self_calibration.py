@@ -14,6 +14,7 @@ from objslam.graph.batch_solver import solve_joint
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.shared_error_jacobian import reduce_system
 from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 
@@ -82,7 +83,7 @@ def test_the_errors_of_a_log_are_found(ranged):
     true = np.array([ERRORS.get(name, 0.0) for name in errors.names])
     deviation = np.abs(found.calibration.values - true) / found.calibration.sigma
     assert (deviation < 4).all(), dict(zip(errors.names, deviation, strict=True))
-    told = found.calibration.sigma < 0.5 * errors.prior
+    told = found.calibration.sigma < 0.5 * np.sqrt(np.diagonal(errors.prior))
     assert {"front.clock", "front.yaw", "front.tilt", "front.roll"} <= set(np.array(errors.names)[told])
     align = "se2" if ranged else "sim2"
     assert np.median(made.object_errors(found.positions, align)) < 0.7 * np.median(
@@ -113,3 +114,15 @@ def test_without_errors_the_map_is_as_good():
     made, errors = drive({}, depth=DepthNoise())
     found, plain = solve(made, errors), solve(made, None)
     assert np.median(made.object_errors(found.positions)) < 1.2 * np.median(made.object_errors(plain.positions)) + 0.01
+
+
+def test_a_calibration_of_before_is_where_the_next_solve_begins(tmp_path):
+    made, errors = drive(ERRORS, depth=DepthNoise())
+    first = solve(made, errors).calibration
+    (tmp_path / "calibration.yaml").write_text(dump_calibration(first))
+    again, known = drive(ERRORS, seed=2, depth=DepthNoise(), overrides=(f"calibration.file={tmp_path}/calibration.yaml",))
+    assert_allclose(known.mean, first.values)
+    second = solve(again, known).calibration
+    assert (second.sigma < first.sigma).all()
+    true = np.array([ERRORS.get(name, 0.0) for name in second.names])
+    assert (np.abs(second.values - true) < 4 * second.sigma).all()
