@@ -21,8 +21,8 @@ _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables ar
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of the ratio between the area in which the landmark may appear and the area of the ray's
-    own noise. cost: the sum of deviation, vague and the range cost."""
+    degrees of freedom). vague: 2 ln of an area ratio: the image area in which the landmark may appear, divided by the area
+    of the ray's own noise. cost: the sum of deviation, vague and the range cost."""
 
     ray: Ints
     landmark: Ints

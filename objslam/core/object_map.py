@@ -23,7 +23,7 @@ class MapObject:
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
     the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
     rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
-    existence are None if all boxes of a label are one object.
+    existence are None if the run took all boxes of a label as one object.
     """
 
     id: int

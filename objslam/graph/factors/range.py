@@ -19,7 +19,7 @@ def ranges(keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise) -> li
 def along_ray(
     origins: Floats, directions: Floats, measured: Floats, sigmas: Floats, landmark: Ints
 ) -> list[gtsam.NonlinearFactor]:
-    """Return one factor with Huber's loss for each of the distances `measured` (R,), m, of L(landmark) along a fixed ray.
+    """Return one factor with Huber's loss for each range: the measured (R,) distance, m, of a landmark along a fixed ray.
 
     Origins (R, 3) and directions (R, 3) are in map. A factor does not restrict the landmark across its ray.
     """

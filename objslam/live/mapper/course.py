@@ -128,9 +128,10 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """Make the piece that puts a pose of its path at start_T_base on the course.
+        """Return the piece of the course whose path has `pose` (4, 4) where the course has start_T_base (4, 4).
 
-        own: (6, 6) drift of this pose on its path. drift: (6, 6) drift of start_T_base. noise: (rad, m) of this relation.
+        own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which the
+        two poses may differ.
         """
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)

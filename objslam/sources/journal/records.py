@@ -88,7 +88,10 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """The offsets of a session from now on. clock: the seconds added to stamps. odometry: start_T_odom (4, 4)."""
+    """A record of offsets, which apply to all later messages of a session.
+
+    clock: s, added to stamps. odometry: start_T_odom (4, 4).
+    """
 
     clock: float
     odometry: Floats

@@ -112,10 +112,10 @@ def _gather(
     rectified: bool | None,
     alone: bool,
 ) -> CameraTopics:
-    """Find all topics of a camera. They have its frame_id.
+    """Find all topics of a camera, which are the topics with the frame_id `frame` of the camera.
 
-    If it is the only camera (`alone`), it also takes topics with other frame_ids that the user chose. Without a frame_id of
-    its own, it takes topics with any frame_id.
+    If this is the only camera (`alone`), topics with another frame_id belong to it as well, if the user chose them. If the
+    camera has no frame_id, all topics of its roles belong to it.
     """
 
     def mine(role: str) -> list[Topic]:

@@ -38,7 +38,7 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 @dataclass(frozen=True)
 class Assembly:
-    """A recording whose topics have their roles.
+    """A recording after each topic got its role, for example the odometry or the images of a camera.
 
     cast: the topics of every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is
     base_T_camera over time, None if the camera does not move. problems: the errors that make a run impossible. left_out: the

@@ -84,7 +84,7 @@ def _main_pair(topic: Topic) -> tuple[str, str]:
 
 
 def _from_topic(topic: Topic, what: str, ledger: Ledger) -> _Odometry:
-    """Read the poses of a topic. Messages with other frames than most messages are dropped and counted."""
+    """Read the poses of a topic. A message that names other coordinate frames than most messages is dropped and counted."""
     pair = _main_pair(topic)
     for other, rows in topic.poses.items():
         if other != pair:
