@@ -130,8 +130,8 @@ class Course:
     ) -> _Piece:
         """Return the piece of the course whose path has `pose` (4, 4) where the course has start_T_base (4, 4).
 
-        own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which the
-        two poses may differ.
+        own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which
+        the two poses may differ.
         """
         start_T_path = start_T_base @ inverse(pose)
         to_start, to_base = adjoint(start_T_path), adjoint(start_T_base)
