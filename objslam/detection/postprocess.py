@@ -53,6 +53,8 @@ def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
 
     if len(boxes) == 0:
         return np.zeros(0, dtype=np.int64)
+    # OpenCV separates labels by an offset of the largest coordinate, which fails for boxes with negative coordinates.
+    boxes = boxes - np.tile(boxes.reshape(-1, 2).min(axis=0), 2)
     sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxesBatched(sized, scores.astype(np.float32), label.astype(np.int32), -1.0, iou)  # type: ignore[arg-type]
     return np.asarray(kept, dtype=np.int64).reshape(-1)

@@ -42,6 +42,7 @@ def suppress_slowly(boxes, scores, label, limit):
     return kept
 
 
+@example(347, 46, 0.0)  # boxes with negative coordinates
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.0, 0.3, 0.5, 0.9, 1.0]))
 def test_suppression_is_greedy_within_each_class(seed, count, limit):
     rng = np.random.default_rng(seed)
