@@ -10,6 +10,7 @@ from objslam.cli.config import config_dump
 from objslam.cli.console import say
 from objslam.cli.convert import convert
 from objslam.cli.demo import demo
+from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
 from objslam.cli.info import info
@@ -35,6 +36,7 @@ app.command()(view)
 app.command()(demo)
 app.command()(convert)
 app.command()(info)
+app.command()(doctor)
 app.command()(export)
 config_app = typer.Typer(no_args_is_help=True, help="Print the settings.")
 config_app.command("dump")(config_dump)

@@ -1,13 +1,22 @@
 """The command `objslam calibrate`, which estimates the shared errors of a robot from one or several logs."""
 
+from __future__ import annotations
+
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from objslam.cli.console import console, progress_bar, report, say
 from objslam.cli.options import Config, Set, settings_of, with_options
 from objslam.sources import SourceOptions
+
+if TYPE_CHECKING:
+    from objslam.config import Settings
+    from objslam.core.calibration import Calibration
+    from objslam.core.diagnostics import Ledger
+    from objslam.mapping.alternation import Progress
 
 
 @with_options
@@ -18,28 +27,78 @@ def calibrate(
     set_: Set = None,
     *,
     options: SourceOptions,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing calibration file.")] = False,
 ) -> None:
-    """Estimate the errors that all measurements of a robot share, for `objslam run --calibration FILE`."""
+    """Estimate the errors that all measurements of a robot share, for `objslam run --calibration FILE`.
+
+    A log that cannot be used is left out with a warning.
+    """
     from objslam.cli.run import calibration_table
     from objslam.core.calibration import combine
     from objslam.core.diagnostics import Ledger
-    from objslam.errors import ConfigError
+    from objslam.errors import ConfigError, LogError, ObjslamError
     from objslam.io.atomic_files import write_file
-    from objslam.io.calibration_yaml import dump_calibration
-    from objslam.mapping import pipeline
-    from objslam.sources import read
+    from objslam.io.calibration_yaml import dump_calibration, load_calibration
 
     settings = settings_of("joint", config, ["output.recording=false", *(set_ or ())])
-    found = []
-    with progress_bar() as show:
-        for log in logs:
-            ledger = Ledger()
-            result = pipeline.run(read(log, ledger, options), settings, ledger, show)
-            report(ledger)
-            if result.calibration is None:
-                raise ConfigError("nothing to calibrate", where=str(log), hint="the log needs odometry, and calibration.use")
-            found.append(result.calibration)
+    if settings.mode != "joint" or settings.calibration.use is False:
+        raise ConfigError("nothing to calibrate", hint="calibrate needs mode=joint, and not calibration.use=false")
+    _check_target(out, overwrite)
+    found: list[Calibration] = []
+    failed: list[ObjslamError] = []
+    for number, log in enumerate(logs, start=1):
+        ledger = Ledger()
+        try:
+            with progress_bar() as show:
+                found.append(_calibrate(log, options, settings, ledger, _of_several(show, number, len(logs))))
+        except ObjslamError as error:
+            if len(logs) == 1:
+                raise
+            failed.append(error)
+            ledger.warn(f"{log} is left out: {error}")
+        report(ledger)
+    if not found:
+        raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
+    if settings.calibration.file is not None:  # what it knew is the prior of all logs, also of what they do not have
+        known = load_calibration(Path(settings.calibration.file))
+        found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)
     console().print(calibration_table(together.to_dict()))
     write_file(out, dump_calibration(together).encode())
-    say(f"wrote {out}, from {len(logs)} log{'' if len(logs) == 1 else 's'}")
+    left_out = f" ({len(failed)} left out)" if failed else ""
+    used = len(logs) - len(failed)
+    say(f"wrote {out}, from {used} log{'' if used == 1 else 's'}{left_out}")
+
+
+def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: Ledger, show: Progress) -> Calibration:
+    """Return the shared errors of one log. ConfigError if it has no odometry, SolveError if the estimation fails."""
+    from objslam.errors import ConfigError, SolveError
+    from objslam.mapping import pipeline
+    from objslam.sources import read
+
+    log = read(path, ledger, options)
+    if log.odometry is None and settings.calibration.use == "auto":
+        hint = "the log needs odometry, or give --set calibration.use=true"
+        raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
+    result = pipeline.run(log, settings, ledger, show)
+    if result.calibration is None:
+        raise SolveError("nothing was calibrated", where=str(path), hint="; ".join(ledger.warnings) or None)
+    return result.calibration
+
+
+def _of_several(show: Progress, number: int, total: int) -> Progress:
+    """Return a progress that also says which of several logs is in work."""
+    prefix = f"log {number} of {total}: " if total > 1 else ""
+    show(f"{prefix}reading", 0, 0)
+    return lambda stage, done, count: show(f"{prefix}{stage}", done, count)
+
+
+def _check_target(out: Path, overwrite: bool) -> None:
+    """Raise OutputError if the file cannot be written, or is there already and shall not be replaced."""
+    from objslam.errors import OutputError
+
+    if out.is_dir() or not out.absolute().parent.is_dir():
+        what = "this is a folder" if out.is_dir() else "its folder does not exist"
+        raise OutputError(f"cannot write: {what}", where=str(out), hint="name a file with -o")
+    if out.exists() and not overwrite:
+        raise OutputError("there is a file already", where=str(out), hint="name another one with -o, or give --overwrite")

@@ -56,6 +56,5 @@ def demo(
         shown = " ".join(["objslam run", str(log), "-o", str(out / mode), "--mode", mode, *(f"--set {c}" for c in changes)])
         say(f"\n[bold]{shown}{f' --detector {model}' if model else ''}[/]", markup=True)
         run_log(read(log, ledger), settings, ledger, out / mode, model)
-        # A map from odometry alone starts at the first odometry pose, so its pose in the room is unknown.
-        print_evaluation(out / mode, None, "none" if poses == "localization" else "se2", 0.5)
+        print_evaluation(out / mode, None, "auto", 0.5)
     say(f"\nopen {out / 'joint' / 'map.png'}, or run: objslam view {out / 'joint'}")

@@ -11,7 +11,7 @@ from objslam.cli.console import console
 from objslam.cli.options import Align, Radius
 
 if TYPE_CHECKING:
-    from objslam.evaluation.alignment import Alignment
+    from objslam.evaluation.evaluate_folder import AlignmentChoice
 
 
 def evaluate_result(
@@ -20,16 +20,16 @@ def evaluate_result(
         Path | None,
         typer.Option("--truth", help="objects.json, or a groundtruth, log or result folder. Default: the truth of the log."),
     ] = None,
-    align: Align = "none",
+    align: Align = "auto",
     radius: Radius = 0.5,
 ) -> None:
     """Compare a result with the ground truth: matched, missed and false objects, errors of the positions and of the path."""
     print_evaluation(out, truth, align, radius)
 
 
-def print_evaluation(out: Path, truth: Path | None, align: Alignment, radius: float) -> None:
+def print_evaluation(out: Path, truth: Path | None, align: AlignmentChoice, radius: float) -> None:
     """Evaluate a result folder, write evaluation.json into it, and print the table."""
-    from objslam.evaluation.evaluate import evaluate_folder, write_evaluation
+    from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
     from objslam.evaluation.table import evaluation_table
 
     found = evaluate_folder(out, truth, align=align, radius=radius)

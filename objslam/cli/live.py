@@ -11,7 +11,7 @@ import typer
 
 from objslam.cli.console import say
 from objslam.cli.live_drive import LatestObjects, drive, finish
-from objslam.cli.options import Config, Out, Set, settings_of, with_options
+from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
@@ -51,6 +51,7 @@ def live(
     journal: WithJournal = True,
     *,
     options: LiveOptions,
+    calibration: CalibrationFile = None,
     publish: Publish = False,
     view: View = None,
 ) -> None:
@@ -66,7 +67,7 @@ def live(
         raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")
     if resume and not journal:
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
-    settings = settings_of("joint", config, set_)
+    settings = settings_of("joint", config, set_, calibration)
     _say_what_is_not_used(source, options, speed, publish)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
     recording = None if source in ADAPTERS else _read(Path(source), options)

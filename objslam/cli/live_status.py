@@ -54,9 +54,10 @@ class _Rates:
         }
         shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
         resolved = len(snapshot.map.resolved())
+        calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
             f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
-            f"{snapshot.keyframes} keyframes | {times(snapshot, ' | ')}"
+            f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, ' | ')}"
             f"{resolved} objects, {len(snapshot.map) - resolved} unresolved"
         )
 

@@ -24,8 +24,12 @@ Mode = Annotated[
     typer.Option("--mode", help="fixed (the default): keep the poses. joint: estimate poses and objects together."),
 ]
 Align = Annotated[
-    Literal["none", "se2", "sim2"],
-    typer.Option("--align", help="Align the map with the truth. se2: a rigid motion in the plane. sim2: also a scale."),
+    Literal["auto", "none", "se2", "sim2", "se3", "sim3"],
+    typer.Option(
+        "--align",
+        help="Align the map with the truth. se2, se3: a rigid motion in the plane or in space. sim2, sim3: also a scale. "
+        "auto: none if a localisation fixed the map's frame, else se2, or se3 if the path is not planar.",
+    ),
 ]
 Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
@@ -38,13 +42,18 @@ CalibrationFile = Annotated[
 
 def settings_of(mode: str | None, config: Path | None, set_: list[str] | None, calibration: Path | None = None) -> Settings:
     """Load the settings from --config, --set, --calibration and --mode. --set overrides the other flags, and these override
-    --config."""
+    --config. A calibration file is read too, so that a wrong one fails before a long log is read."""
     import yaml
 
     from objslam.config import load_settings
 
     more = () if calibration is None else (f"calibration.file={yaml.safe_dump(str(calibration.resolve()))}",)
-    return load_settings(config, ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ()))
+    settings = load_settings(config, ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ()))
+    if settings.calibration.file is not None:
+        from objslam.io.calibration_yaml import load_calibration
+
+        load_calibration(Path(settings.calibration.file))
+    return settings
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -80,6 +80,9 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     console().print(table)
     if calibration := result.summary.get("calibration"):
         console().print(calibration_table(calibration))
+    if noise := result.summary.get("noise"):
+        found = {name: factor for name, factor in noise.items() if name != "shrinkage"}
+        say("noise, times that of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(

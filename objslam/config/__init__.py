@@ -4,6 +4,7 @@ describes objects, rooms or robots is a setting, and a value that only a method 
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector
 from objslam.config.mapping import AssociationSettings, Live, Loss, Odometry, Output, Reconstruction, Triangulation
+from objslam.config.noise import Noise
 from objslam.config.section import Device, NotNegative, Positive, Section
 from objslam.config.settings import Settings, dump_settings, is_file, load_settings
 
@@ -14,6 +15,7 @@ __all__ = [
     "Device",
     "Live",
     "Loss",
+    "Noise",
     "NotNegative",
     "Odometry",
     "Output",

@@ -6,12 +6,14 @@ from objslam.config.section import NotNegative, Positive, Section
 
 
 class CalibrationSettings(Section):
-    """Errors that all measurements of a robot share. A number is a prior standard deviation, and 0 holds its error at 0."""
+    """Errors that all measurements of a robot share. A number is a prior standard deviation, and 0 holds its error at 0
+    or at the value of `file`."""
 
     use: Literal["auto"] | bool = "auto"
     """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off."""
     file: str | None = None
-    """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it."""
+    """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it. An error in it that is
+    not estimated has the value of the file."""
     scale: NotNegative = 0.03
     """share by which all ways of the odometry are too long or too short."""
     turn_scale: NotNegative = 0.05

@@ -186,6 +186,9 @@ class Live(Section):
     """Number of frames that should show an object before it can be dropped. A larger value keeps false objects longer."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
+    calibrate_from: Annotated[int, Field(ge=0)] = 200
+    """Number of keyframes at which the session first estimates the shared errors. It does so again each time that there are
+    half as many keyframes more. 0 leaves it to the end of the session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""

@@ -9,7 +9,9 @@ from pydantic import BaseModel, Field, ValidationError
 
 from objslam.config import mapping
 from objslam.config.calibration import CalibrationSettings
+from objslam.config.checks import Checks
 from objslam.config.detector import Detector
+from objslam.config.noise import Noise
 from objslam.config.section import Section
 from objslam.errors import ConfigError
 
@@ -27,6 +29,8 @@ class Settings(Section):
     planar: mapping.Planar = mapping.Planar()
     localization: mapping.Localization = mapping.Localization()
     calibration: CalibrationSettings = CalibrationSettings()
+    noise: Noise = Noise()
+    checks: Checks = Checks()
     association: mapping.AssociationSettings = mapping.AssociationSettings()
     triangulation: mapping.Triangulation = mapping.Triangulation()
     fixed: mapping.Fixed = mapping.Fixed()

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
 OBSERVABLE = 0.8
@@ -15,6 +16,12 @@ OBSERVABLE = 0.8
 observable. Chosen so that the log has told at least as much as half of what the prior said."""
 TRADED_OFF = 0.9
 """The correlation from which on two parameters are said to trade off; larger says so more rarely."""
+
+SCALES = ("scale", "turn_scale", "range_scale", "focal")
+"""The kinds of parameters that are shares: what was measured is multiplied by 1 + the value."""
+MOST_SCALE = 0.5
+"""The largest absolute value of a share. A larger bound lets a solve shrink what was measured towards nothing. A robot that
+errs by half has wrong units, not a calibration."""
 
 UNITS = {"clock": "s", "turn_bias": "rad/s", "yaw": "rad", "tilt": "rad", "roll": "rad", "x": "m", "y": "m", "z": "m"}
 """The unit of each kind of parameter; the others are shares."""
@@ -30,18 +37,31 @@ class Calibration:
     """The estimate of the shared errors: measurements with these values taken out agree best.
 
     names: P names, as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P).
-    prior: (P,) standard deviations before the solve; their mean is 0.
+    prior: (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None for 0.
+    prior_covariance: (P, P) before the solve, None if the parameters were independent.
     """
 
     names: tuple[str, ...]
     values: Floats
     covariance: Floats
     prior: Floats
+    prior_mean: Floats | None = None
+    prior_covariance: Floats | None = None
 
     @property
     def sigma(self) -> Floats:
         """(P,) standard deviations."""
         return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def expected(self) -> Floats:
+        """(P,) values that were expected before the solve."""
+        return np.zeros(len(self.names)) if self.prior_mean is None else self.prior_mean
+
+    @property
+    def before(self) -> Floats:
+        """(P, P) covariance before the solve."""
+        return np.diag(self.prior**2) if self.prior_covariance is None else self.prior_covariance
 
     def traded_off(self) -> list[tuple[str, str]]:
         """Return the pairs of parameters that the log cannot tell apart: their errors are highly correlated."""
@@ -50,39 +70,58 @@ class Calibration:
         return [(self.names[i], self.names[j]) for i, j in zip(first, second, strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what summary.json holds: each parameter with value, sigma, prior, unit and whether the log tells it."""
-        sigma = self.sigma
+        """Return what summary.json holds: each parameter with value, sigma, prior, unit and whether the log tells it.
+
+        A later run that is given the file starts from the values and the covariance.
+        """
+        sigma, expected = self.sigma, self.expected
         parameters = {
             name: {
                 "value": float(self.values[i]),
                 "sigma": float(sigma[i]),
+                "prior_mean": float(expected[i]),
                 "prior_sigma": float(self.prior[i]),
                 "unit": UNITS.get(kind(name), "share"),
                 "observable": bool(sigma[i] <= OBSERVABLE * self.prior[i]),
             }
             for i, name in enumerate(self.names)
         }
-        return {"parameters": parameters, "traded_off": [list(pair) for pair in self.traded_off()]}
+        return {
+            "parameters": parameters,
+            "traded_off": [list(pair) for pair in self.traded_off()],
+            "covariance": self.covariance.tolist(),
+            "prior_covariance": self.before.tolist(),
+        }
 
 
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
     """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
 
-    A parameter that only some of the logs have is taken from these logs.
+    A parameter that only some of the logs have is taken from these logs. Its prior is that of the first of them, given the
+    parameters that are known from the logs before.
     """
     names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
-    sigma = {name: prior for one in calibrations for name, prior in zip(one.names, one.prior, strict=True)}
-    prior = np.array([sigma[name] for name in names])
-    information, vector = np.diag(prior**-2.0), np.zeros(len(names))
+    prior, prior_vector, told, told_vector = (np.zeros((len(names),) * axes) for axes in (2, 1, 2, 1))
+    known = np.zeros(len(names), dtype=bool)
     for one in calibrations:
         at = np.array([names.index(name) for name in one.names])
-        own = np.linalg.inv(one.covariance) - np.diag(one.prior**-2.0)
+        before = np.linalg.inv(one.before)
+        own = np.linalg.inv(one.covariance) - before
         size, axes = np.linalg.eigh((own + own.T) / 2)
         own = (axes * np.maximum(size, 0.0)) @ axes.T  # rounding must not take information away
-        information[np.ix_(at, at)] += own
-        vector[at] += np.linalg.inv(one.covariance) @ one.values
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    return Calibration(names, covariance @ vector, covariance, prior)
+        told[np.ix_(at, at)] += own
+        told_vector[at] += (own + before) @ one.values - before @ one.expected
+        # The chain rule: p(new | known) = p(new, known) / p(known), where all of it is from the prior of this log.
+        there = np.flatnonzero(known[at])
+        new = before.copy()
+        new[np.ix_(there, there)] -= np.linalg.inv(one.before[np.ix_(there, there)])
+        prior[np.ix_(at, at)] += new
+        prior_vector[at] += before @ one.expected
+        prior_vector[at[there]] -= np.linalg.solve(one.before[np.ix_(there, there)], one.expected[there])
+        known[at] = True
+    covariance, before = (np.asarray(np.linalg.inv(part), dtype=np.float64) for part in (prior + told, prior))
+    values, expected = covariance @ (prior_vector + told_vector), before @ prior_vector
+    return Calibration(names, values, covariance, np.sqrt(np.diagonal(before)), expected, before)
 
 
 class CalibratedMeasurements(Protocol):
@@ -91,6 +130,14 @@ class CalibratedMeasurements(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """The P parameters."""
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the run, with the nominal noise."""
+
+    @property
+    def rays(self) -> Rays:
+        """The rays as they were measured, with the nominal noise."""
 
     @property
     def mean(self) -> Floats:
@@ -107,6 +154,27 @@ class CalibratedMeasurements(Protocol):
     @property
     def bounds(self) -> Floats:
         """(P,) the largest absolute values of the parameters."""
+
+    @property
+    def noise(self) -> NoiseFactors:
+        """The noise that the measurements have."""
+
+    @property
+    def unknown_noise(self) -> frozenset[str]:
+        """The kinds of noise that are estimated, of `rays`, `ranges` and `odometry`."""
+
+    @property
+    def size_told(self) -> float:
+        """From 0 to 1, how far ranges or absolute poses tell the size of the map, and not the odometry."""
+
+    def with_noise(self, noise: NoiseFactors) -> Self:
+        """Return the same with other noise."""
+
+    def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
+        """Return keyframes and settings whose odometry has nominal noise only along, only across, only in turning, or none.
+
+        The last ones have the noise that is not the odometry's. values: (P,) the errors taken out.
+        """
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return the measurements with the errors (P,) taken out, and the settings of their noise.

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import Calibration
+from objslam.core.noise import NoiseFactors
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,7 @@ class Estimate:
     no object weighs 0. cost_before: error of the graph where the first solve starts. cost_after: error of the graph at the
     optimum of the last solve. For Eq. 1 the error is the sum of distances, m.
     calibration: the shared errors that were estimated, or None. The poses belong to measurements without these errors.
+    noise: the noise that was estimated beside them, None without an estimate.
     """
 
     map_T_base: Floats
@@ -29,3 +31,4 @@ class Estimate:
     cost_after: float
     iterations: int
     calibration: Calibration | None = None
+    noise: NoiseFactors | None = None

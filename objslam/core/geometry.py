@@ -11,6 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Bools, Floats
 
+_ON_A_LINE = 1e-9
+"""The second singular value of two point sets' products, as a share of the first, up to which the points count as on a line.
+A larger share calls more points so. Rounding leaves about 1e-15."""
+
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
     """Make poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), m."""
@@ -177,22 +181,25 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     return result, valid
 
 
-def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "se3"]) -> tuple[Floats, float]:
+def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "se3", "sim3"]) -> tuple[Floats, float]:
     """Return the pose (R, t) (4, 4) and the scale that align source points (N, 3) with target points (N, 3) (Umeyama 1991).
 
     Then scale * R @ source + t is nearest to target in least squares. The kind `none` gives the identity. `se2` estimates
-    the yaw and the whole translation. `sim2` adds a scale. `se3` estimates the full rotation. With fewer than 2 points (3
-    for `se3`), only the translation is estimated.
+    the yaw and the whole translation, and `se3` the full rotation. `sim2` and `sim3` add a scale. R is never a reflection.
+    With fewer than 2 points (3 for `se3` and `sim3`), only the translation is estimated. Points on a line leave the rotation
+    about the line open. Then R is the smallest of the best rotations.
     """
     if kind == "none" or len(source) == 0:
         return np.eye(4), 1.0
     mean_s, mean_t = source.mean(axis=0), target.mean(axis=0)
     a, b = source - mean_s, target - mean_t
     rotation, scale = np.eye(3), 1.0
-    if kind == "se3":
+    if kind in ("se3", "sim3"):
         if len(source) >= 3:
-            u, _, vt = np.linalg.svd(b.T @ a)
-            rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+            rotation, shared = _best_rotation(a, b)
+            spread = float((a**2).sum())
+            if kind == "sim3" and spread > 0 and shared > 0:
+                scale = shared / spread
     elif len(source) >= 2:
         dot = float((a[:, :2] * b[:, :2]).sum())
         cross = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
@@ -201,6 +208,15 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
         if kind == "sim2" and spread > 0:
             scale = float(np.hypot(dot, cross)) / spread
     return make_pose(rotation, mean_t - scale * rotation @ mean_s), scale
+
+
+def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
+    """Return the rotation (3, 3) that maximises the sum of products of rotated points `a` with `b` (N, 3), and this sum."""
+    u, size, vt = np.linalg.svd(b.T @ a)
+    if size[0] > 0 and size[1] <= _ON_A_LINE * size[0]:
+        return Rotation.align_vectors(u[:, :1].T, vt[:1])[0].as_matrix(), float(size[0])
+    sign = np.sign(np.linalg.det(u @ vt))
+    return u @ np.diag([1.0, 1.0, sign]) @ vt, float(size[0] + size[1] + sign * size[2])
 
 
 def widest_angle(directions: Floats) -> float:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
@@ -37,7 +38,7 @@ class Snapshot:
     rebuilt. lag: the time, s, from the arrival of the newest message until the map contains it. update: the median and the
     99th percentile of the time, s, from the push of a message to the updated map. counters: how many messages of each kind
     were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
-    image.
+    image. calibration: the shared errors that the session takes out of its measurements, None if it takes out none.
     """
 
     stamp: float
@@ -50,3 +51,4 @@ class Snapshot:
     counters: dict[str, int] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
     frames: tuple[CameraFrame, ...] = ()
+    calibration: Calibration | None = None

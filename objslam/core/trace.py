@@ -18,18 +18,28 @@ Stage = Literal["grow", "solve"]
 
 
 @dataclass(frozen=True)
+class Parameters:
+    """The shared errors at one step: P names, values (P,) in the unit of each, and sigma (P,), their standard deviations."""
+
+    names: tuple[str, ...]
+    values: Floats
+    sigma: Floats
+
+
+@dataclass(frozen=True)
 class Iteration:
     """The state after one step of a solver.
 
     stage: `grow` adds keyframes to the graph, `solve` is one step of Levenberg-Marquardt. cost: the error of the graph.
     path: (k, 3) m, the robot in map at the first k keyframes, which are in the graph.
-    positions: (N, 3) m, NaN for an object that is not in the graph.
+    positions: (N, 3) m, NaN for an object that is not in the graph. parameters: the shared errors, if this step moved them.
     """
 
     stage: Stage
     cost: float
     path: NDArray[np.float32]
     positions: NDArray[np.float32]
+    parameters: Parameters | None = None
 
 
 @dataclass(frozen=True)
@@ -56,10 +66,13 @@ class Trace:
     rounds: list[Round] = field(default_factory=list)
     _iterations: list[Iteration] = field(default_factory=list)
 
-    def iteration(self, stage: Stage, cost: float, map_T_camera: Floats, positions: Floats) -> None:
+    def iteration(
+        self, stage: Stage, cost: float, map_T_camera: Floats, positions: Floats, parameters: Parameters | None = None
+    ) -> None:
         """Add one step of a solver, with the camera poses (k, 4, 4) of the first k keyframes and object positions (N, 3)."""
         path = (map_T_camera @ inverse(self.base_T_camera[: len(map_T_camera)]))[:, :3, 3]
-        self._iterations.append(Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32)))
+        step = Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32), parameters)
+        self._iterations.append(step)
 
     def aside(self) -> Trace:
         """Return an empty trace for an attempt that may be discarded."""

@@ -3,8 +3,25 @@
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.geometry import interpolate, inverse
+from objslam.core.geometry import interpolate, inverse, log_se3
 from objslam.core.types import Trajectory
+
+_SPAN = 0.4
+"""The time, s, over which a speed is taken. A longer time smooths more. Chosen to span several poses of slow odometry."""
+
+
+def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
+    """Return the speed, m/s, and the turn rate to the left, rad/s, of a path at stamps (K,).
+
+    Both are means over 0.4 s. At an end of the path, the time is shorter. A path of one pose has no speed.
+    """
+    begin, end = (np.clip(stamps + half, path.stamps[0], path.stamps[-1]) for half in (-_SPAN / 2, _SPAN / 2))
+    before, after = (interpolate(path.stamps, path.poses, at, np.inf)[0] for at in (begin, end))
+    twist = log_se3(inverse(before) @ after)
+    span = end - begin
+    moved = np.stack([np.linalg.norm(twist[:, 3:], axis=1), twist[:, 2]])
+    speed, turn = np.divide(moved, span, out=np.zeros_like(moved), where=span > 0)
+    return speed, turn
 
 
 def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats) -> Trajectory:

@@ -150,13 +150,19 @@ class Log:
     truth: Truth | None = None
     path: Path | None = None
 
+    @property
+    def robot_path(self) -> Trajectory | None:
+        """The poses that frames are placed by: the localisation if it has poses, else the odometry, None without both."""
+        return next((path for path in (self.localization, self.odometry) if path is not None and len(path)), None)
+
 
 @dataclass(frozen=True)
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of
-    this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
+    stamps: (K,) s, non-decreasing. If different clock offsets of several cameras were taken out, this holds for each camera
+    alone. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
+    base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
     localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
     absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
     None without odometry. drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the same

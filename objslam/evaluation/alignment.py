@@ -2,24 +2,31 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.geometry import align, inverse, lift_se2
+from objslam.core.geometry import align, inverse, lift_se2, make_pose
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory, Truth, TruthObject
 
-Alignment = Literal["none", "se2", "sim2"]
-"""The alignment of a map with the truth: none, se2 (yaw and translation), or sim2 (yaw, translation and scale)."""
+Alignment = Literal["none", "se2", "sim2", "se3", "sim3"]
+"""The alignment of a map with the truth: none, se2 (yaw and translation), se3 (rotation and translation), and sim2 and sim3,
+which also have a scale."""
 
 _MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pairs of them are sampled.
-_DRAWN_PAIRS = 200_000  # The number of sampled pairs of correspondences.
+_DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences.
+_MAX_TRIPLED = 80  # If there are more correspondences than this, triples of them are sampled. 80 have 82,160 triples.
 _MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
+_MAX_TRIPLES = 1000  # The same for transforms that lay three objects onto three. Fewer do, as more of them are right.
 _MAX_REFINED = 12  # This many of the best initial transforms are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
-_SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 searches.
+_ON_A_LINE = 0.02
+"""The sine of a triangle's angle up to which its corners count as on a line. A larger one leaves more triples out. Chosen so
+that position errors of 2 % of a triangle's length do not turn it about its longest side."""
+_SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 and sim3 search.
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,8 @@ def align_objects(
         same: (N, M), True if two objects may be the same.
         radius: maximum distance of a match in m.
         start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
-            with the same labels and a similar distance. At most 3,000 of these alignments are sampled, with a fixed seed.
+            with the same labels and a similar distance. The kinds se3 and sim3 align triples of objects likewise. At most
+            3,000 of these alignments (1,000 of triples) are sampled, with a fixed seed.
     """
     if kind == "none" or not same.any():
         return IDENTITY
@@ -116,8 +124,15 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Return the best initial transforms. Each aligns two map objects, or one if no two fit, with true objects."""
+    """Return the best initial transforms. Each aligns two map objects, or one if no two fit, with true objects.
+
+    For se3 and sim3, each aligns three map objects, if three fit.
+    """
     i, k = np.nonzero(same)
+    if kind in ("se3", "sim3"):
+        starts = _starts_in_space(source, target, i, k, radius, kind)
+        if starts:
+            return _cheapest(starts, source, target, same, radius)
     if len(i) <= _MAX_CORRESPONDENCES:
         first, second = np.triu_indices(len(i), 1)
     else:
@@ -127,7 +142,7 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
     a, b = source[i[second], :2] - source[i[first], :2], target[k[second], :2] - target[k[first], :2]
     length_a, length_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     likely = np.minimum(length_a, length_b) > 1e-9
-    if kind == "se2":
+    if kind in ("se2", "se3"):
         likely &= np.abs(length_a - length_b) <= 2 * radius
     else:
         likely &= (length_a * _SCALES[0] <= length_b) & (length_b <= length_a * _SCALES[1])
@@ -138,15 +153,59 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
         return [Transform(*align(source[[i[c]]], target[[k[c]]], kind)) for c in range(min(len(i), _MAX_REFINED))]
     first, second, a, b = first[chosen], second[chosen], a[chosen], b[chosen]
     yaw = np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[:, 1], a[:, 0])
-    scale = length_b[chosen] / length_a[chosen] if kind == "sim2" else np.ones(len(chosen))
+    scale = length_b[chosen] / length_a[chosen] if kind in ("sim2", "sim3") else np.ones(len(chosen))
     poses = lift_se2(np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=-1))
     middle_a = (source[i[first]] + source[i[second]]) / 2
     middle_b = (target[k[first]] + target[k[second]]) / 2
     poses[:, :3, 3] = middle_b - scale[:, None] * np.einsum("hij,hj->hi", poses[:, :3, :3], middle_a)
-    costs = [
-        _nearest_cost(Transform(pose, float(s)), source, target, same, radius) for pose, s in zip(poses, scale, strict=True)
-    ]
-    return [Transform(poses[h], float(scale[h])) for h in np.argsort(costs, kind="stable")[:_MAX_REFINED]]
+    starts = [Transform(pose, float(s)) for pose, s in zip(poses, scale, strict=True)]
+    return _cheapest(starts, source, target, same, radius)
+
+
+def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: float, kind: Alignment) -> list[Transform]:
+    """Return alignments of three map objects with three true objects, of the correspondences `i`, `k`; none if none fit.
+
+    Each lays a triangle onto a triangle. Three objects on a line make no triangle.
+    """
+    rng = np.random.default_rng(0)
+    if len(i) <= _MAX_TRIPLED:
+        drawn = np.array(list(combinations(range(len(i)), 3)), dtype=np.int64).reshape(-1, 3)
+    else:
+        drawn = rng.integers(len(i), size=(_DRAWN_PAIRS, 3))
+    a, b = source[i[drawn]], target[k[drawn]]  # (T, 3, 3): the corners of each triangle in the map and in the truth.
+    side_a, side_b = (np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) for corners in (a, b))
+    long_a, long_b = side_a.sum(axis=1), side_b.sum(axis=1)
+    likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A side of no length is one object, taken twice.
+    scale = np.ones(len(a)) if kind == "se3" else long_b / np.maximum(long_a, 1e-9)
+    likely &= (scale >= _SCALES[0]) & (scale <= _SCALES[1])
+    likely &= (np.abs(scale[:, None] * side_a - side_b) <= 2 * radius).all(axis=1)
+    frame_a, frame_b = _frames(a), _frames(b)
+    likely &= np.isfinite(frame_a).all(axis=(1, 2)) & np.isfinite(frame_b).all(axis=(1, 2))
+    chosen = np.flatnonzero(likely)
+    if len(chosen) > _MAX_TRIPLES:
+        chosen = np.sort(rng.choice(chosen, _MAX_TRIPLES, replace=False))
+    rotation = frame_b[chosen] @ np.swapaxes(frame_a[chosen], 1, 2)
+    turned = np.einsum("h,hij,hj->hi", scale[chosen], rotation, a[chosen].mean(axis=1))
+    poses = make_pose(rotation, b[chosen].mean(axis=1) - turned)
+    return [Transform(pose, float(s)) for pose, s in zip(poses, scale[chosen], strict=True)]
+
+
+def _frames(corners: Floats) -> Floats:
+    """Return right-handed axes (T, 3, 3) of triangles (T, 3, 3); NaN for one whose corners lie on a line."""
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(first, second)
+    length = np.linalg.norm(normal, axis=1)
+    flat = length <= _ON_A_LINE * np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x, z = first / np.linalg.norm(first, axis=1, keepdims=True), normal / length[:, None]
+    frames = np.stack([x, np.cross(z, x), z], axis=2)
+    frames[flat] = np.nan
+    return frames
+
+
+def _cheapest(starts: list[Transform], source: Floats, target: Floats, same: Bools, radius: float) -> list[Transform]:
+    costs = [_nearest_cost(start, source, target, same, radius) for start in starts]
+    return [starts[h] for h in np.argsort(costs, kind="stable")[:_MAX_REFINED]]
 
 
 def _nearest_cost(transform: Transform, source: Floats, target: Floats, same: Bools, radius: float) -> float:

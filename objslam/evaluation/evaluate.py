@@ -1,39 +1,39 @@
 """Evaluation of a map and a path against the ground truth."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import align as align_points
-from objslam.core.geometry import interpolate
+from objslam.core.geometry import interpolate, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory, Truth, TruthObject
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_objects, correspondences, match_points
-from objslam.io.atomic_files import write_file
-from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, dump_json
-from objslam.results.read import load_map, load_trajectory, load_truth
 
 MAX_TRUTH_GAP = 1.0
 """The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
 INSIDE_95 = 5.991
 """The squared Mahalanobis distance within which 95 % of honest errors lie (chi-squared, 2 degrees of freedom)."""
+INSIDE_95_3D = 7.815
+"""The same for an error in x, y and z (chi-squared, 3 degrees of freedom)."""
 
 
 @dataclass(frozen=True)
 class Match:
     """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
-    squared: squared Mahalanobis distance of the offset in x and y, by the covariance of the object. None without one.
+    squared: squared Mahalanobis distance of the offset in x and y, by the covariance of the object, which is rotated and
+    scaled as the map is. squared_3d: the same in x, y and z. Both are None without a covariance.
     """
 
     object: MapObject
     truth: TruthObject
     offset: Floats
     squared: float | None
+    squared_3d: float | None
 
     @property
     def error(self) -> float:
@@ -93,12 +93,15 @@ class Evaluation:
     warnings: tuple[str, ...] = ()
     truth: str | None = None
     """The path of the ground truth, or None if it is the truth of the log."""
+    why: str = "as asked"
+    """The reason for the alignment."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of evaluation.json. Values are in m and deg. A missing value is None."""
         return {
             "truth": self.truth,
             "align": self.align,
+            "align_reason": self.why,
             "radius": self.radius,
             **_object_dict(self.objects),
             **_path_dict(self.path),
@@ -125,7 +128,7 @@ def evaluate(
         LogError: there is no truth to compare with.
         ConfigError: the radius is not positive.
     """
-    _check_radius(radius)
+    check_radius(radius)
     pairs = None
     if trajectory is not None and truth is not None and truth.trajectory is not None:
         poses, known = interpolate(truth.trajectory.stamps, truth.trajectory.poses, trajectory.stamps, MAX_TRUTH_GAP)
@@ -144,31 +147,8 @@ def evaluate(
     return Evaluation(objects, path, align, radius, tuple(_warnings(objects, path, align)))
 
 
-def evaluate_folder(out: Path, truth: Path | None = None, *, align: Alignment = "none", radius: float = 0.5) -> Evaluation:
-    """Compare the result folder `out` with the ground truth at the path `truth` (see `load_truth`).
-
-    By default, the ground truth of the result's log is used. LogError if there is no truth, OutputError if the result cannot
-    be read, ConfigError if the radius is not positive.
-    """
-    _check_radius(radius)
-    map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
-    if known is None:
-        if truth is None:
-            raise LogError("the log of this result has no ground truth", where=str(out), hint="give --truth FILE")
-        message = f"no ground truth here: looked for {GROUNDTRUTH}/{OBJECTS} or {GROUNDTRUTH}/{TRAJECTORY}"
-        raise LogError(message, where=str(truth), hint="give an objects file, or a folder with such a file")
-    if not known.objects and known.trajectory is None:
-        raise LogError("the ground truth is empty", where=str(truth or out), hint="give --truth FILE")
-    evaluation = evaluate(map_, known, path, align=align, radius=radius)
-    return evaluation if truth is None else replace(evaluation, truth=str(truth))
-
-
-def write_evaluation(evaluation: Evaluation, out: Path) -> None:
-    """Write evaluation.json into the result folder `out`. OutputError if the file cannot be written."""
-    write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())
-
-
-def _check_radius(radius: float) -> None:
+def check_radius(radius: float) -> None:
+    """Raise ConfigError unless the radius of a match is positive."""
     if not radius > 0:
         raise ConfigError(f"the radius must be positive, got {radius}")
 
@@ -199,15 +179,20 @@ def _score_objects(
 def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
     """A match with its offset (3,) after the alignment, and the offset in units of the object's own covariance."""
     if found.covariance is None:
-        return Match(found, true, offset, None)
+        return Match(found, true, offset, None, None)
     turn = transform.scale * transform.pose[:3, :3]
-    covariance = (turn @ found.covariance @ turn.T)[:2, :2]
-    return Match(found, true, offset, float(offset[:2] @ np.linalg.pinv(covariance, hermitian=True) @ offset[:2]))
+    covariance = turn @ found.covariance @ turn.T
+    return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance))
+
+
+def _squared(offset: Floats, covariance: Floats) -> float:
+    return float(offset @ np.linalg.pinv(covariance, hermitian=True) @ offset)
 
 
 def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
     warnings = []
-    if objects is not None and kind != "none" and 0 < len(objects.matches) < 3:
+    few = 4 if kind in ("se3", "sim3") else 3
+    if objects is not None and kind != "none" and 0 < len(objects.matches) < few:
         warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only, so their errors mean little")
     if objects is not None and kind == "none" and objects.false and 2 * len(objects.matches) < len(objects.missed):
         warnings.append("few objects match the truth: if the map has its own frame, use --align se2")
@@ -222,14 +207,17 @@ def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Align
 
 def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
     counts = ("matched", "missed", "false", "unresolved", "precision", "recall")
-    honest = ("mahalanobis_median", "inside_95")
+    honest = ("mahalanobis_median", "inside_95", "inside_95_3d")
     if scores is None:
         return {**dict.fromkeys((*counts, *honest)), **_summary("position_", None), "transform": None}
     found = (len(scores.matches), len(scores.missed), len(scores.false), scores.unresolved, scores.precision, scores.recall)
     numbers = dict(zip(counts, found, strict=True))
-    squared = [m.squared for m in scores.matches if m.squared is not None]
-    median, inside = (float(np.median(squared)), float(np.mean(np.array(squared) <= INSIDE_95))) if squared else (None, None)
-    numbers |= dict(zip(honest, (median, inside), strict=True))
+    squared = np.array([(m.squared, m.squared_3d) for m in scores.matches if m.squared is not None])
+    if len(squared):
+        inside = (squared <= [INSIDE_95, INSIDE_95_3D]).mean(axis=0).tolist()
+        numbers |= dict(zip(honest, (float(np.median(squared[:, 0])), *inside), strict=True))
+    else:
+        numbers |= dict.fromkeys(honest)
     return {**numbers, **_summary("position_", scores.errors), "transform": _transform_dict(scores.transform)}
 
 
@@ -257,6 +245,7 @@ def _listing(scores: ObjectScores | None) -> dict[str, Any]:
             "error": m.error,
             "offset": m.offset.tolist(),
             "mahalanobis": m.squared,
+            "mahalanobis_3d": m.squared_3d,
         }
         for m in scores.matches
     ]
@@ -284,4 +273,6 @@ def _summary(prefix: str, errors: Floats | None) -> dict[str, float | None]:
 
 def _transform_dict(transform: Transform) -> dict[str, Any]:
     yaw = float(np.degrees(np.arctan2(transform.pose[1, 0], transform.pose[0, 0])))
-    return {"scale": transform.scale, "yaw_deg": yaw, "translation": transform.pose[:3, 3].tolist()}
+    place = transform.pose[:3, 3].tolist()
+    rotation = quaternion(transform.pose[None])[0].tolist()
+    return {"scale": transform.scale, "yaw_deg": yaw, "translation": place, "rotation_xyzw": rotation}

@@ -21,6 +21,7 @@ _OBJECT_ROWS = (
     ("position_max", "position max", " m"),
     ("mahalanobis_median", "squared Mahalanobis in x, y, median (honest: 1.39)", ""),
     ("inside_95", "share of truths inside the 95 % ellipse", ""),
+    ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
 """The rows about objects: key in evaluation.json, name in the table, and unit."""
 
@@ -42,7 +43,8 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     from rich.table import Table
 
     data = evaluation.to_dict()
-    scores = Table(title=f"align {evaluation.align}, radius {evaluation.radius:g} m")
+    title = f"align {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
+    scores = Table(title=title)
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {escape(evaluation.truth)}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())

@@ -19,11 +19,11 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     that are outside the path or in one of its gaps longer than poses.max_gap. If a camera moves on the robot, the same holds
     for its mount. LogError if the log has no path, no detection frame, or no frame on the path.
     """
-    path = log.localization or log.odometry
+    path = log.robot_path
     if path is None:
         raise LogError("the log has neither odometry nor localisation", where=log.name, hint="give at least one of them")
     odometry = log.odometry if settings.mode == "joint" else None
-    max_gap = settings.poses.max_gap
+    localized, max_gap = path is log.localization, settings.poses.max_gap
 
     found = [(index, c.detections) for index, c in enumerate(log.cameras) if c.detections is not None]
     if not any(len(detections.frame_stamps) for _, detections in found):
@@ -36,13 +36,13 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     camera, frame, stamps, boxes = camera[order], frame[order], stamps[order], boxes[order]
 
     valid = np.ones(len(stamps), dtype=bool)
-    what = "localisation" if log.localization else "odometry"
+    what = "localisation" if localized else "odometry"
     map_T_base, on_path = _on_path(path, stamps, valid, boxes, max_gap, ledger, what)
     valid &= on_path
     odom_T_base, drift, stretch = None, None, None
     if odometry is not None:
         odom_T_base, drift = map_T_base, gathered_drift(odometry, stamps, settings.odometry)
-        if log.localization is not None:
+        if localized:
             odom_T_base, on_odometry = _on_path(odometry, stamps, valid, boxes, max_gap, ledger, "odometry")
             valid &= on_odometry
         odom_T_base = inverse(odometry.poses[0]) @ odom_T_base
@@ -65,7 +65,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
             hint="check that both use the same clock, or raise poses.max_gap to bridge longer gaps",
         )
     localized_every = 0.0
-    if log.localization:
+    if localized and log.localization is not None:
         known, used = log.localization.stamps, stamps[valid]
         measured = ((known >= used[0]) & (known <= used[-1])).sum()
         localized_every = max(1.0, len(used) / max(float(measured), 1.0))

@@ -1,15 +1,31 @@
 """The drift of odometry, which is the covariance that it accumulates along its path."""
 
+from collections.abc import Mapping
 from typing import TypeVar
 
 import numpy as np
 
-from objslam.config import Odometry
+from objslam.config import Odometry, Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import adjoint, inverse, is_planar, twist_length, twist_lengths
 from objslam.core.types import Trajectory
 
 Length = TypeVar("Length", float, Floats)
+
+
+def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
+    """Return the settings of odometry whose ways are longer by the scale in these errors, and its noise with them.
+
+    If the noise did not follow its ways, a smaller map would have less of it.
+    """
+    way = 1 + error.get("odometry.scale", 0.0)
+    if way == 1:
+        return settings
+    of = settings.odometry
+    scaled = {name: getattr(of, name) * np.sqrt(way) for name in ("x_per_m", "y_per_m")}
+    scaled |= {name: getattr(of, name) * way for name in ("xy_per_rad", "floor_xy")}
+    scaled["yaw_per_m"] = of.yaw_per_m / np.sqrt(way)
+    return settings.model_copy(update={"odometry": of.model_copy(update=scaled)})
 
 
 def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> Floats:
@@ -22,13 +38,40 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     if len(odometry) == 1:
         return np.zeros((len(stamps), 6, 6))
     start_T_base = inverse(odometry.poses[0]) @ odometry.poses
-    steps = step_drift(start_T_base, settings, planar=is_planar(start_T_base))
-    total = np.zeros((len(odometry), 36))
-    np.cumsum(steps.reshape(-1, 36), axis=0, out=total[1:])
+    planar = is_planar(start_T_base)
+    steps = _planar_entries(start_T_base, settings) if planar else step_drift(start_T_base, settings, False).reshape(-1, 36)
+    total = np.zeros((len(odometry), steps.shape[1]))
+    np.cumsum(steps, axis=0, out=total[1:])
     after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
     span = odometry.stamps[after] - odometry.stamps[after - 1]
     share = np.clip((stamps - odometry.stamps[after - 1]) / span, 0.0, 1.0)[:, None]
-    return ((1 - share) * total[after - 1] + share * total[after]).reshape(-1, 6, 6)
+    gathered = (1 - share) * total[after - 1] + share * total[after]
+    if not planar:
+        return gathered.reshape(-1, 6, 6)
+    drift = np.zeros((len(stamps), 6, 6))
+    drift[:, 2:5, 2:5] = gathered[:, _PLANAR]
+    return drift
+
+
+_PLANAR = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Where the rows and columns yaw, x and y of a symmetric matrix are in its six entries."""
+
+
+def _planar_entries(start_T_base: Floats, settings: Odometry) -> Floats:
+    """The entries (N-1, 6) of `step_drift` on a planar path that are not 0; ten times as fast for 60,000 poses."""
+    angle, x, y = _step_variances(*twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:]), settings)
+    c, s, px, py = (start_T_base[1:, i, j] for i, j in ((0, 0), (1, 0), (0, 3), (1, 3)))
+    return np.stack(
+        [
+            angle,
+            angle * py,
+            -angle * px,
+            angle * py * py + x * c * c + y * s * s,
+            -angle * px * py + (x - y) * c * s,
+            angle * px * px + x * s * s + y * c * c,
+        ],
+        axis=1,
+    )
 
 
 def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:

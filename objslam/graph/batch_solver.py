@@ -7,7 +7,7 @@ import numpy as np
 
 from objslam.config import Loss, Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, inverse
@@ -101,16 +101,14 @@ def solve_joint(
     which are then estimated from theta (P,) on, or from their mean. Their covariance enters the covariance of the objects.
     """
 
-    def remeasure(values: Floats) -> Measurements:
-        assert errors is not None
-        other, other_rays, scaled = errors.at(values)
-        return Measurements.of(other, _share_bias(other_rays, association, settings), scaled)
+    def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
+        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings)
 
     if errors is None:
-        measured = Measurements.of(keyframes, _share_bias(rays, association, settings), settings)
+        measured = measure(keyframes, rays, settings)
     else:
         theta = errors.mean if theta is None else theta
-        measured = remeasure(theta)
+        measured = measure(*errors.at(theta))
     keyframes, rays = measured.keyframes, measured.rays
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
@@ -130,13 +128,15 @@ def solve_joint(
             found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
-    calibrated = None
+    calibrated, calibration = None, None
     if errors is not None and theta is not None:
         try:
-            calibrated = calibrate(errors, remeasure, association, found, theta, trace)
+            calibrated = calibrate(errors, measure, association, found, theta, trace)
         except (SolveError, np.linalg.LinAlgError) as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+            calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
         else:
+            errors, calibration = calibrated.errors, calibrated.calibration
             measured, found = calibrated.measured, calibrated.found
             keyframes, rays = measured.keyframes, measured.rays
     map_T_camera, positions, used, optimum = found.map_T_camera, found.positions, found.used, found.optimum
@@ -172,7 +172,8 @@ def solve_joint(
         cost_before=found.cost_before,
         cost_after=optimum.cost_after,
         iterations=found.iterations,
-        calibration=None if calibrated is None else calibrated.calibration,
+        calibration=calibration if calibration is not None and calibration.names else None,
+        noise=None if errors is None else errors.noise,
     )
 
 

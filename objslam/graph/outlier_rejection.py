@@ -57,12 +57,12 @@ def reject_outliers(
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
     for _ in range(_ROUNDS):
-        positions, supported = second_opinion(measured, map_T_camera, association, positions, used)
+        moved, supported = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
             supported = supported | back
         elif (supported == used).all():
-            break
-        used = supported
+            break  # the positions stay those of the last solve
+        positions, used = moved, supported
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         graph = build_graph(measured.factors(association.object, which, landmarks, positions, loss))
         values, others = make_values(map_T_camera, positions, landmarks), range(len(which), graph.size())

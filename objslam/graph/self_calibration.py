@@ -9,19 +9,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
-import gtsam
 import numpy as np
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
 from objslam.core.geometry import exp_se3
-from objslam.core.trace import Trace
-from objslam.core.types import Association
+from objslam.core.trace import Parameters, Trace
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers, second_opinion
-from objslam.graph.shared_error_jacobian import ReducedSystem, reduce_system
+from objslam.graph.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.variance_components import estimate_noise, shrinking_force
 
 _ROUNDS = 8
 """The most outer steps; more is slower. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6."""
@@ -38,15 +40,27 @@ _LEAST_SIGNAL = 0.05
 _MEMORY = 3
 """The steps that Anderson's acceleration looks back on; more extrapolates farther, and less safely."""
 
-Remeasure = Callable[[Floats], Measurements]
-"""Return the measurements with shared errors (P,) taken out."""
+_NOISE_ROUNDS = 3
+"""How often the noise is estimated, each time followed by a solve with it. More rounds are slower and change it less."""
+_SAME_NOISE = 0.1
+"""The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
+
+_SHRINKINGS = 30
+"""How often the noise in the information is made smaller to keep the curvature positive; more keep less of it."""
+
+Measure = Callable[[Keyframes, Rays, Settings], Measurements]
+"""Collect the measurements of keyframes and rays with the noise of the settings."""
 
 
 @dataclass(frozen=True)
 class CalibratedSolution:
-    """A joint solution at the shared errors that fit best. sensitivity: (N, 3, P) of the landmarks, m per unit."""
+    """A joint solution at the shared errors and the noise that fit best.
+
+    errors: with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter.
+    """
 
     calibration: Calibration
+    errors: CalibratedMeasurements
     measured: Measurements
     found: JointSolution
     sensitivity: Floats
@@ -54,97 +68,157 @@ class CalibratedSolution:
 
 def calibrate(
     errors: CalibratedMeasurements,
-    remeasure: Remeasure,
+    measure: Measure,
     association: Association,
     found: JointSolution,
     theta: Floats,
     trace: Trace | None = None,
 ) -> CalibratedSolution:
-    """Estimate the shared errors from a joint solution at `theta` (P,).
+    """Estimate the shared errors and the noise from a joint solution at `theta` (P,).
 
     Which rays are used is settled again after each step. What the log does not tell stays at its prior.
 
     Raises:
         SolveError: a linear system has no single solution.
     """
-    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
-    sigma = np.sqrt(np.diagonal(errors.prior))
-
-    def deviation(values: Floats) -> float:
-        """Half the squared Mahalanobis distance of parameters (P,) from their prior."""
-        return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
-
-    state = _State.of(remeasure(theta), association, found.map_T_camera, found.positions, found.used)
-    history: list[tuple[Floats, Floats]] = []
-    signal: Floats | None = None
-    steps = 0
-    for _ in range(_ROUNDS):
-        system = state.reduced(errors, theta)
-        if signal is None:
-            signal = _signal_shares(state, system, errors, remeasure, theta)
-        curvature, covariance = _curvature(system.information, signal, prior)
-        step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
-        if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
+    fit = _Fit(errors, measure, trace)
+    state = _State.of(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
+    theta, state, signal, steps = fit.shared_errors(state, theta)
+    for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
+        system = linearise(state, fit.errors, theta)
+        noise = estimate_noise(state, system, fit.errors, theta, fit.prior_residuals)
+        same = noise.like(fit.errors.noise, _SAME_NOISE)
+        fit = replace(fit, errors=fit.errors.with_noise(noise))
+        state = fit.remeasured(state, theta).settled()
+        if same:
             break
-        history = [*history[-_MEMORY:], (theta, step)]
-        target = _accelerated(history, sigma)
-        before = state.cost + deviation(theta)
-        for _ in range(_HALVINGS + 1):
-            other = np.clip(target, -errors.bounds, errors.bounds)
-            trial = state.moved(system, other - theta, remeasure(other))
-            if trial.cost + deviation(other) <= before:
-                break
-            target, history = theta + (target - theta) / 2, []
-        else:
-            break
-        theta, state, steps = other, trial.settled(), steps + 1
-        if trace is not None:
-            trace.base_T_camera = state.measured.keyframes.base_T_camera
-            trace.iteration("solve", state.cost, state.map_T_camera, state.positions)
+        theta, state, signal, more = fit.shared_errors(state, theta)
+        steps += more
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
-    system = state.reduced(errors, theta)
-    assert signal is not None
-    _, covariance = _curvature(system.information, signal, prior)
+    reduced = linearise(state, fit.errors, theta).reduce()
+    _, covariance = _curvature(reduced.information, signal, np.asarray(np.linalg.inv(errors.prior), dtype=np.float64))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
-    sensitivity[state.landmarks] = system.sensitivity[: 3 * len(state.landmarks)].reshape(-1, 3, len(theta))
+    by_landmark = (len(state.landmarks), 3, len(theta))
+    sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
-    return CalibratedSolution(Calibration(errors.names, theta, covariance, sigma), state.measured, final, sensitivity)
+    calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
+    return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)
 
 
-def _signal_shares(
-    state: _State, system: ReducedSystem, errors: CalibratedMeasurements, remeasure: Remeasure, theta: Floats
-) -> Floats:
-    """Return the shares (P,) of the diagonal of the information that are signal; 1 but for clocks.
+@dataclass(frozen=True)
+class _Fit:
+    """What a search for shared errors needs: the measurements as a function of them."""
 
-    The derivative of a motion by a clock is a difference of measured velocities. Their noise enters the Jacobian, and makes
-    its square too large. It does not enter the change of the gradient between two values of the clock.
-    """
-    shares = np.ones(len(theta))
-    for k in np.flatnonzero([kind(name) == "clock" for name in errors.names]).tolist():
-        step = errors.steps[k] * np.eye(len(theta))[k]
-        sides = [
-            state.moved(system, s * step, remeasure(theta + s * step)).reduced(errors, theta + s * step) for s in (1, -1)
-        ]
-        change = (sides[1].gradient[k] - sides[0].gradient[k]) / (2 * errors.steps[k])
-        shares[k] = np.clip(change / max(system.information[k, k], 1e-300), _LEAST_SIGNAL, 1.0)
-    return shares
+    errors: CalibratedMeasurements
+    measure: Measure
+    trace: Trace | None
+
+    @property
+    def prior_residuals(self) -> float:
+        """For how many residuals the nominal noise counts."""
+        return self.errors.settings.noise.prior
+
+    def shared_errors(self, state: _State, theta: Floats) -> tuple[Floats, _State, Floats, int]:
+        """Return the parameters (P,) that fit best, the solution at them, the shares of signal (P,) and the steps."""
+        errors = self.errors
+        prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
+        signal = np.ones(len(theta))
+        if len(theta) == 0:
+            return theta, state, signal, 0
+        sigma = np.sqrt(np.diagonal(errors.prior))
+
+        def deviation(values: Floats) -> float:
+            """Half the squared Mahalanobis distance of parameters (P,) from their prior."""
+            return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
+
+        history: list[tuple[Floats, Floats]] = []
+        for steps in range(_ROUNDS):
+            linear = linearise(state, errors, theta)
+            system = linear.reduce()
+            if steps == 0:
+                signal = self.signal_shares(state, system, theta)
+            curvature, covariance = _curvature(system.information, signal, prior)
+            gradient = system.gradient + _without_shrinking(state, system, linear.told)
+            step = np.asarray(np.linalg.solve(curvature, gradient - prior @ (theta - errors.mean)), dtype=np.float64)
+            pull = gradient - system.descent
+            if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
+                break
+            history = [*history[-_MEMORY:], (theta, step)]
+            target = _accelerated(history, sigma)
+            begin, before = theta, state.cost + deviation(theta)
+            for _ in range(_HALVINGS + 1):
+                other = np.clip(target, -errors.bounds, errors.bounds)
+                trial = state.moved(system, other - theta, self.measure(*errors.at(other)))
+                if trial.cost + deviation(other) - pull @ (other - begin) <= before:
+                    break
+                target, history = theta + (target - theta) / 2, []
+            else:
+                break
+            theta, state = other, trial.settled()
+            if self.trace is not None:
+                self.trace.base_T_camera = state.measured.keyframes.base_T_camera
+                moved = Parameters(errors.names, theta, np.sqrt(np.diagonal(covariance)))
+                self.trace.iteration("solve", state.cost, state.map_T_camera, state.positions, moved)
+        return theta, state, signal, steps
+
+    def signal_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
+        """Return the shares (P,) of the diagonal of the information that are signal; 1 but for clocks and odometry scales.
+
+        The derivative of a motion by a clock is a difference of measured velocities. Their noise enters the Jacobian, and
+        makes its square too large. It does not enter the change of the gradient between two values of the clock.
+        """
+        shares = np.maximum(system.signal, _LEAST_SIGNAL)
+        for k in np.flatnonzero([kind(name) == "clock" for name in self.errors.names]).tolist():
+            step = self.errors.steps[k] * np.eye(len(theta))[k]
+            gradients = []
+            for at in (step, -step):
+                side = state.moved(system, at, self.measure(*self.errors.at(theta + at)))
+                gradients.append(linearise(side, self.errors, theta + at).reduce().gradient[k])
+            change = (gradients[1] - gradients[0]) / (2 * self.errors.steps[k])
+            shares[k] = np.clip(change / max(system.information[k, k], 1e-300), _LEAST_SIGNAL, 1.0)
+        return shares
+
+    def remeasured(self, state: _State, theta: Floats) -> _State:
+        """The optimum for the measurements with the noise as it is now."""
+        measured = self.measure(*self.errors.at(theta))
+        return _State.of(measured, state.association, state.map_T_camera, state.positions, state.used).solved(
+            state.landmarks
+        )
 
 
 def _curvature(information: Floats, signal: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
     The gradient varies as the whole information says, also by the noise in it, while the curvature is that of the signal
-    alone. Hence the covariance is a sandwich (Huber 1967).
+    alone. Hence the covariance is a sandwich (Huber 1967). SolveError if the information is not finite.
     """
+    if not np.isfinite(information).all():
+        raise SolveError("the information about the shared errors is not finite")
     noise = np.diag((1 - signal) * np.diagonal(information))
     curvature = information - noise + prior
-    while np.linalg.eigvalsh(curvature)[0] <= 0:
+    for _ in range(_SHRINKINGS):
+        if (np.linalg.eigvalsh(curvature) > 0).all():
+            break
         noise = 0.8 * noise
         curvature = information - noise + prior
+    else:
+        curvature = information + prior
     inverse = np.linalg.inv(curvature)
     return curvature, np.asarray(inverse @ (information + prior) @ inverse)
+
+
+def _without_shrinking(state: _State, system: ReducedSystem, told: Floats) -> Floats:
+    """What (P,) the gradient lacks: without the force that makes a solution too small, it would not pull at the parameters.
+
+    A parameter feels the force as far as the size of the map follows it.
+    """
+    landmarks = state.positions[state.landmarks]
+    around = landmarks - landmarks.mean(axis=0)
+    moved = system.sensitivity[: around.size].reshape(*around.shape, system.sensitivity.shape[1])
+    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
+    return told * shrinking_force(state)[0] * size
 
 
 def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:
@@ -161,16 +235,9 @@ def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class _State:
-    """A graph at its optimum for given parameters; used: (R,) its rays, cost: the graph's."""
+class _State(Linearised):
+    """A graph at its optimum for given parameters, and its cost."""
 
-    measured: Measurements
-    association: Association
-    map_T_camera: Floats
-    positions: Floats
-    used: Bools
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
     cost: float
 
     @classmethod
@@ -180,18 +247,7 @@ class _State:
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         graph = build_graph(measured.factors(association.object, np.flatnonzero(used), landmarks, positions))
         values = make_values(map_T_camera, positions, landmarks)
-        return cls(measured, association, map_T_camera, positions, used, graph, values, graph.error(values))
-
-    @property
-    def landmarks(self) -> Ints:
-        return np.flatnonzero(np.isfinite(self.positions[:, 0]))
-
-    def reduced(self, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
-        which = np.flatnonzero(self.used)
-        owner = self.association.object[which]
-        return reduce_system(
-            self.graph, self.values, self.measured, errors, theta, which, owner, self.positions, self.map_T_camera
-        )
+        return cls(graph, values, measured, association, map_T_camera, positions, used, graph.error(values))
 
     def moved(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
         """The optimum for other measurements, from the linear prediction of it for a step (P,) of the parameters."""
@@ -200,12 +256,15 @@ class _State:
         positions = self.positions.copy()
         positions[landmarks] += change[: 3 * len(landmarks)].reshape(-1, 3)
         map_T_camera = self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6))
-        start = type(self).of(measured, self.association, map_T_camera, positions, self.used)
-        optimum = levenberg_marquardt(start.graph, start.values, _INNER, _TOLERANCE)
+        return type(self).of(measured, self.association, map_T_camera, positions, self.used).solved(landmarks)
+
+    def solved(self, landmarks: Ints) -> Self:
+        """The same after a few iterations of the inner solve. landmarks: (m,) those in the graph."""
+        optimum = levenberg_marquardt(self.graph, self.values, _INNER, _TOLERANCE)
         return replace(
-            start,
+            self,
             map_T_camera=read_poses(optimum.values),
-            positions=with_points(positions, landmarks, optimum.values),
+            positions=with_points(self.positions, landmarks, optimum.values),
             values=optimum.values,
             cost=optimum.cost_after,
         )

@@ -8,62 +8,121 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, kind
-from objslam.core.geometry import inverse, log_se3
+from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.core.statistics import CAUCHY_K, HUBER_K
-from objslam.core.types import Keyframes, Rays
+from objslam.core.types import Association, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
-from objslam.graph.factors.bearing import bearings
 from objslam.graph.factors.localization import localization_covariance
-from objslam.graph.factors.noise import robust
 from objslam.graph.factors.priors import ANCHOR
+from objslam.graph.factors.rays import ray_factors
+from objslam.graph.optimizers import build_graph
+
+_ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
+"""The parameters whose derivatives are the measured motions themselves, with their noise."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A graph, as `Measurements.factors` makes it, with its variables at the values of its last solve.
+
+    map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. used: (R,) the rays in it.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    measured: Measurements
+    association: Association
+    map_T_camera: Floats
+    positions: Floats
+    used: Bools
+
+    @property
+    def which(self) -> Ints:
+        """(n,) the rays in the graph."""
+        return np.flatnonzero(self.used)
+
+    @property
+    def landmarks(self) -> Ints:
+        """(m,) the landmarks in the graph."""
+        return np.flatnonzero(np.isfinite(self.positions[:, 0]))
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are held.
+
+    The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
+    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. sides: (M, P) by the
+    shared errors. residual: (M,). first_range, first_motion: the rows where the ranges and the motions begin.
+    instruments: (M, P) what the residuals must not correlate with at the optimum. They are the sides, but for the scales of
+    the odometry: their sides hold the odometry's own noise, which is in the residuals as well. told: (P,)
+    how far the measurements tell each parameter at all.
+    """
+
+    jacobian: sparse.csc_matrix
+    sides: Floats
+    instruments: Floats
+    told: Floats
+    residual: Floats
+    first_range: int
+    first_motion: int
+
+    def reduce(self) -> "ReducedSystem":
+        """Eliminate poses and landmarks by a Schur complement. SolveError if the linear system is singular."""
+        factored = factor(self.jacobian)
+        sensitivity = -factored.solve(self.jacobian.T @ self.sides)
+        newton = -factored.solve(self.jacobian.T @ self.residual)
+        reduced, left = self.sides + self.jacobian @ sensitivity, self.residual + self.jacobian @ newton
+        across, diagonal = np.einsum("mp,mp->p", self.instruments, reduced), np.einsum("mp,mp->p", reduced, reduced)
+        signal = np.clip(across / np.maximum(diagonal, 1e-300), 0.0, 1.0)
+        gradient, descent = -self.told * (self.instruments.T @ left), -reduced.T @ left
+        information = np.outer(self.told, self.told) * (reduced.T @ reduced)
+        return ReducedSystem(information, gradient, descent, signal, sensitivity, newton)
 
 
 @dataclass(frozen=True)
 class ReducedSystem:
     """The normal equations of the parameters with poses and landmarks eliminated.
 
-    information: (P, P). gradient: (P,), the negative gradient of the cost at the linearisation. sensitivity: (D, P), the
-    derivatives of all variables at their optimum by the parameters: first the landmarks, three rows each, then the poses,
-    six rows each. newton: (D,), what is left of the variables' own step.
+    information: (P, P). gradient: (P,), what must be zero at the optimum: the residuals against the instruments. descent:
+    (P,), the negative gradient of the cost. signal: (P,) the share of the information's diagonal that is no noise.
+    sensitivity: (D, P), the derivatives of all variables at their optimum by the parameters: first the landmarks, three
+    rows each, then the poses, six rows each. newton: (D,), what is left of the variables' own step.
     """
 
     information: Floats
     gradient: Floats
+    descent: Floats
+    signal: Floats
     sensitivity: Floats
     newton: Floats
 
 
-def reduce_system(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    measured: Measurements,
-    errors: CalibratedMeasurements,
-    theta: Floats,
-    which: Ints,
-    landmark: Ints,
-    positions: Floats,
-    map_T_camera: Floats,
-) -> ReducedSystem:
-    """Linearise a graph and its shared errors theta (P,), and eliminate poses and landmarks by a Schur complement.
+def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> LinearSystem:
+    """Return the linear system of a graph at its values, and at the shared errors theta (P,)."""
+    columns = 3 * len(of.landmarks) + 6 * len(of.map_T_camera)
+    jacobian, residual = _whitened(of.graph, of.values, columns)
+    keyframes = of.measured.keyframes
+    motions = 6 * int(keyframes.measured.sum()) if of.measured.motion is not None else 0
+    absolute = 6 * (len(keyframes) if keyframes.localized_every else 1)
+    first_motion = len(residual) - absolute - motions
+    ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
+    first_range = first_motion - 3 * len(of.landmarks) - ranged
+    sides = _parameter_columns(of, errors, theta, (len(residual), first_range, first_motion))
+    told = np.array([errors.size_told if name == "odometry.scale" else 1.0 for name in errors.names])
+    instruments = _instruments(of, errors, sides, slice(first_motion, first_motion + motions))
+    return LinearSystem(jacobian, sides, instruments, told, residual, first_range, first_motion)
 
-    Args:
-        graph: as `Measurements.factors` makes it of the rays `which` (n,), with the poses X and n landmarks L in `values`.
-        landmark: (n,) the landmark of each of these rays.
-        positions, map_T_camera: (N, 3), NaN where an object is not in the graph, and (K, 4, 4), as in `values`.
-    Raises:
-        SolveError: the linear system is singular.
-    """
-    landmarks = int(np.isfinite(positions[:, 0]).sum())
-    columns = 3 * landmarks + 6 * len(map_T_camera)
-    jacobian, residual = _linear_system(graph, values, columns)
-    sides = _parameter_columns(values, measured, errors, theta, which, landmark, positions, map_T_camera, len(residual))
+
+def factor(jacobian: sparse.csc_matrix) -> SuperLU:
+    """Factor the normal equations of a sparse Jacobian. SolveError if they are singular."""
     try:
-        factored = splu(
+        return splu(
             sparse.csc_matrix(jacobian.T @ jacobian),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
@@ -71,98 +130,120 @@ def reduce_system(
         )
     except RuntimeError as error:
         raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
-    sensitivity = -factored.solve(jacobian.T @ sides)
-    newton = -factored.solve(jacobian.T @ residual)
-    reduced = sides + jacobian @ sensitivity
-    return ReducedSystem(reduced.T @ reduced, -reduced.T @ (residual + jacobian @ newton), sensitivity, newton)
 
 
-def _linear_system(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, columns: int | None
-) -> tuple[sparse.csc_matrix, Floats]:
+def _whitened(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, columns: int) -> tuple[sparse.csc_matrix, Floats]:
     """The whitened Jacobian (M, columns) of a graph, and its whitened residuals (M,), in the order of the factors."""
     linear = graph.linearize(values)
     row, column, value = linear.sparseJacobian_()  # numbers from 1; the column after the last holds the right-hand side
     row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
     rows = sum(graph.at(i).dim() for i in range(graph.size()))
-    columns = int(column.max()) if columns is None else columns
     side = column == columns
     residual = np.zeros(rows)
     residual[row[side]] = -value[side]
     return sparse.csc_matrix((value[~side], (row[~side], column[~side])), shape=(rows, columns)), residual
 
 
-def _parameter_columns(
-    values: gtsam.Values,
-    measured: Measurements,
-    errors: CalibratedMeasurements,
-    theta: Floats,
-    which: Ints,
-    landmark: Ints,
-    positions: Floats,
-    map_T_camera: Floats,
-    rows: int,
-) -> Floats:
+def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats, rows: tuple[int, int, int]) -> Floats:
     """(M, P) derivatives of the whitened residuals by the parameters: central differences, robust weights held.
 
-    The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
+    rows: the number of rows, and where the ranges and the motions begin.
     """
-    keyframes, rays = measured.keyframes, measured.rays.take(which)
+    measured, map_T_camera = of.measured, of.map_T_camera
+    keyframes, rays, landmark = measured.keyframes, measured.rays.take(of.which), of.association.object[of.which]
     steps, ranged = np.flatnonzero(keyframes.measured), np.flatnonzero(np.isfinite(rays.range))
-    rays_of_range, odometry = rays.take(ranged), measured.settings.odometry
-    distance = np.linalg.norm(positions[landmark[ranged]] - map_T_camera[rays_of_range.keyframe, :3, 3], axis=1)
+    rays_of_range = rays.take(ranged)
+    distance = np.linalg.norm(of.positions[landmark[ranged]] - map_T_camera[rays_of_range.keyframe, :3, 3], axis=1)
     deviation = (distance - rays_of_range.range) / rays_of_range.range_sigma
     range_root = 1 / rays_of_range.range_sigma / np.sqrt(1 + (deviation / CAUCHY_K) ** 2)
-    motion_root = _roots(measured.odometry()[1][steps]) if len(steps) else np.zeros((0, 6, 6))
+    has_odometry = measured.motion is not None and len(steps) > 0
+    motion_root = whitening(measured.odometry()[1][steps]) if has_odometry else np.zeros((0, 6, 6))
     moved = inverse(map_T_camera[:-1]) @ map_T_camera[1:]
     absolute = map_T_camera if keyframes.localized_every else map_T_camera[:1]
-    absolute_root = _absolute_roots(keyframes, measured, absolute)
+    absolute_root = _absolute_roots(measured, absolute)
 
-    def residuals(parameters: Floats) -> list[Floats]:
+    def residuals(parameters: Floats, refocused: bool) -> list[Floats]:
         other, other_rays, settings = errors.at(parameters, drift=False)
-        longer = other_rays.range[which[ranged]] / rays_of_range.range
+        longer = other_rays.range[of.which[ranged]] / rays_of_range.range
         parts = [range_root * (distance - longer * rays_of_range.range) / longer]
-        if other.odom_T_base is not None and len(steps):
+        if has_odometry and other.odom_T_base is not None:
             odom_T_camera = other.odom_T_base @ other.base_T_camera
             said = inverse(odom_T_camera[:-1]) @ odom_T_camera[1:]
-            turn, way = settings.odometry.floor_yaw / odometry.floor_yaw, settings.odometry.floor_xy / odometry.floor_xy
-            off = log_se3(inverse(said[steps]) @ moved[steps]) / np.repeat([turn, way], 3)
+            way = settings.odometry.floor_xy / measured.settings.odometry.floor_xy
+            off = log_se3(inverse(said[steps]) @ moved[steps]) / np.repeat([1.0, way], 3)
             parts.append(np.einsum("kij,kj->ki", motion_root, off).ravel())
         off = log_se3(inverse(other.map_T_camera[: len(absolute)]) @ absolute)
-        return [*parts, np.einsum("kij,kj->ki", absolute_root, off).ravel()]
+        parts.append(np.einsum("kij,kj->ki", absolute_root, off).ravel())
+        if refocused:
+            parts.append(_bearing_residuals(of, other_rays.take(of.which), rows[1]))
+        return parts
 
-    result = np.zeros((rows, len(theta)))
-    first_range, first_motion = 2 * len(which), rows - 6 * (len(steps) + len(absolute))
+    total, first_range, first_motion = rows
+    result = np.zeros((total, len(theta)))
     for k, step in enumerate(errors.steps):
-        ahead, behind = (theta + sign * step * np.eye(len(theta))[k] for sign in (1, -1))
-        (up, *ups), (down, *downs) = residuals(ahead), residuals(behind)
+        refocused = kind(errors.names[k]) == "focal"
+        (up, *ups), (down, *downs) = (residuals(theta + sign * step * np.eye(len(theta))[k], refocused) for sign in (1, -1))
+        if refocused:
+            result[:first_range, k] = (ups.pop() - downs.pop()) / (2 * step)
         result[first_range : first_range + len(ranged), k] = (up - down) / (2 * step)
         result[first_motion:, k] = (np.concatenate(ups) - np.concatenate(downs)) / (2 * step)
-        if kind(errors.names[k]) == "focal":
-            sides = [
-                _bearing_residuals(errors.at(side, drift=False)[1].take(which), landmark, values) for side in (ahead, behind)
-            ]
-            result[:first_range, k] = (sides[0] - sides[1]) / (2 * step)
     return result
 
 
-def _bearing_residuals(rays: Rays, landmark: Ints, values: gtsam.Values) -> Floats:
-    """(2n,) whitened residuals of bearings under Huber's loss."""
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in bearings(rays.keyframe, rays.direction, landmark, robust("huber", rays.sigma, 2)):
-        graph.push_back(factor)
-    return _linear_system(graph, values, None)[1]
+def _instruments(of: Linearised, errors: CalibratedMeasurements, sides: Floats, motions: slice) -> Floats:
+    """The sides (M, P) with the motions of the odometry's scales as their neighbours predict them.
+
+    A motion's own noise is in its derivative by the scale and in its residual. Their product would pull the scale away: up
+    if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is another
+    (instrumental variables; Fuller 1987, 1.4).
+    """
+    which = [k for k, name in enumerate(errors.names) if name in _ODOMETRY_SCALES]
+    if not which or motions.start == motions.stop:
+        return sides
+    keyframes = of.measured.keyframes
+    steps = np.flatnonzero(keyframes.measured)
+    root = whitening(of.measured.odometry()[1][steps])
+    to_base = adjoint(keyframes.base_T_camera[1:][steps])
+    seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
+    instruments = sides.copy()
+    for k in which:
+        own = (to_base @ np.linalg.solve(root, sides[motions, k].reshape(-1, 6, 1)))[..., 0]
+        told = np.linalg.solve(to_base, from_neighbours(own, seconds)[..., None])
+        instruments[motions, k] = (root @ told)[..., 0].ravel()
+    return instruments
 
 
-def _roots(covariance: Floats) -> Floats:
-    """Upper triangular (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM's noise models do."""
+def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
+    """Predict motions (n, D) from the two before and the two after each, at their rate. seconds: (n,) their durations."""
+
+    def near(values: Floats) -> Floats:
+        padded = np.pad(values, ((2, 2), (0, 0)))
+        return np.asarray(sum(padded[i : i + len(values)] for i in (0, 1, 3, 4)))
+
+    time = near(seconds[:, None])
+    return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
+
+
+def _bearing_residuals(of: Linearised, rays: Rays, rows: int) -> Floats:
+    """The whitened residuals (rows,) of the graph's rays in other directions, with Huber's loss."""
+    factors = ray_factors(rays, of.association.object[of.which], "huber", of.measured.settings)[0][1]
+    row, column, value = build_graph(factors).linearize(of.values).sparseJacobian_()
+    side = column == column.max()  # the right-hand side
+    residual = np.zeros(rows)
+    residual[row[side].astype(np.int64) - 1] = -value[side]
+    return residual
+
+
+def whitening(covariance: Floats) -> Floats:
+    """Return upper triangular (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM's noise models do."""
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
 
 
-def _absolute_roots(keyframes: Keyframes, measured: Measurements, poses: Floats) -> Floats:
+def _absolute_roots(measured: Measurements, poses: Floats) -> Floats:
     """What whitens the residuals of absolute poses (n, 4, 4), with the weights of Huber's loss; the anchor has no loss."""
+    keyframes = measured.keyframes
     if not keyframes.localized_every:
         return np.eye(6)[None] / ANCHOR
-    roots = _roots(localization_covariance(keyframes, measured.settings))
+    roots = whitening(localization_covariance(keyframes, measured.settings))
     off = np.linalg.norm(np.einsum("kij,kj->ki", roots, log_se3(inverse(keyframes.map_T_camera) @ poses)), axis=1)
     return np.asarray(roots * np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12)))[:, None, None])

@@ -1,43 +1,111 @@
 """Read and write the shared errors of a robot as YAML: what `objslam calibrate` found, and what a run starts from."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from objslam.core.calibration import UNITS, Calibration, kind
-from objslam.errors import ConfigError
+from objslam.core.arrays import Floats
+from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
+from objslam.errors import ConfigError, LogError, one_line
 from objslam.io.text import read_bytes
+
+_MOST_BYTES = 1 << 20
+"""The largest size of a file, bytes. A larger file is refused unread. A robot with ten cameras needs 100 kB."""
+_ASYMMETRY = 1e-6
+"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share takes
+files that somebody rounded more."""
+_HINT = "write it with objslam calibrate"
 
 
 def dump_calibration(calibration: Calibration) -> str:
     """Return the YAML text of a calibration. `load_calibration` reads it."""
-    parameters = {
-        name: {
-            "value": float(value),
-            "sigma": float(sigma),
-            "prior_sigma": float(prior),
-            "unit": UNITS.get(kind(name), "share"),
-        }
-        for name, value, sigma, prior in zip(
-            calibration.names, calibration.values, calibration.sigma, calibration.prior, strict=True
-        )
-    }
-    data = {"parameters": parameters, "covariance": calibration.covariance.tolist()}
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
+    return yaml.safe_dump(calibration.to_dict(), sort_keys=False, default_flow_style=None, width=200)
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read a file of `objslam calibrate`. ConfigError names the file and what is wrong in it."""
+    """Read a file of `objslam calibrate`, or the summary.json of a run that estimated the shared errors.
+
+    ConfigError names the file and what is wrong in it.
+    """
     try:
-        data = yaml.safe_load(read_bytes(path).decode())
-        parameters = data["parameters"]
-        columns = [np.array([float(of[key]) for of in parameters.values()]) for key in ("value", "prior_sigma")]
-        covariance = np.array(data["covariance"], dtype=np.float64).reshape(len(parameters), len(parameters))
-        np.linalg.cholesky(covariance)
-        if not all(np.isfinite(part).all() for part in (*columns, covariance)) or not (columns[1] > 0).all():
-            raise ValueError("a number is not finite or a prior sigma is not positive")
-    except (yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
-        hint = "write it with objslam calibrate"
-        raise ConfigError(f"this is no calibration of shared errors: {error}", where=str(path), hint=hint) from error
-    return Calibration(tuple(map(str, parameters)), columns[0], covariance, columns[1])
+        if path.is_file() and path.stat().st_size > _MOST_BYTES:
+            raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MiB")
+        text = read_bytes(path).decode()
+        _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader))
+        return _calibration(yaml.safe_load(text))
+    except LogError as error:
+        raise ConfigError(error.message, where=error.where, hint="give a file of objslam calibrate") from error
+    except (yaml.YAMLError, ValueError, OSError, RecursionError, OverflowError) as error:
+        what = one_line(error)[:300]
+        raise ConfigError(f"this is no calibration of shared errors: {what}", where=str(path), hint=_HINT) from error
+
+
+def _refuse_duplicates(node: yaml.Node | None) -> None:
+    """Raise ValueError if a mapping, or one in it, has a key twice, of which PyYAML would take the last."""
+    seen = set()
+    for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+        if not isinstance(key, yaml.ScalarNode):
+            raise ValueError(f"line {key.start_mark.line + 1} has a key that is no name")
+        if key.value in seen:
+            raise ValueError(f"{key.value} is there twice, again in line {key.start_mark.line + 1}")
+        seen.add(key.value)
+        _refuse_duplicates(value)
+
+
+def _calibration(data: Any) -> Calibration:
+    """Return the calibration that a file holds. ValueError says what is wrong."""
+    if isinstance(data, dict) and "calibration" in data:  # the summary.json of a run
+        data = data["calibration"]
+    parameters = data.get("parameters") if isinstance(data, dict) else None
+    if not isinstance(parameters, dict) or not parameters:
+        raise ValueError("it has no parameters")
+    names = tuple(map(str, parameters))
+    values, prior = (_column(parameters, key) for key in ("value", "prior_sigma"))
+    expected = _column(parameters, "prior_mean", 0.0)
+    for name, value, sigma in zip(names, values.tolist(), prior.tolist(), strict=True):
+        if sigma <= 0:
+            raise ValueError(f"prior_sigma of {name} is not positive")
+        if kind(name) in SCALES and abs(value) > MOST_SCALE:
+            raise ValueError(f"{name} is {value:g}, and no scale errs by more than {MOST_SCALE:g}")
+    before = _covariance(data, "prior_covariance", names) if "prior_covariance" in data else np.diag(prior**2)
+    return Calibration(names, values, _covariance(data, "covariance", names), prior, expected, before)
+
+
+def _column(parameters: dict[Any, Any], key: str, default: float | None = None) -> Floats:
+    """Return one number of each parameter."""
+    numbers = []
+    for name, of in parameters.items():
+        value = of.get(key, default) if isinstance(of, dict) else None
+        try:
+            numbers.append(float(value))  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            raise ValueError(f"{key} of {name} is no number") from None
+        if isinstance(value, bool) or not np.isfinite(numbers[-1]):
+            raise ValueError(f"{key} of {name} is no finite number")
+    return np.array(numbers)
+
+
+def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Floats:
+    """Return the matrix (P, P) of a covariance."""
+    size, rows = len(names), data.get(key)
+    if not isinstance(rows, list) or len(rows) != size or any(not isinstance(r, list) or len(r) != size for r in rows):
+        raise ValueError(f"{key} must be {size} x {size} numbers, as there are {size} parameters")
+    try:
+        matrix = np.array([[float(number) for number in row] for row in rows])
+    except (TypeError, ValueError):
+        raise ValueError(f"{key} is no matrix of numbers") from None
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{key} has a number that is not finite")
+    if (np.diagonal(matrix) <= 0).any():
+        raise ValueError(f"{key} has a variance that is not positive")
+    scale = np.sqrt(np.diagonal(matrix))
+    if (np.abs(matrix - matrix.T) > _ASYMMETRY * np.outer(scale, scale)).any():
+        raise ValueError(f"{key} is not symmetric")
+    matrix = (matrix + matrix.T) / 2
+    try:
+        np.linalg.cholesky(matrix / np.outer(scale, scale))  # of the correlation, because the units differ
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{key} is not positive definite") from None
+    return matrix

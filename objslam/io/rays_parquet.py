@@ -26,13 +26,18 @@ class RaysTable:
     camera: Any  # (R,) camera name.
     box: Floats  # (R, 4) x1, y1, x2, y2, px of the raw image.
     label: Any  # (R,) label of the box.
+    sigma: Floats  # (R,) standard deviation of the residual along one axis by the settings, rad.
+    residual_before: Floats  # (R,) residual with the shared errors left in, rad, NaN if they were not estimated.
+    image: Floats  # (R, 2) centre of the box, as a share of the image's width and height.
+    speed: Floats  # (R,) speed of the robot, m/s.
+    turn_rate: Floats  # (R,) turn rate of the robot to the left, rad/s.
 
     def __len__(self) -> int:
         return len(self.object)
 
 
 def dump_rays(rays: RaysTable) -> bytes:
-    """Return the content of rays.parquet. Object -1 and residual NaN become null. Raises OutputError for invalid text."""
+    """Return the content of rays.parquet. Object -1 and NaN residuals become null. Raises OutputError for invalid text."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -56,6 +61,11 @@ def dump_rays(rays: RaysTable) -> bytes:
             "score": pa.array(rays.score),
             "camera": texts(rays.camera),
             "box": lists(rays.box),
+            "sigma": pa.array(rays.sigma),
+            "residual_before": pa.array(rays.residual_before, mask=np.isnan(rays.residual_before)),
+            "image": lists(rays.image),
+            "speed": pa.array(rays.speed),
+            "turn_rate": pa.array(rays.turn_rate),
         }
     )
     buffer = io.BytesIO()
@@ -88,6 +98,11 @@ def read_rays(file: Path) -> RaysTable:
             camera=np.array(table["camera"].to_pylist(), dtype=object),
             box=rows("box", 4),
             label=np.array(table["label"].to_pylist(), dtype=object),
+            sigma=numbers("sigma"),
+            residual_before=numbers("residual_before"),
+            image=rows("image", 2),
+            speed=numbers("speed"),
+            turn_rate=numbers("turn_rate"),
         )
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error

@@ -22,6 +22,7 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.checks.unexplained import warn_of_unexplained
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -31,12 +32,6 @@ _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
 """The noise (m, rad) of solved poses that an association expects. Larger values let it tolerate larger residuals."""
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
-_USUAL = 0.12
-"""The usual share of boxes that are false or show moving objects. A larger share warns less often."""
-_IMPLAUSIBLE = 0.4
-"""The share of boxes without an object above which the input may be wrong. In simulation it is 0.1 for right input, and
-at least 0.5 for swapped axes, mirrored images or boxes of another image size. A larger share warns less often."""
-_INPUT = "the stamps, base_T_camera, the axes of the poses, and that boxes are x1 y1 x2 y2 in px of this image size"
 MANY, SECOND = 5, 0.25
 """The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
 values accept fewer second objects."""
@@ -108,11 +103,27 @@ def solve(
         association, estimate, rounds = _joint(
             frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, start, errors
         )
-        if errors is not None and estimate.calibration is not None:
-            keyframes, rays_of_keyframes, _ = errors.at(estimate.calibration.values)
-    _count_unexplained(rays_of_keyframes, association, ledger)
+        if errors is not None:
+            keyframes, rays_of_keyframes = without_errors(errors, estimate)
+    warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     return Solution(keyframes, rays_of_keyframes, association, estimate, tuple(rounds), recorded)
+
+
+def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
+    """Return the keyframes and rays that an estimate belongs to: without its shared errors, and with its noise."""
+    values = errors.mean if estimate.calibration is None else estimate.calibration.values
+    keyframes, rays, _ = with_noise_of(errors, estimate).at(values)
+    return keyframes, rays
+
+
+def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
+    """Return shared errors with the noise of an estimate.
+
+    Lengths are as they were measured: only inside a solve they make up for its shrinkage.
+    """
+    noise = errors.noise if estimate.noise is None else estimate.noise
+    return errors.with_noise(replace(noise, shrinkage=0.0))
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
@@ -141,13 +152,14 @@ def _joint(
     measured = frames, all_rays
 
     def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
-        nonlocal theta, keyframes, rays
+        nonlocal theta, errors, keyframes, rays
         solved = batch_solver.solve_joint(
             keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, theta
         )
-        if errors is not None and solved.calibration is not None:
-            theta = solved.calibration.values
-            keyframes, rays, _ = errors.at(theta)
+        if errors is not None and solved.noise is not None:
+            errors = errors.with_noise(solved.noise)
+            theta = solved.calibration.values if solved.calibration is not None else errors.mean
+            keyframes, rays = without_errors(errors, solved)
         if trace is not None:
             trace.end_round(why, association, solved)
         return solved
@@ -172,6 +184,8 @@ def _joint(
         progress(f"association, round {number + 1}", 0, 0)
         if errors is not None and theta is not None:
             frames, all_rays, _ = errors.take(*measured).at(theta, drift=False)
+            # Noise below the nominal one is that of rays which agreed. A gate must let the others in, too.
+            all_rays = replace(all_rays, sigma=np.maximum(all_rays.sigma, measured[1].sigma))
         at = correct_poses(frames.stamps, frames.map_T_base, keyframes.stamps, keyframes.map_T_base, map_T_base)
         scale = 1.0 if rounds else _FIRST
         noise = np.hypot(all_rays.sigma, scale * _SOLVED_YAW), scale * _SOLVED_XY
@@ -289,16 +303,3 @@ def _labels_tell(settings: Settings, association: Association, weight: Floats) -
     number = np.bincount(association.object[held], minlength=association.count)
     rejected = np.bincount(association.object[held & (weight == 0)], minlength=association.count)
     return not ((rejected >= MANY) & (rejected > SECOND * number)).any()
-
-
-def _count_unexplained(rays: Rays, association: Association, ledger: Ledger) -> None:
-    """Warn if there is no object, or if more boxes than usual belong to no object."""
-    left = association.object < 0
-    if association.count and left.mean() <= _USUAL:
-        return
-    number = np.bincount(rays.label[left], minlength=len(rays.label_names))
-    worst = ", ".join(f"{rays.label_names[i]} {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
-    why = "" if association.count else "; an object needs at least three boxes from three places"
-    if left.mean() > _IMPLAUSIBLE:
-        why += f"; unless most things move, the input may be wrong: check {_INPUT}"
-    ledger.warn(f"{left.sum()} of {len(left)} boxes are explained by no object at rest ({worst}){why}")

@@ -13,17 +13,41 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import angles_off, widest_angle
+from objslam.core.geometry import angles_off, is_planar, widest_angle
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
 from objslam.mapping.alternation import Solution
 
 
-def describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> tuple[ObjectMap, Floats]:
+def make_result(solution: Solution, objects: ObjectMap, residual: Floats, **more: Any) -> RunResult:
+    """Return the result of a solution that `describe` described. more: the fields that the solution does not tell."""
+    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
+    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
+    return RunResult(
+        map=objects,
+        keyframes=keyframes,
+        map_T_base=estimate.map_T_base,
+        rays=rays,
+        association=solution.association,
+        origins=origins,
+        directions=directions,
+        residual=residual,
+        weight=estimate.weight,
+        trace=solution.trace,
+        calibration=estimate.calibration,
+        **more,
+    )
+
+
+def describe(
+    solution: Solution, cameras: tuple[Camera, ...], settings: Settings, *, trusted: bool = True
+) -> tuple[ObjectMap, Floats]:
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
     The numbers of rays and frames in the map leave out rejected rays, unless all rays of the object are rejected.
+    trusted: whether positions can be relied on. If not, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
@@ -42,7 +66,7 @@ def describe(solution: Solution, cameras: tuple[Camera, ...], settings: Settings
         parallax = widest_angle(directions[kept])
         solved = bool(estimate.solved[j] and np.isfinite(covariance).all())
         status = status_of(
-            sigma=float(estimate.seen_sigma[j]) if solved else np.inf,
+            sigma=float(estimate.seen_sigma[j]) if solved and trusted else np.inf,
             reach=reach(estimate.positions[j], origins[kept]),
             rays=len(kept),
             parallax=parallax,
@@ -91,7 +115,11 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Return the content of summary.json. counts: how many images, frames and boxes the driver found."""
+    """Return the content of summary.json. counts: how many images, frames and boxes the driver found.
+
+    `map_frame` in it says what fixed the frame of the map: `localization`, or `odometry` if nothing absolute did. `planar`
+    says whether the measured path has one height, roll and pitch.
+    """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
@@ -100,6 +128,8 @@ def summarise(
         "log": name,
         "log_path": None if path is None else str(path),
         "mode": settings.mode,
+        "map_frame": "localization" if solution.keyframes.localized_every else "odometry",
+        "planar": is_planar(solution.keyframes.map_T_base),
         "counts": {
             **counts,
             "keyframes": len(solution.keyframes),
@@ -114,6 +144,7 @@ def summarise(
         },
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
+        "noise": None if estimate.noise is None else estimate.noise.to_dict(),
         "dropped": dict(ledger.dropped),
         "dropped_examples": {k: v for k, v in ledger.examples.items() if v},
         "cost_before": estimate.cost_before,

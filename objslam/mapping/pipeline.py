@@ -17,21 +17,33 @@ from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import Progress, seen_something, solve
-from objslam.mapping.describe import describe, summarise
-from objslam.mapping.plausibility import warn_of_large_errors
+from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.shared_errors import uncorrected
+from objslam.mapping.checks.verdict import say, widened
+from objslam.mapping.corrected import corrected
+from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.reconstruction import reconstruct
+from objslam.mapping.uncorrected import uncorrected_residual
 
 
 def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    LogError if no frame lies on the path. SolveError if no box gives a usable ray.
+    LogError if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
+    or does not fit the log.
     """
-    log = _chosen_poses(log, settings)
+    log = chosen_poses(log, settings)
+    expected = take_out_expected(log, settings)
+    log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
+    diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
+        if settings.checks.use:
+            diagnosis = diagnose(expected, settings)
+            say(diagnosis, ledger)
         frames = build_keyframes(log, settings, ledger)
         rays = build_rays(log, frames, settings, ledger)
     if len(rays) == 0:
@@ -42,16 +54,19 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     with _stage("solve", seconds, progress):
         errors = shared_errors(log, *seen_something(frames, rays), settings)
         solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
-    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
-    if errors is not None and estimate.calibration is not None:
-        log = errors.corrected_log(estimate.calibration.values)
+    if errors is not None:
+        solution, log = corrected(solution, errors, ledger)
         cameras = tuple(c.camera for c in log.cameras)
-        warn_of_large_errors(estimate.calibration, ledger)
-    objects, residual = describe(solution, cameras, settings)
-    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
-    path = log.localization or log.odometry
+        if settings.checks.use and solution.estimate.calibration is not None:
+            diagnosis = diagnosis.with_findings(uncorrected(solution.estimate.calibration, errors.bounds))
+            say(diagnosis, ledger)
+    keyframes, estimate = solution.keyframes, solution.estimate
+    objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
+    objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
+    path = log.robot_path
     assert path is not None  # build_keyframes raises LogError otherwise
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
+    residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
     if settings.reconstruction.use and any(c.depth is not None for c in log.cameras):
         with _stage("reconstruction", seconds, progress):
@@ -65,26 +80,22 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         "frames_on_path": len(frames),
         "detections": sum(len(detections) for detections in found),
     }
-    return RunResult(
-        map=objects,
-        keyframes=keyframes,
-        map_T_base=estimate.map_T_base,
-        rays=rays,
-        association=solution.association,
-        origins=origins,
-        directions=directions,
-        residual=residual,
-        weight=estimate.weight,
-        summary=summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
+    return make_result(
+        solution,
+        objects,
+        residual,
+        summary={
+            **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
+            "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
+        },
         settings=settings,
         cameras=cameras,
         path=path,
         path_after=path_after,
-        trace=solution.trace,
         images=tuple(c.rgb for c in log.cameras),
         surface=surface,
         surface_before=before,
-        calibration=estimate.calibration,
+        residual_before=residual_before,
     )
 
 
@@ -101,7 +112,8 @@ def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Fl
     return Trajectory(path.stamps, np.where(inside[:, None, None], poses, after.poses))
 
 
-def _chosen_poses(log: Log, settings: Settings) -> Log:
+def chosen_poses(log: Log, settings: Settings) -> Log:
+    """Return the log with the poses that the settings choose. LogError if it has none of them."""
     use = settings.poses.use
     if use == "auto":
         return log

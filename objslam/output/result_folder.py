@@ -10,6 +10,7 @@ import numpy as np
 
 from objslam.config import dump_settings
 from objslam.core.result import RunResult
+from objslam.core.trajectory import rates
 from objslam.core.types import CameraLog, Trajectory, Truth
 from objslam.errors import OutputError
 from objslam.evaluation.alignment import lay_truth
@@ -142,6 +143,9 @@ def _rays_table(result: RunResult) -> RaysTable:
     rays, keyframes = result.rays, result.keyframes
     ids = np.array([*(o.id for o in result.map.objects), -1], dtype=np.int64)
     cameras = np.array([camera.name for camera in result.cameras], dtype=object)
+    sizes = np.array([(camera.width, camera.height) for camera in result.cameras], dtype=np.float64).reshape(-1, 2)
+    speed, turn_rate = rates(result.path_after, keyframes.stamps)
+    before = result.residual_before
     return RaysTable(
         object=ids[result.association.object],
         stamp=keyframes.stamps[rays.keyframe],
@@ -153,6 +157,11 @@ def _rays_table(result: RunResult) -> RaysTable:
         camera=cameras[keyframes.camera[rays.keyframe]],
         box=rays.box,
         label=np.array(rays.label_names, dtype=object)[rays.label],
+        sigma=rays.sigma,
+        residual_before=np.full(len(rays), np.nan) if before is None else before,
+        image=(rays.box[:, :2] + rays.box[:, 2:]) / 2 / sizes[keyframes.camera[rays.keyframe]],
+        speed=speed[rays.keyframe],
+        turn_rate=turn_rate[rays.keyframe],
     )
 
 

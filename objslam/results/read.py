@@ -1,6 +1,8 @@
-"""Readers of a result folder: its map, path, rays, odometry and ground truth."""
+"""Readers of a result folder: its map, summary, path, rays, odometry and ground truth."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
@@ -17,6 +19,24 @@ from objslam.results import files
 def load_map(out: Path) -> ObjectMap:
     """Read the object map of the result folder `out`. OutputError names what is missing or malformed."""
     return read_objects(_existing(out, files.OBJECTS))
+
+
+def load_summary(out: Path) -> dict[str, Any]:
+    """Read summary.json of the result folder `out`. OutputError if it is missing or not a JSON object."""
+    return load_json(_existing(out, files.SUMMARY))
+
+
+def load_json(file: Path) -> dict[str, Any]:
+    """Read a file that holds one JSON object. OutputError if it cannot be read, or holds something else."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
+    except ValueError as error:
+        raise OutputError(f"is not JSON: {error}", where=str(file)) from error
+    if not isinstance(data, dict):
+        raise OutputError("is not a JSON object", where=str(file))
+    return data
 
 
 def load_trajectory(out: Path) -> Trajectory:

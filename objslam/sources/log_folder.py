@@ -70,7 +70,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     cameras cannot be folder names, if a file cannot be written, or if `check_target` refuses the path.
     """
     path = Path(os.path.realpath(path))
-    if not log.cameras or not (log.odometry or log.localization):
+    if not log.cameras or log.robot_path is None:
         missing = "odometry or localization" if log.cameras else "cameras"
         raise OutputError(f"cannot write a log without {missing}", where=log.name)
     names = [camera_log.camera.name for camera_log in log.cameras]

@@ -54,7 +54,7 @@ def contents(log: Log) -> Contents:
     """Summarise a log."""
     streams = [_path("odometry", log.odometry), _path("localization", log.localization)]
     missing = []
-    if log.odometry is None and log.localization is None:
+    if log.robot_path is None:
         missing.append("there is neither odometry nor localisation")
     if not log.cameras:
         missing.append("there is no camera")
@@ -74,7 +74,7 @@ def contents(log: Log) -> Contents:
             missing.append(f"{where}: no detections; {FIND_BOXES}")
         else:
             missing.append(f"{where}: neither detections nor images")
-        missing += off_path(where, frames, log.localization or log.odometry)
+        missing += off_path(where, frames, log.robot_path)
     if log.truth is not None:
         streams.append(_path("truth", log.truth.trajectory))
     cameras = tuple(camera_log.camera for camera_log in log.cameras)

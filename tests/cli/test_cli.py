@@ -14,17 +14,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
 
 from objslam import __version__
 from objslam.cli import main
 from objslam.config import Odometry, Settings
-from objslam.io.calibration_yaml import load_calibration
+from objslam.core.calibration import Calibration
+from objslam.io.calibration_yaml import dump_calibration, load_calibration
 from objslam.results.read import load_map, load_trajectory
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START
+from objslam.simulation.wrong_inputs import MISTAKES
 from objslam.sources.log_folder import write_log_folder
 
 LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
@@ -487,7 +490,6 @@ def with_boxes_that_are_none(folder):
         (with_a_few_nan_poses, ("pose line with a value that is not finite", "odometry.txt:21")),
         (with_stamps_going_back, ("stamp that repeats or goes back", "odometry.txt:61", "detections.jsonl:31")),
         (with_labels_of_unknown_type, ("a label is not a string", "detections.jsonl:4")),
-        (with_the_camera_of_another_size, ("outside the image", "camera left")),
         (with_a_path_that_begins_late, ("before or after the localisation", f"stamp {START:.3f}")),
         (with_boxes_that_are_none, ("detections.jsonl:5", "detections.jsonl:6")),
     ],
@@ -504,6 +506,20 @@ def test_what_is_spoilt_is_counted_and_the_rest_is_mapped(objslam, variant, tmp_
     assert len(resolved) >= 3
     for o in resolved:
         assert np.linalg.norm(o.position - dict(THINGS)[o.label]) < 0.3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_camera_of_another_size_is_said_and_nothing_is_sure(objslam, variant, tmp_path, mode):
+    with_the_camera_of_another_size(variant)
+    run = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *LEAN)
+    assert run.code == 0, run.err
+    run.says_somewhere("warning: dropped", "outside the image", "camera left")
+    run.says_somewhere("the input")
+    assert not load_map(tmp_path / "out").resolved()
+    objslam("run", variant, "-o", tmp_path / "all", "--mode", mode, "--set", "checks.use=false", *LEAN)
+    resolved = load_map(tmp_path / "all").resolved()
+    assert len(resolved) >= 3
+    assert all(np.linalg.norm(o.position - dict(THINGS)[o.label]) < 0.3 for o in resolved)
 
 
 def only_first_cup(folder, count):
@@ -798,6 +814,85 @@ def test_calibrate_and_run_with_what_it_found(objslam, tmp_path):
     assert "front.clock" in done.out
 
 
+@pytest.fixture(scope="module")
+def late_camera(tmp_path_factory):
+    """A short drive without an error of the odometry, whose camera clock is 0.15 s off."""
+    log = simulate(preset("demo", objects=8, classes=8, frames=120, localization=None, odometry=Odometry()), 1)
+    folder = tmp_path_factory.mktemp("logs") / "late"
+    write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), folder)
+    return folder
+
+
+def test_calibrate_leaves_out_a_log_that_it_cannot_use(objslam, tmp_path, late_camera):
+    file = tmp_path / "robot.yaml"
+    logs = (str(tmp_path / "none"), str(late_camera))
+    done = objslam("calibrate", *logs, "-o", str(file), "--set", "association.method=by_label")
+    assert done.code == 0, done.err
+    done.says_somewhere("warning:", "none is left out")
+    assert "from 1 log (1 left out)" in done.out
+    assert load_calibration(file).names
+
+
+def test_calibrate_fails_if_no_log_is_left(objslam, tmp_path):
+    done = objslam("calibrate", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(tmp_path / "robot.yaml"))
+    assert done.code == 1
+    done.says_somewhere("a is left out", "b is left out", "none of the 2 logs can be used")
+    assert not (tmp_path / "robot.yaml").exists()
+
+
+def test_calibrate_replaces_a_file_only_if_asked(objslam, tmp_path, late_camera):
+    file = tmp_path / "robot.yaml"
+    file.write_text("mine")
+    done = objslam("calibrate", str(late_camera), "-o", str(file))
+    assert done.code == 1
+    done.says("robot.yaml", "there is a file already", "--overwrite")
+    assert file.read_text() == "mine"
+    fast = ("--set", "association.method=by_label")
+    done = objslam("calibrate", str(late_camera), "-o", str(file), "--overwrite", *fast)
+    assert done.code == 0, done.err
+    assert load_calibration(file).names
+    objslam("calibrate", str(late_camera), "-o", str(tmp_path / "no" / "robot.yaml")).says("folder does not exist")
+
+
+def test_calibrate_that_may_not_estimate_says_so(objslam, tmp_path, late_camera):
+    done = objslam("calibrate", str(late_camera), "-o", str(tmp_path / "robot.yaml"), "--set", "calibration.use=false")
+    assert done.code == 2
+    done.says("nothing to calibrate", "calibration.use=false")
+
+
+def test_a_wrong_calibration_file_fails_before_the_log_is_read(objslam, tmp_path):
+    (tmp_path / "robot.yaml").write_text("parameters: {}")
+    for more in (("--mode", "joint"), ("--mode", "fixed"), ("--set", "calibration.use=false")):
+        done = objslam("run", str(tmp_path / "no_log"), "--calibration", str(tmp_path / "robot.yaml"), *more)
+        assert done.code == 2
+        done.says("robot.yaml", "no parameters")
+
+
+def test_a_calibration_of_before_is_no_news(objslam, tmp_path, late_camera):
+    """Calibrating a log anew from its own file tightens it like a second log, and combining keeps the file's prior once."""
+    first, twice, settings = tmp_path / "first.yaml", tmp_path / "twice.yaml", ("--set", "association.method=by_label")
+    assert objslam("calibrate", str(late_camera), "-o", str(first), *settings).code == 0
+    one = load_calibration(first)
+    known = Calibration(
+        (*one.names, "rear.yaw"), np.append(one.values, 0.3), block_diag(one.covariance, 1e-4), np.append(one.prior, 1)
+    )
+    first.write_text(dump_calibration(known))
+    done = objslam("calibrate", str(late_camera), "-o", str(twice), *settings, "--set", f"calibration.file={first}")
+    assert done.code == 0, done.err
+    done.says_somewhere("rear.yaw")
+    again = load_calibration(twice)
+    assert again.names == known.names
+    assert again.values[-1] == pytest.approx(0.3)
+    assert again.sigma[-1] == pytest.approx(0.01)
+    np.testing.assert_allclose(again.expected, known.values, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(again.before, known.covariance, rtol=1e-6, atol=1e-15)
+    assert (again.sigma < 1.001 * known.sigma).all()
+    # Two equal halves of information: each of the parameters that the log tells has a sigma smaller by the root of 2.
+    told = one.sigma < 0.2 * one.prior
+    assert told.any()
+    np.testing.assert_allclose((again.sigma / known.sigma)[:-1][told], np.sqrt(0.5), atol=0.1)
+
+
 def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
     log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
     write_log_folder(log, tmp_path / "log")
@@ -805,3 +900,28 @@ def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
     assert done.code == 2
     assert "nothing to calibrate" in done.err
     assert not (tmp_path / "robot.yaml").exists()
+
+
+def test_doctor_names_what_is_wrong_and_leaves_the_log_alone(objslam, tmp_path):
+    """A camera.yaml with the inverse of base_T_camera, as an optical frame's pose is often written."""
+    log = simulate(preset("demo", objects=10, classes=10, frames=200), 3)
+    write_log_folder(log, tmp_path / "right")
+    write_log_folder(MISTAKES["base_T_camera inverted"](log), tmp_path / "wrong")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    right, wrong = (objslam("doctor", tmp_path / name) for name in ("right", "wrong"))
+    assert right.code == wrong.code == 0
+    assert "nothing wrong was found" in right.out
+    assert "base_T_camera is probably camera_T_base" in wrong.out
+    assert "the log as it is" in wrong.out
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_run_on_wrong_input_says_so(objslam, tmp_path):
+    log = simulate(preset("demo", objects=10, classes=10, frames=200), 3)
+    write_log_folder(MISTAKES["yaw of poses negated"](log), tmp_path / "log")
+    called = objslam("run", tmp_path / "log", "-o", tmp_path / "out", *LEAN)
+    assert called.code == 0
+    called.says_somewhere("yaw of the poses is clockwise", "no object is called ok")
+    told = summary(tmp_path / "out")
+    assert told["wrong_input"][0]["name"] == "yaw negated"
+    assert told["counts"]["objects"] == told["counts"]["unresolved"]

@@ -225,19 +225,19 @@ def test_no_path_and_no_query_give_nothing():
     assert len(valid) == 0
 
 
-@given(seeds, st.sampled_from(["se2", "sim2", "se3"]), st.floats(0.2, 5.0))
+@given(seeds, st.sampled_from(["se2", "sim2", "se3", "sim3"]), st.floats(0.2, 5.0))
 def test_alignment_finds_the_transform_that_was_applied(seed, kind, factor):
     source = np.random.default_rng(seed).uniform(-4, 4, (10, 3))
-    moved = some_poses(seed, 1)[0] if kind == "se3" else lift_se2(np.random.default_rng(seed).uniform(-3, 3, 3))
+    moved = some_poses(seed, 1)[0] if kind in ("se3", "sim3") else lift_se2(np.random.default_rng(seed).uniform(-3, 3, 3))
     moved[2, 3] = 0.7
-    scale = factor if kind == "sim2" else 1.0
+    scale = factor if kind in ("sim2", "sim3") else 1.0
     target = scale * source @ moved[:3, :3].T + moved[:3, 3]
     pose, got = align(source, target, kind)
     np.testing.assert_allclose(pose, moved, atol=1e-9)
     assert got == pytest.approx(scale)
 
 
-@pytest.mark.parametrize("kind", ["se2", "sim2", "se3"])
+@pytest.mark.parametrize("kind", ["se2", "sim2", "se3", "sim3"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_alignment_of_noisy_points_is_a_least_squares_optimum(kind, seed):
     rng = np.random.default_rng(seed)
@@ -245,8 +245,8 @@ def test_alignment_of_noisy_points_is_a_least_squares_optimum(kind, seed):
     target = source @ some_poses(seed, 1, angle=1.0)[0][:3, :3].T + rng.standard_normal((8, 3))
 
     def cost(x):
-        rotation = Rotation.from_rotvec(x[:3] if kind == "se3" else [0, 0, x[2]]).as_matrix()
-        residual = (x[6] if kind == "sim2" else 1.0) * source @ rotation.T + x[3:6] - target
+        rotation = Rotation.from_rotvec(x[:3] if kind in ("se3", "sim3") else [0, 0, x[2]]).as_matrix()
+        residual = (x[6] if kind in ("sim2", "sim3") else 1.0) * source @ rotation.T + x[3:6] - target
         return (residual[:, :2] ** 2).sum() if kind == "sim2" else (residual**2).sum()
 
     pose, scale = align(source, target, kind)
@@ -257,7 +257,7 @@ def test_alignment_of_noisy_points_is_a_least_squares_optimum(kind, seed):
 
 def test_alignment_of_too_few_points_shifts_only():
     source, target = np.array([[1.0, 2.0, 3.0]]), np.array([[4.0, 4.0, 4.0]])
-    for kind in ("se2", "sim2", "se3"):
+    for kind in ("se2", "sim2", "se3", "sim3"):
         pose, scale = align(source, target, kind)
         np.testing.assert_allclose(pose, make_pose(np.eye(3), np.array([3.0, 2.0, 1.0])))
         assert scale == 1.0
@@ -270,10 +270,26 @@ def test_alignment_of_too_few_points_shifts_only():
         assert scale == 1.0
 
 
-def test_alignment_never_mirrors():
-    source = np.random.default_rng(0).uniform(-1, 1, (10, 3))
-    pose, _ = align(source, source * [1, 1, -1], "se3")
+@given(seeds, st.sampled_from(["se3", "sim3"]), st.integers(0, 2), st.floats(0.2, 5.0))
+def test_alignment_never_mirrors(seed, kind, axis, factor):
+    source = np.random.default_rng(seed).uniform(-1, 1, (10, 3))
+    mirrored = source * np.where(np.arange(3) == axis, -factor, factor)
+    pose, scale = align(source, mirrored @ some_poses(seed, 1)[0][:3, :3].T, kind)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert scale > 0
+
+
+@given(seeds, st.sampled_from(["se3", "sim3"]), st.integers(3, 6))
+def test_alignment_of_points_on_a_line_turns_no_further_than_the_line(seed, kind, count):
+    rng = np.random.default_rng(seed)
+    along, toward = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    at = rng.uniform(-3, 3, (count, 1)) + np.arange(count)[:, None]
+    scale = 2.0 if kind == "sim3" else 1.0
+    pose, got = align(at * along, scale * at * toward + [1.0, 2.0, 3.0], kind)
+    turned = Rotation.from_matrix(pose[:3, :3])
+    np.testing.assert_allclose(turned.apply(along), toward, atol=1e-7)
+    assert turned.magnitude() == pytest.approx(np.arccos(np.clip(along @ toward, -1, 1)), abs=1e-6)
+    assert got == pytest.approx(scale)
 
 
 @given(seeds, st.integers(2, 25))

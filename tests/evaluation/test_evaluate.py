@@ -11,54 +11,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
+from scenes import CLASSES, a_map, a_path, a_truth, an_object, numbers, scene, show
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from synthetic_result import clusters, synthetic_result
 
-from objslam.config import Output, Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import lift_se2
-from objslam.core.object_map import MapObject, ObjectMap
-from objslam.core.types import Trajectory, Truth, TruthObject
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Trajectory, Truth
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.alignment import match_points
-from objslam.evaluation.evaluate import Evaluation, evaluate, evaluate_folder, write_evaluation
-from objslam.evaluation.table import evaluation_table
-from objslam.io.objects_json import dump_truth_objects
-from objslam.output.result_folder import write_result
-
-
-def an_object(number: int, label: str, position: Floats, status: str = "ok") -> MapObject:
-    return MapObject(number, label, np.asarray(position, float), None, status, 9, 9, 20.0, 0.2, 0.0, 1.0)  # type: ignore[arg-type]
-
-
-def a_map(positions: Floats, labels: list[str]) -> ObjectMap:
-    return ObjectMap(tuple(an_object(10 + i, label, p) for i, (label, p) in enumerate(zip(labels, positions, strict=True))))
-
-
-def a_truth(positions: Floats, labels: list[str], path: Trajectory | None = None) -> Truth:
-    objects = tuple(
-        TruthObject(i, label, np.asarray(p, float)) for i, (label, p) in enumerate(zip(labels, positions, strict=True))
-    )
-    return Truth(objects, path)
-
-
-def a_path(seed: int = 0, count: int = 60) -> Trajectory:
-    t = np.linspace(0, 4, count)
-    wobble = np.random.default_rng(seed).uniform(1, 2, 3)
-    return Trajectory(10 + t, lift_se2(np.column_stack([t * wobble[0], np.sin(t * wobble[1]) * 3, t])))
+from objslam.evaluation.evaluate import evaluate
+from objslam.evaluation.evaluate_folder import write_evaluation
 
 
 def moved(trajectory: Trajectory, pose: Floats, scale: float = 1.0) -> Trajectory:
     poses = pose @ trajectory.poses
     poses[:, :3, 3] = scale * trajectory.poses[:, :3, 3] @ pose[:3, :3].T + pose[:3, 3]
     return Trajectory(trajectory.stamps, poses)
-
-
-def numbers(evaluation: Evaluation) -> dict[str, float]:
-    data = evaluation.to_dict()
-    return {k: v for k, v in data.items() if isinstance(v, int | float) and not isinstance(v, bool)}
 
 
 def test_exact_counts() -> None:
@@ -91,6 +61,7 @@ def test_exact_counts() -> None:
         "label": "cup",
         "error": pytest.approx(0.3),
         "mahalanobis": None,
+        "mahalanobis_3d": None,
         "offset": pytest.approx([0.3, 0, 0]),
     }
     assert data["missed_objects"] == [{"truth_id": 2, "label": "book"}, {"truth_id": 3, "label": "cup"}]
@@ -125,17 +96,7 @@ def test_matching_is_the_best_of_all_one_to_one_choices(seed: int, n: int, m: in
     assert float(((a[rows] - b[columns]) ** 2).sum()) == pytest.approx(best[1])
 
 
-CLASSES = st.sampled_from([1, 3, 12])
-KINDS = st.sampled_from(["none", "se2", "sim2"])
-
-
-def scene(seed: int, classes: int) -> tuple[Floats, list[str], Floats, list[str]]:
-    """12 true objects; a map that misses two of them, has two false ones, and is 2 cm off."""
-    rng = np.random.default_rng(seed)
-    truth = np.column_stack([rng.uniform(0, 10, 12), rng.uniform(0, 8, 12), rng.uniform(0, 1, 12)])
-    labels = [f"class {i % classes}" for i in range(12)]
-    found = np.concatenate([truth[2:] + rng.normal(scale=0.02, size=(10, 3)), [[30, 30, 0], [-25, 7, 1]]])
-    return truth, labels, found, [*labels[2:], labels[0], labels[1]]
+KINDS = st.sampled_from(["none", "se2", "sim2", "se3", "sim3"])
 
 
 @settings(max_examples=25)
@@ -214,7 +175,7 @@ def test_one_wrong_landmark_does_not_move_the_alignment() -> None:
     assert data["position_max"] == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["none", "se2", "sim2"])
+@pytest.mark.parametrize("kind", ["none", "se2", "sim2", "se3", "sim3"])
 def test_nothing_matched_has_no_numbers(kind: str, tmp_path: Path) -> None:
     truth = a_truth([[0, 0, 0], [1, 1, 1]], ["cup", "cup"])
     for found in (ObjectMap(()), a_map([[0, 0, 0]], ["book"]), ObjectMap((an_object(0, "cup", [0, 0, 0], "unresolved"),))):
@@ -306,12 +267,6 @@ def test_objects_without_a_path_and_the_other_way_round() -> None:
     }
 
 
-def show(evaluation: Evaluation) -> str:
-    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
-    console.print(evaluation_table(evaluation))
-    return console.export_text()
-
-
 def test_the_table_shows_scores_and_the_worst_object_first() -> None:
     truth = a_truth([[0, 0, 0], [1, 0, 0], [2, 0, 0]], ["cup", "[red]book", "pen"], a_path())
     found = a_map([[0.1, 0, 0], [1.3, 0, 0], [9, 9, 9]], ["cup", "[red]book", "pen"])
@@ -330,69 +285,3 @@ def test_the_table_shows_scores_and_the_worst_object_first() -> None:
     alone = show(evaluate(found, dataclasses.replace(truth, trajectory=None)))
     assert "ATE" not in alone
     assert "matched" not in show(evaluate(found, Truth((), a_path()), a_path()))
-
-
-def test_what_was_compared_with_is_named(tmp_path: Path) -> None:
-    result, truth = synthetic_result(
-        *clusters(), keyframes=5, settings=Settings(output=Output(recording=False, picture=False))
-    )
-    out, other = tmp_path / "mine", tmp_path / "other"
-    write_result(result, out, truth)
-    write_result(result, other)
-    for path, kept, title in ((None, None, "against the ground truth"), (other / "objects.json",) * 3):
-        write_evaluation(evaluation := evaluate_folder(out, path), out)
-        assert json.loads((out / "evaluation.json").read_text())["truth"] == (kept and str(kept))
-        console = Console(width=500, record=True, quiet=False)
-        console.print(evaluation_table(evaluation))
-        assert str(title) in console.export_text()
-
-
-def test_where_no_truth_was_found_is_named(tmp_path: Path) -> None:
-    settings = Settings(output=Output(recording=False, picture=False))
-    write_result(synthetic_result(*clusters(), keyframes=5, settings=settings)[0], tmp_path / "out")
-    (tmp_path / "log").mkdir()
-    with pytest.raises(LogError, match=r"looked for groundtruth/objects\.json or groundtruth/trajectory\.txt") as caught:
-        evaluate_folder(tmp_path / "out", tmp_path / "log")
-    assert caught.value.where == str(tmp_path / "log")
-    with pytest.raises(LogError, match="has no ground truth") as caught:
-        evaluate_folder(tmp_path / "out")
-    assert caught.value.where == str(tmp_path / "out")
-    (tmp_path / "empty.json").write_text(dump_truth_objects(()))
-    with pytest.raises(LogError, match=r"empty\.json: the ground truth is empty"):
-        evaluate_folder(tmp_path / "out", tmp_path / "empty.json")
-
-
-@pytest.mark.parametrize("kind", ["none", "se2", "sim2"])
-def test_honest_covariances_hold_the_truth_as_often_as_they_say(kind):
-    """Errors drawn from the covariances themselves: 95 % of them lie inside, and the median is chi-squared's."""
-    rng = np.random.default_rng(5)
-    pose = np.eye(4) if kind == "none" else lift_se2(np.array([3.0, -2.0, 0.7]))
-    scale = 1.3 if kind == "sim2" else 1.0
-    labels, squared = [f"thing {i}" for i in range(40)], []
-    for _ in range(30):
-        places = rng.uniform(-50, 50, (40, 3))
-        roots = rng.normal(scale=0.02, size=(40, 3, 3))
-        errors = (roots @ rng.standard_normal((40, 3, 1)))[..., 0]
-        turned = (places + errors) @ pose[:3, :3].T * scale + pose[:3, 3]
-        covariances = scale**2 * pose[:3, :3] @ roots @ np.swapaxes(roots, 1, 2) @ pose[:3, :3].T
-        map_ = ObjectMap(
-            tuple(
-                dataclasses.replace(an_object(i, labels[i], at), covariance=c)
-                for i, (at, c) in enumerate(zip(turned, covariances, strict=True))
-            )
-        )
-        data = evaluate(map_, a_truth(places, labels), align=kind).to_dict()
-        assert data["matched"] == 40
-        one = [row["mahalanobis"] for row in data["objects"]]
-        assert data["inside_95"] == pytest.approx(np.mean(np.array(one) < 5.991))
-        assert data["mahalanobis_median"] == pytest.approx(np.median(one))
-        squared += one
-    assert np.mean(np.array(squared) < 5.991) == pytest.approx(0.95, abs=0.02)
-    assert np.median(squared) == pytest.approx(1.386, rel=0.1)
-
-
-def test_objects_without_a_covariance_say_nothing_of_honesty():
-    places = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    data = evaluate(a_map(places, ["a", "b", "c"]), a_truth(places, ["a", "b", "c"])).to_dict()
-    assert data["mahalanobis_median"] is None
-    assert data["inside_95"] is None

@@ -12,7 +12,7 @@ from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.shared_error_jacobian import reduce_system
+from objslam.graph.shared_error_jacobian import Linearised, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
@@ -65,15 +65,15 @@ def test_the_reduced_system_is_that_of_solving_anew(localization):
     true = made.map_T_base @ made.keyframes.base_T_camera
     start = (made.keyframes.map_T_camera[0] @ inverse(true[0])) @ true, made.points
     poses, places, _, graph, values, measured = optimum(errors, theta, made, start)
-    rays = np.arange(len(made.rays))
-    system = reduce_system(graph, values, measured, errors, theta, rays, made.association.object, places, poses)
+    every = np.ones(len(made.rays), dtype=bool)
+    system = linearise(Linearised(graph, values, measured, made.association, poses, places, every), errors, theta).reduce()
     told = system.sensitivity[: 3 * len(places)].reshape(-1, 3, len(theta))
     for k, step in enumerate(0.1 * errors.steps):
         ahead, behind = (optimum(errors, theta + s * step * np.eye(len(theta))[k], made, (poses, places)) for s in (1, -1))
         moved = (ahead[1] - behind[1]) / (2 * step)
         assert_allclose(told[..., k], moved, atol=0.01 * np.abs(moved).max() + 1e-5, err_msg=errors.names[k])
         slope = (ahead[2] - behind[2]) / (2 * step)
-        assert -system.gradient[k] == pytest.approx(slope, abs=0.1 * np.sqrt(system.information[k, k]), rel=0.1)
+        assert -system.descent[k] == pytest.approx(slope, abs=0.1 * np.sqrt(system.information[k, k]), rel=0.1)
 
 
 @pytest.mark.parametrize("ranged", [True, False])

@@ -28,6 +28,11 @@ def three_rays() -> RaysTable:
         camera=np.array(["front", "left", "front"], dtype=object),
         box=rng.uniform(0, 100, (3, 4)),
         label=np.array(["cup", "café", "cup"], dtype=object),
+        sigma=rng.uniform(0, 1, 3),
+        residual_before=np.array([0.1, np.nan, 0.2]),
+        image=rng.uniform(0, 1, (3, 2)),
+        speed=rng.uniform(0, 1, 3),
+        turn_rate=rng.normal(size=3),
     )
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
 
+from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
 from objslam.errors import LogError, OutputError
@@ -16,6 +17,7 @@ from objslam.simulation import make_camera
 from objslam.sources import read
 from objslam.sources.journal.file import Journal, is_journal, messages, read_journal
 from objslam.sources.journal.records import (
+    CalibrationMessage,
     CameraMessage,
     FrameMessage,
     MountMessage,
@@ -48,10 +50,16 @@ def frames(draw):
     )
 
 
+def calibrations(count):
+    numbers = [npst.arrays(np.float64, shape, elements=FINITE) for shape in (count, (count, count), count)]
+    return st.builds(Calibration, st.tuples(*[st.text(max_size=9)] * count), *numbers)
+
+
 MESSAGES = st.one_of(
     st.builds(PoseMessage, st.sampled_from(["odometry", "localization"]), FINITE, POSES),
     st.builds(MountMessage, FINITE, st.text(max_size=9), POSES),
     st.builds(NoteMessage, FINITE, POSES),
+    st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations)),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
     frames(),
@@ -61,7 +69,7 @@ MESSAGES = st.one_of(
 def same(one, other):
     assert type(one) is type(other)
     for a, b in zip(vars(one).values(), vars(other).values(), strict=True):
-        if hasattr(a, "matrix"):
+        if hasattr(a, "matrix") or hasattr(a, "covariance"):
             same(a, b)
         elif isinstance(a, np.ndarray):
             np.testing.assert_array_equal(a, b)

@@ -11,7 +11,9 @@ import pytest
 from waiting import LIMIT, wait_for
 
 from objslam.config import Odometry, load_settings
+from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
+from objslam.io.calibration_yaml import dump_calibration
 from objslam.io.objects_json import read_objects
 from objslam.live.session.session import Session
 from objslam.results.read import load_map
@@ -151,14 +153,36 @@ def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
     assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
 
 
-@pytest.mark.parametrize("more", [(), ("--resume",)])
-def test_a_file_that_is_no_journal_stays_as_it_is(log, tmp_path, more):
+def test_a_session_starts_from_a_calibration(log, tmp_path):
+    found = Calibration(("odometry.scale", "front.yaw"), np.array([0.01, 0.02]), np.diag([1e-4, 4e-6]), np.full(2, 0.03))
+    file = tmp_path / "robot.yaml"
+    file.write_text(dump_calibration(found))
+    more = ("--speed", "0", "--no-journal", "--calibration", str(file))
+    done = subprocess.run(command(log, tmp_path / "out", *more), capture_output=True, text=True, timeout=LIMIT)
+    assert done.returncode == 0, done.stderr
+    parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
+    assert parameters["odometry.scale"]["prior_sigma"] == pytest.approx(0.01)
+    assert parameters["front.yaw"]["prior_sigma"] == pytest.approx(0.002)
+    assert parameters["front.yaw"]["value"] == pytest.approx(0.02, abs=0.01)  # of a camera that is right: the file holds it
+    assert "errors that all measurements share" in done.stdout
+    file.write_text("parameters: 3")
+    failed = subprocess.run(command(log, tmp_path / "other", *more), capture_output=True, text=True, timeout=LIMIT)
+    assert failed.returncode == 2  # as for any setting
+    assert "write it with objslam calibrate" in " ".join(failed.stderr.split())
+    assert "Traceback" not in failed.stderr
+    assert not (tmp_path / "other" / "objects.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "fault"), [((), "this file is not a journal"), (("--resume",), "cannot resume: this file is no journal")]
+)
+def test_a_file_that_is_no_journal_stays_as_it_is(log, tmp_path, more, fault):
     out = tmp_path / "out"
     out.mkdir()
     (out / "journal.objslam").write_text("my notes about journals")
     done = subprocess.run(command(log, out, "--speed", "0", *more), capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 1
-    assert "no journal" in done.stderr or "not a journal" in done.stderr
+    assert fault in " ".join(done.stderr.split())
     assert (out / "journal.objslam").read_text() == "my notes about journals"
     assert len(list(out.iterdir())) == 1
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_session import SETTINGS, errors, make_log
+from test_session import errors, make_log
 from waiting import LIMIT
 
 from objslam.config import load_settings
@@ -18,6 +18,8 @@ from objslam.live.session.session import Session
 from objslam.results.read import load_map
 from objslam.simulation import PoseNoise
 
+SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "calibration.use=false"))
+"""Shared errors are held, because the bounds below are for paths. test_live_calibration.py estimates them on such paths."""
 WHOLE, NEVER = ((0, 999),), ()
 FRAMES = (lift_se2(np.array([3.0, -2.0, 0.8])), lift_se2(np.array([-1.0, 4.0, -2.0])))
 """Where each stretch of the odometry has its own beginning."""

@@ -89,12 +89,13 @@ def test_what_places_a_frame_is_decided_by_the_poses_alone():
 
 def test_odometry_that_comes_back_waits_for_the_localisation_and_lies_as_it_says():
     course, keyframes = on_course(np.arange(0, 2, 0.1).tolist(), np.arange(0, 6, 0.1).tolist()), KeyframeTable()
-    row = {"id": 0, "camera": 0, "frame": 0, "base_T_camera": np.eye(4), "localized": True}
+    row = {"id": 0, "camera": 0, "frame": 0, "base_T_camera": np.eye(4), "mount": np.eye(4), "localized": True}
 
     def keep(stamp, placed):
         rows = {
             **row,
             "stamp": stamp,
+            "sent": stamp,
             **vars(placed),
             "camera_T_start": np.eye(4),
             "map_T_base": lift_se2(np.array([stamp, 0.0, 0.0])),

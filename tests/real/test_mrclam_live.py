@@ -22,8 +22,7 @@ def test_live_and_offline_find_the_same_in_the_same_place(data_dir, monkeypatch,
     """
     monkeypatch.setattr(maintenance, "_EVERY", every)
     log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=False))
-    # A session does not estimate shared errors.
-    settings = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false"))
+    settings = load_settings(None, ("mode=joint", "output.recording=false"))
     session = Session(settings, patient=True).start()
     ReplayAdapter(session, log, None, session.wait).run(threading.Event())
     live, reference = session.stop().map, pipeline.run(log, settings, Ledger()).map

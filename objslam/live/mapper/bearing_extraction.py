@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
-from objslam.core.diagnostics import Ledger
+from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, surest
+from objslam.frontend.corrected_log import corrected_camera, corrected_mount, refocused
 from objslam.live.mapper.frame_association import FrameRays
+from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
 _MOUNTS = 4096  # The mounts kept per camera. With more, frames of a camera on an arm may come later. They cost memory.
@@ -17,40 +18,48 @@ _MOUNTS = 4096  # The mounts kept per camera. With more, frames of a camera on a
 
 @dataclass(frozen=True)
 class FrameView:
-    """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4)."""
+    """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4).
+
+    mount: (4, 4) base_T_camera as it came, with its shared errors.
+    """
 
     camera: int
+    mount: Floats
     base_T_camera: Floats
     rays: FrameRays
 
 
 class BearingExtractor:
-    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings.
+    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings without their shared errors.
 
-    cameras, labels: the lists of the map, to which new cameras and labels are appended.
+    The lists of cameras and labels are those of the map. New cameras and labels are appended to them.
     """
 
-    def __init__(self, settings: Settings, ledger: Ledger, cameras: list[Camera], labels: list[str]) -> None:
-        self._settings, self._ledger = settings, ledger
-        self._cameras, self._labels = cameras, labels
+    def __init__(self, m: MapState) -> None:
+        self._map, self._settings, self._ledger, self._labels = m, m.given, m.counters.ledger, m.labels
         self._camera_number: dict[str, int] = {}
         self._label_number: dict[str, int] = {}
         self._mounts: dict[str, HeldMounts] = {}
 
     def add_camera(self, camera: Camera) -> None:
         """Add a camera, or replace its calibration."""
-        number = self._camera_number.setdefault(camera.name, len(self._cameras))
-        self._cameras[number : number + 1] = [camera]
+        m = self._map
+        number = self._camera_number.setdefault(camera.name, len(m.cameras))
+        m.sent_cameras[number : number + 1] = [camera]
+        m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 
     def add_mount(self, message: MountMessage) -> None:
         """Add a mount: a pose of a camera on the robot from a stamp on."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
-    def extract(self, frame: FrameMessage) -> FrameView:
-        """Return the bearings of a frame, with the mount of its camera at its stamp. Count the dropped boxes."""
-        number, settings = self._camera_number[frame.camera], self._settings
-        camera, held = self._cameras[number], self._mounts.get(frame.camera)
-        base_T_camera = camera.base_T_camera if held is None else held.at(frame.stamp, camera)
+    def extract(self, frame: FrameMessage, stamp: float) -> FrameView:
+        """Return the bearings of a frame, with the mount of its camera at a corrected stamp, s. Count the dropped boxes."""
+        number, settings, errors = self._camera_number[frame.camera], self._settings, self._map.errors
+        camera, held = self._map.sent_cameras[number], self._mounts.get(frame.camera)
+        mount = camera.base_T_camera if held is None else held.at(stamp, camera)
+        base_T_camera = self._map.cameras[number].base_T_camera
+        if held is not None:
+            base_T_camera = corrected_mount(mount, errors, frame.camera) if errors else mount
         kept, direction, sigma = box_rays(frame.boxes, frame.scores, camera, settings, self._ledger, frame.whole)
         for name in sorted(set(frame.labels) - self._label_number.keys()):
             self._label_number[name] = len(self._labels)
@@ -59,14 +68,15 @@ class BearingExtractor:
         few = surest(np.zeros(len(kept), dtype=np.int64), label[kept], frame.scores[kept], camera, self._ledger)
         kept, direction, sigma = kept[few], direction[few], sigma[few]
         reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
+        focal, longer = errors.get(f"{frame.camera}.focal", 0.0), 1 + errors.get("range_scale", 0.0)
         rays = FrameRays(
-            direction=direction,
+            direction=refocused(direction, np.ones(len(direction), dtype=bool), focal),
             sigma=sigma,
-            range=reach,
-            range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * reach,
+            range=reach * longer,
+            range_sigma=(settings.depth.sigma + settings.depth.sigma_per_m * reach) * longer,
             label=label[kept],
             score=frame.scores[kept],
             box=frame.boxes[kept],
             track=frame.track_ids[kept],
         )
-        return FrameView(number, base_T_camera, rays)
+        return FrameView(number, mount, base_T_camera, rays)

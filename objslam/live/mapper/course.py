@@ -3,15 +3,19 @@
 Localisation replaces missing odometry. It also relates the pieces of the course before and after a gap or change of source.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.geometry import adjoint, inverse
+from objslam.core.geometry import adjoint, interpolate, inverse
+from objslam.core.types import Trajectory
+from objslam.frontend.corrected_log import OdometryCorrection
+from objslam.frontend.odometry_drift import gathered_drift
 from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
-from objslam.live.mapper.tables import KeyframeTable
+from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
 _KEPT = 3.0  # Poses are kept for live.max_late and this time, s, because frames wait in a queue. A longer time costs memory.
@@ -43,12 +47,18 @@ class _Piece:
 
 
 class Course:
-    """The paths of odometry and localisation, and the course that they form."""
+    """The paths of odometry and localisation, and the course that they form.
 
-    def __init__(self, settings: Settings) -> None:
-        seconds, self._max_gap = settings.live.max_late + _KEPT, settings.poses.max_gap
+    driven, localized: the whole odometry and localisation, as they came. odometry has its shared errors taken out.
+    """
+
+    def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:
+        seconds = settings.live.max_late + _KEPT + settings.calibration.max_clock
+        self._max_gap = settings.poses.max_gap
+        self._correction = correction or OdometryCorrection({})
         self.odometry = PathBuffer(settings.odometry, seconds, self._max_gap)
         self.localization = PathBuffer(settings.odometry, seconds, self._max_gap)
+        self.driven, self.localized = PathTable(self._max_gap), PathTable(self._max_gap)
         self._noise = settings.localization.yaw, settings.localization.xy
         self._localized_by_then = -np.inf
         self._pieces: list[_Piece] = []
@@ -57,8 +67,68 @@ class Course:
 
     def add_odometry(self, stamp: float, pose: Floats) -> None:
         """Append a pose (4, 4) of the odometry."""
-        self.odometry.append(stamp, pose)
+        self.driven.append(stamp, pose)
+        self.odometry.append(stamp, self._correction.correct(stamp, pose))
         self._localized_by_then = self.localization.newest
+
+    def add_localization(self, stamp: float, pose: Floats) -> None:
+        """Append a pose (4, 4) of the localisation."""
+        self.localized.append(stamp, pose)
+        self.localization.append(stamp, pose)
+
+    def recalibrate(
+        self, errors: Mapping[str, float], corrected: Trajectory | None, settings: Settings, keyframes: KeyframeTable
+    ) -> None:
+        """Take other errors out of the odometry, and move the pieces of the course and the keyframes on it accordingly.
+
+        corrected: the odometry without its errors. keyframes: all keyframes, with their new stamps and their new map_T_base.
+        start_T_base and drift of the keyframes change. A piece that begins anew stays where its first keyframe is.
+        """
+        said = self.driven.trajectory()
+        self._correction = OdometryCorrection(errors, said, corrected)
+        if corrected is not None:
+            self.odometry.replace(corrected, settings.odometry)
+        k = keyframes
+        if not len(k):
+            return
+        reckoned, path = np.flatnonzero(k.by_odometry), self.localized.trajectory()
+        on_path = np.tile(np.eye(4), (len(k), 1, 1))
+        drift = np.zeros((len(k), 6, 6))
+        others = np.flatnonzero(~k.by_odometry)
+        if corrected is not None:
+            at = k.stamp[reckoned].clip(corrected.stamps[0], corrected.stamps[-1])
+            poses, _ = interpolate(corrected.stamps, corrected.poses, at, np.inf)
+            on_path[reckoned] = inverse(corrected.poses[0]) @ poses
+            drift[reckoned] = gathered_drift(corrected, at, settings.odometry)
+        if path is not None and len(others):
+            on_path[others] = self.localization.from_start(k.map_T_base[others])
+            drift[others] = gathered_drift(path, k.stamp[others], settings.odometry)
+        starts = [piece.start_T_path for piece in self._pieces]
+        for number, old in enumerate(list(self._pieces)):
+            mine = np.flatnonzero(k.piece == number)
+            before = self._pieces[number - 1]
+            if number and starts[number] is starts[number - 1]:
+                piece = _Piece(old.stretch, before.start_T_path, before.drift)
+            elif number and len(mine):
+                first = mine[k.stamp[mine].argmin()]
+                start_T_path = k.start_T_base[first] @ inverse(on_path[first])
+                to_start = adjoint(start_T_path)
+                piece = _Piece(old.stretch, start_T_path, k.drift[first] - to_start @ drift[first] @ to_start.T)
+            else:
+                piece = old
+            self._pieces[number] = piece
+            to_start = adjoint(piece.start_T_path)
+            k.drift[mine] = piece.drift + to_start @ drift[mine] @ to_start.T
+            k.start_T_base[mine] = piece.start_T_path @ on_path[mine]
+        newest = int(k.stamp.argmax())
+        self._newest = float(k.stamp[newest])
+        self._last = Placed(
+            bool(k.by_odometry[newest]),
+            int(k.piece[newest]),
+            k.map_T_base[newest].copy(),
+            k.start_T_base[newest].copy(),
+            k.drift[newest].copy(),
+        )
 
     def ready(self, stamp: float) -> bool:
         """Return whether later messages cannot change the result of `place` for a frame with this stamp.

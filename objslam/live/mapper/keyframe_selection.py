@@ -31,6 +31,10 @@ class KeyframeSelector:
         self._shown |= shown
         self._standing += 1
 
+    def place(self, camera: int, start_T_camera: Floats) -> None:
+        """Change the pose (4, 4) of a camera's last keyframe on the course, after the course has changed."""
+        self._last[camera] = start_T_camera
+
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
         """Register a frame that is neither redundant nor a keyframe. If its camera has moved, keyframes count anew."""
         if self._has_moved(camera, start_T_camera):

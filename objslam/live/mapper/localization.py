@@ -69,8 +69,4 @@ def _move_onto(m: MapState, row: int, map_T_base: Floats) -> None:
     m.graph.update()
     there = map_T_base @ m.keyframes.base_T_camera[row] @ inverse(m.graph.pose(int(m.keyframes.id[row])))
     m.graph.drop_absolute()
-    m.graph.move(there)
-    turn, landmarks = there[:3, :3], m.landmarks
-    landmarks.position[:] = landmarks.position @ turn.T + there[:3, 3]
-    landmarks.information[:] = turn @ landmarks.information @ turn.T
-    m.move_tracks(there, -np.inf)
+    m.move(there)

@@ -10,6 +10,9 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.frontend.corrected_log import OdometryCorrection
+from objslam.frontend.known_errors import known_errors
+from objslam.frontend.odometry_drift import scaled_noise
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
 from objslam.live.mapper.bearing_extraction import BearingExtractor, FrameView
@@ -32,8 +35,15 @@ class Mapper:
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
         by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
-        self.state = MapState(settings, counters, IncrementalGraph(settings), Course(settings), by_label, rng)
-        self._extractor = BearingExtractor(settings, counters.ledger, self.state.cameras, self.state.labels)
+        given = settings.model_copy(update={"mode": "joint"})
+        known = known_errors(given)
+        errors = {} if known is None else dict(zip(known.names, known.values.tolist(), strict=True))
+        scaled = scaled_noise(given, errors)
+        course = Course(scaled, OdometryCorrection(errors))
+        self.state = MapState(
+            scaled, counters, IncrementalGraph(scaled), course, by_label, rng, given, errors=errors, calibration=known
+        )
+        self._extractor = BearingExtractor(self.state)
         self._selector = KeyframeSelector(settings.live)
         self._predictor = PosePredictor(self.state)
         self._predicted: PredictedLandmarks | None = None  # For the next frame. None after the map has changed.
@@ -46,7 +56,7 @@ class Mapper:
                 m.course.add_odometry(message.stamp, message.pose)
                 return
             m.localization.received += 1
-            m.course.localization.append(message.stamp, message.pose)
+            m.course.add_localization(message.stamp, message.pose)
             if localize(m):
                 self._predicted = None
         elif isinstance(message, CameraMessage):
@@ -58,26 +68,38 @@ class Mapper:
         """Return whether later messages cannot change the pose of a frame with this stamp on the course."""
         return self.state.course.ready(stamp)
 
+    def corrected_stamp(self, frame: FrameMessage) -> float:
+        """Return the stamp of a frame, s, on the clock of the poses."""
+        return frame.stamp + self.state.errors.get(f"{frame.camera}.clock", 0.0)
+
+    def map_has_moved(self) -> None:
+        """Forget what was prepared for the next frame, because keyframes and landmarks have other places now."""
+        m = self.state
+        self._predictor, self._predicted = PosePredictor(m), None
+        for number in np.unique(m.keyframes.camera).tolist():
+            row = int(np.flatnonzero(m.keyframes.camera == number)[-1])
+            self._selector.place(number, m.keyframes.start_T_base[row] @ m.keyframes.base_T_camera[row])
+
     def take(self, frame: FrameMessage) -> LandmarkUpdate | None:
         """Add a frame to the map, and return the argument for `look_after`. None if the frame does not become a keyframe."""
-        m = self.state
-        before = m.newest_before(frame.stamp)
-        placed = m.course.place(frame.stamp, m.keyframes, before)
+        m, stamp = self.state, self.corrected_stamp(frame)
+        before = m.newest_before(stamp)
+        placed = m.course.place(stamp, m.keyframes, before)
         if placed is None:
             m.counters.drop_frame(frame, "frames off the path, or in a gap of it")
             return None
-        view = self._extractor.extract(frame)
+        view = self._extractor.extract(frame, stamp)
         m.frames[view.camera] += 1
         start_T_camera, shown = placed.start_T_base @ view.base_T_camera, set(view.rays.label.tolist())
         if not self._is_wanted(frame, view.camera, start_T_camera, shown, before):
             return None
-        prediction = self._predictor.predict(before, frame.stamp, placed, view.base_T_camera, start_T_camera)
+        prediction = self._predictor.predict(before, stamp, placed, view.base_T_camera, start_T_camera)
         pose = prediction.map_T_camera
         if not shown:  # A frame without boxes counts against the landmarks in view, but is no keyframe.
             m.landmarks.expected[in_view(m.landmarks, m.cameras[view.camera], pose)] += 1
             return None
         self._selector.accept(view.camera, start_T_camera, shown)
-        k = self._add_keyframe(frame.stamp, view, placed, prediction)
+        k = self._add_keyframe(frame, view, placed, prediction)
         if localize(m):
             pose, self._predicted = m.graph.pose(k), None
         predicted, self._predicted = self._predicted, None
@@ -112,14 +134,16 @@ class Mapper:
             m.counters.drop_frame(frame, "frames older than the map")
         return shows_something and not is_late
 
-    def _add_keyframe(self, stamp: float, view: FrameView, placed: Placed, prediction: PosePrediction) -> int:
+    def _add_keyframe(self, frame: FrameMessage, view: FrameView, placed: Placed, prediction: PosePrediction) -> int:
         """Add a keyframe to the table and the graph, and return its id."""
         m = self.state
         k = m.next_id.keyframe
         m.next_id.keyframe += 1
         row: dict[str, Any] = {
             "id": k,
-            "stamp": stamp,
+            "stamp": self.corrected_stamp(frame),
+            "sent": frame.stamp,
+            "mount": view.mount,
             "camera": view.camera,
             "frame": m.frames[view.camera] - 1,
             "base_T_camera": view.base_T_camera,

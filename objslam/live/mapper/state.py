@@ -8,6 +8,7 @@ import numpy as np
 from objslam.association.observations import Observations
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.types import Keyframes
 from objslam.graph.factors.rays import Bearings
@@ -89,6 +90,9 @@ class MapState:
     exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
     the course. rng: seeded by the settings.
+    given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
+    as they came, and without their errors. errors: by name, what is taken out of all measurements. calibration: their
+    estimate.
     """
 
     settings: Settings
@@ -97,6 +101,7 @@ class MapState:
     course: Course
     by_label: bool
     rng: np.random.Generator
+    given: Settings
     cameras: list[Camera] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
     keyframes: KeyframeTable = field(default_factory=KeyframeTable)
@@ -111,6 +116,9 @@ class MapState:
     localization: LocalizationState = field(default_factory=LocalizationState)
     schedule: MaintenanceSchedule = field(default_factory=MaintenanceSchedule)
     next_id: NextIds = field(default_factory=NextIds)
+    sent_cameras: list[Camera] = field(default_factory=list)
+    errors: dict[str, float] = field(default_factory=dict)
+    calibration: Calibration | None = None
 
     def newest_before(self, stamp: float) -> int | None:
         """Return the row of the newest keyframe at or before a stamp, s; None if there is none."""
@@ -169,6 +177,14 @@ class MapState:
         """Start a rebuild of the graph in slices, and copy the positions of all landmarks."""
         self.graph.rebuild_in_slices(self.keyframes.id[self.time_order()])
         self.read_positions()
+
+    def move(self, new_T_old: Floats) -> None:
+        """Move the whole map by a pose (4, 4). The caller must remove the absolute poses before."""
+        self.graph.move(new_T_old)
+        turn, landmarks = new_T_old[:3, :3], self.landmarks
+        landmarks.position[:] = landmarks.position @ turn.T + new_T_old[:3, 3]
+        landmarks.information[:] = turn @ landmarks.information @ turn.T
+        self.move_tracks(new_T_old, -np.inf)
 
     def move_tracks(self, new_T_old: Floats, since: float) -> None:
         """Move the tracks that were seen at or after the stamp `since`, s, by a pose (4, 4)."""

@@ -7,7 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.types import Trajectory
 
+_MOST_POSES = 131_072
+"""The most poses of a path that are kept before some are left out: 11 minutes at 200 Hz. A larger number keeps old paths
+finer, and takes 136 bytes a pose."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -64,10 +68,46 @@ class GrowingTable:
             setattr(self, name, room[: self._length])
 
 
+class PathTable(GrowingTable):
+    """The poses of a path in the order of their stamps, as the robot sent them.
+
+    Above _MOST_POSES, some are left out, evenly over time, so that a long session takes little memory. The poses that stay
+    are never so far apart that a gap seems to be between them. max_gap: s, the shortest gap.
+    """
+
+    stamp: Floats = column(np.float64)
+    pose: Floats = column(np.float64, 4, 4)
+
+    def __init__(self, max_gap: float) -> None:
+        super().__init__()
+        self._widest, self._spacing, self._most = max_gap / 4, 0.0, _MOST_POSES
+
+    def append(self, stamp: float, pose: Floats) -> None:
+        """Append a pose (4, 4) at a stamp, s, later than all others."""
+        if len(self) >= self._most:
+            self._thin()
+        self.add(stamp=[stamp], pose=pose[None])
+
+    def trajectory(self) -> Trajectory | None:
+        """Return a copy of the path, None if it has no pose."""
+        return Trajectory(self.stamp.copy(), self.pose.copy()) if len(self) else None
+
+    def _thin(self) -> None:
+        """Keep one pose in each period, and those at gaps. The period doubles each time, up to a quarter of a gap."""
+        usual = (self.stamp[-1] - self.stamp[0]) / len(self)
+        self._spacing = min(max(2 * self._spacing, 2 * usual), self._widest)
+        period = np.floor((self.stamp - self.stamp[0]) / self._spacing)
+        far = np.append(np.diff(self.stamp) > self._spacing, True)
+        self.keep(np.append(True, np.diff(period) > 0) | far)
+        if len(self) > 3 * self._most // 4:
+            self._most *= 2
+
+
 class KeyframeTable(GrowingTable):
     """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
     camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
+    sent, mount: stamp and base_T_camera as they came. stamp and base_T_camera have the shared errors taken out.
     """
 
     id: Ints = column(np.int64)
@@ -81,6 +121,8 @@ class KeyframeTable(GrowingTable):
     drift: Floats = column(np.float64, 6, 6)
     piece: Ints = column(np.int64)
     by_odometry: Bools = column(np.bool_)
+    sent: Floats = column(np.float64)
+    mount: Floats = column(np.float64, 4, 4)
     localized: Bools = column(np.bool_)
 
 

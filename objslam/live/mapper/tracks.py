@@ -73,6 +73,21 @@ class Track:
         ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], np.array(direction))
         return Observations.of_lines(poses[:, :3, 3], ahead, np.array(sigma), np.array(range_), np.array(range_sigma))
 
+    def remeasure(
+        self, directions: Floats, ranges: Floats, range_sigmas: Floats, drift: Floats, graph: IncrementalGraph
+    ) -> None:
+        """Replace directions (n, 3), ranges (n,) and their sigmas (n,), and drift (6, 6), after a calibration."""
+        self.rays = [
+            (number, k, direction, sigma, float(reach), float(range_sigma))
+            for (number, k, _, sigma, _, _), direction, reach, range_sigma in zip(
+                self.rays, directions, ranges, range_sigmas, strict=True
+            )
+        ]
+        self.drift = drift
+        obs = self.sight(graph)
+        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, ranges, range_sigmas])
+        self._lines = list(lines[-_RECENT:])
+
     def move(self, new_T_old: Floats) -> None:
         """Move its position and lines by a pose (4, 4)."""
         turn = new_T_old[:3, :3]

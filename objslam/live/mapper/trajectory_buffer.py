@@ -8,7 +8,8 @@ import numpy as np
 from objslam.config import Odometry
 from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse
-from objslam.frontend.odometry_drift import add_step
+from objslam.core.types import Trajectory
+from objslam.frontend.odometry_drift import add_step, gathered_drift
 
 _PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_planar`. A larger value accepts more paths.
 
@@ -57,6 +58,17 @@ class PathBuffer:
         half = len(self._stamps) // 2
         if self._stamps[half] < stamp - self._seconds:  # Each deletion moves all other poses, so it must be rare.
             del self._stamps[:half], self._path[:half]
+
+    def replace(self, path: Trajectory, settings: Odometry) -> None:
+        """Replace the kept poses by those of another path, which begins with the first pose at all."""
+        if not self._stamps:
+            return
+        self._settings, self._from_start = settings, inverse(path.poses[0])
+        poses, _ = interpolate(path.stamps, path.poses, np.array(self._stamps), np.inf)
+        drift = gathered_drift(path, np.array(self._stamps), settings)
+        stretches = [on.stretch for on in self._path]
+        self._path = [OnPath(*on) for on in zip(poses, drift, stretches, strict=True)]
+        self._last = self._from_start @ poses[-1]
 
     @property
     def oldest(self) -> float:

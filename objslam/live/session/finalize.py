@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
-from objslam.core.estimate import Estimate
 from objslam.core.result import RunResult
-from objslam.core.types import Association, Keyframes, Rays, Trajectory
+from objslam.core.types import Trajectory
 from objslam.errors import SolveError
+from objslam.frontend.known_errors import warn_of_others
+from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
-from objslam.mapping.alternation import Solution, seen_something, solve
-from objslam.mapping.describe import describe, summarise
+from objslam.mapping.alternation import Solution, solve, without_errors
+from objslam.mapping.corrected import corrected
+from objslam.mapping.describe import describe, make_result, summarise
 
 
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
@@ -26,9 +28,9 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
     begin = time.perf_counter()
-    settings = m.settings.model_copy(update={"mode": "joint"})
-    ledger = m.counters.ledger
-    keyframes, rays, association, poses, positions = collected(m)
+    settings, ledger = m.given, m.counters.ledger
+    found = collect(m, name)
+    keyframes, rays, errors, log = found.keyframes, found.rays, found.errors, found.log
     if not len(rays):
         kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
         came = m.counters.accepted()
@@ -36,32 +38,29 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         missing = [f"no {what} arrived" for what, kind in kinds.items() if not came.get(kind)]
         hint = "; ".join(missing + ledger.lines())
         raise SolveError("no box could be mapped", where=name, hint=hint or None)
-    cameras = tuple(m.cameras)
+    if m.calibration is not None:
+        warn_of_others(m.calibration, log, settings, ledger)
+    cameras = tuple(one.camera for one in log.cameras)
     if m.by_label or len(rays) > settings.live.reassociate:
-        estimate = _solve_joint(keyframes, rays, association, settings, ledger, poses)
-        solution = Solution(keyframes, rays, association, estimate, ())
+        solution = _solve_joint(found, settings, ledger)
     else:
-        start = InitialEstimate(poses, association, positions)
-        solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start)
-    keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
+        start = InitialEstimate(found.map_T_camera, found.association, found.positions)
+        solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start, errors)
+    if errors is not None:
+        solution, log = corrected(solution, errors, ledger)
+        cameras = tuple(one.camera for one in log.cameras)
+    keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
-    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     accepted = m.counters.accepted()
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
     seconds = {"finish": round(time.perf_counter() - begin, 4)}
     summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
     stamps, first = np.unique(keyframes.stamps, return_index=True)
-    return RunResult(
-        map=objects,
-        keyframes=keyframes,
-        map_T_base=estimate.map_T_base,
-        rays=rays,
-        association=solution.association,
-        origins=origins,
-        directions=directions,
-        residual=residual,
-        weight=estimate.weight,
+    return make_result(
+        solution,
+        objects,
+        residual,
         summary={**summary, "live": {**accepted, "rebuilds": m.graph.rebuilds}},
         settings=settings,
         cameras=cameras,
@@ -70,10 +69,8 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     )
 
 
-def _solve_joint(
-    keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, ledger: Ledger, poses: Floats
-) -> Estimate:
-    """Return the joint solve that starts from the session's poses (K, 4, 4).
+def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:
+    """Return the joint solve that starts from the session's poses. The shared errors start as in a run.
 
     With few rays and without localisation, also solve from the odometry. Return the solve with the smaller residuals.
     """
@@ -81,76 +78,32 @@ def _solve_joint(
     from objslam.graph.assembly import Measurements
     from objslam.graph.outlier_rejection import misfit
 
-    found = batch_solver.solve_joint(keyframes, rays, association, settings, ledger, start=poses)
+    keyframes, rays, association, errors = found.keyframes, found.rays, found.association, found.errors
+
+    def solved(into: Ledger, start: Floats | None) -> Solution:
+        estimate = batch_solver.solve_joint(keyframes, rays, association, settings, into, start=start, errors=errors)
+        measured = (keyframes, rays) if errors is None else without_errors(errors, estimate)
+        return Solution(*measured, association, estimate, ())
+
+    def cost(solution: Solution) -> float:
+        """The cost with the noise of the settings, because each solve may have found another noise."""
+        estimate = solution.estimate
+        measured = keyframes, rays, settings
+        if errors is not None:
+            measured = errors.at(errors.mean if estimate.calibration is None else estimate.calibration.values)
+        map_T_camera = estimate.map_T_base @ measured[0].base_T_camera
+        return misfit(map_T_camera, estimate.positions, Measurements.of(*measured), association)
+
+    first = solved(ledger, found.map_T_camera)
     few = association.count and len(rays) <= settings.live.reassociate
     if not few or keyframes.odom_T_base is None or keyframes.localized_every:
-        return found
+        return first
     other_ledger = Ledger()  # Of a second solve, because the session may have rejected rays early and for good.
     try:
-        other = batch_solver.solve_joint(keyframes, rays, association, settings, other_ledger)
+        other = solved(other_ledger, None)
     except SolveError:
-        return found
-    measured = Measurements.of(keyframes, rays, settings)
-    before, after = (
-        misfit(estimate.map_T_base @ keyframes.base_T_camera, estimate.positions, measured, association)
-        for estimate in (found, other)
-    )
-    if not after < before:
-        return found
+        return first
+    if not cost(other) < cost(first):
+        return first
     ledger.add(other_ledger)
     return other
-
-
-def collected(m: MapState) -> tuple[Keyframes, Rays, Association, Floats, Floats]:
-    """Return keyframes in time order, their rays, the association, camera poses (K, 4, 4) and object positions (N, 3).
-
-    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. Tracks with enough rays
-    become objects too, but the solve may leave them unresolved.
-    """
-    m.graph.refresh()
-    k, r = m.keyframes, m.rays
-    order = np.argsort(k.stamp, kind="stable")
-    if k.localized.any():
-        off = order[~k.localized[order]]
-        if len(off):
-            boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
-            m.counters.drop("keyframes that the localisation does not cover", where, len(off))
-            m.counters.drop("boxes that the localisation does not cover", where, boxes)
-        order = order[k.localized[order]]
-    number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
-    number[k.id[order]] = np.arange(len(order))
-    owner, label, place = _owners(m)
-    at = number[r.keyframe]
-    rows = np.flatnonzero(at >= 0)
-    rows = rows[np.argsort(at[rows], kind="stable")]
-    rays = offline_rays(m, rows, at[rows])
-    poses = m.graph.poses(k.id[order])
-    kept = np.unique(rays.keyframe)
-    keyframes, rays = seen_something(m.keyframe_arrays(order), rays)
-    owners, index = np.unique(owner[rows], return_inverse=True)
-    objects = owners[owners >= 0]
-    association = Association(index - (len(owners) - len(objects)), label[objects])
-    return keyframes, rays, association, poses[kept], place[objects]
-
-
-def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
-    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe there."""
-    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
-    columns = {name: getattr(m.rays, name)[rows] for name in names}
-    return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
-
-
-def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """Return the object (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) of the objects."""
-    landmarks, rays = m.landmarks, m.rays
-    owner = rays.owner.copy()
-    first = int(landmarks.id.max(initial=-1)) + 1
-    enough = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
-    label = np.zeros(first + len(enough), dtype=np.int64)
-    label[landmarks.id] = landmarks.label
-    place = np.zeros((len(label), 3))
-    place[landmarks.id] = landmarks.position
-    for i, track in enumerate(enough, first):
-        owner[np.searchsorted(rays.number, track.numbers())] = i
-        label[i], place[i] = track.label, track.position
-    return owner, label, place

@@ -6,6 +6,7 @@ import time
 import numpy as np
 
 from objslam.config import Settings
+from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.sources.journal.records import FrameMessage, Message
@@ -22,10 +23,13 @@ class FrameQueue:
     s, when a frame last left the queue.
     """
 
-    def __init__(self, settings: Settings, counters: Counters, mapper: Mapper, patient: bool) -> None:
+    def __init__(
+        self, settings: Settings, counters: Counters, mapper: Mapper, calibrator: Calibrator, patient: bool
+    ) -> None:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
-        self._counters, self._mapper, self._patient = counters, mapper, patient
-        self._waiting: list[tuple[float, int, FrameMessage, float]] = []  # stamp, order of arrival, frame, time of arrival
+        self._counters, self._mapper, self._calibrator, self._patient = counters, mapper, calibrator, patient
+        # corrected stamp, order of arrival, frame, time of arrival
+        self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
         self.lag = 0.0
         self.worked = -np.inf
@@ -37,7 +41,7 @@ class FrameQueue:
         """
         if isinstance(message, FrameMessage):
             self._frames += 1
-            bisect.insort(self._waiting, (message.stamp, self._frames, message, arrival))
+            bisect.insort(self._waiting, (self._mapper.corrected_stamp(message), self._frames, message, arrival))
             while len(self._waiting) > self._most:
                 self._counters.drop_frame(self._waiting.pop(0)[2], _NEVER_COVERED)
         else:
@@ -45,9 +49,10 @@ class FrameQueue:
         worked = False
         while self._waiting and self._mapper.is_ready(self._waiting[0][0]):
             worked = True
-            _, _, frame, came = self._waiting.pop(0)
-            if measured and not self._patient and time.perf_counter() - came > self._limit:
-                self._counters.drop_frame(frame, _RARE_POSES if arrival - came > self._limit else TOO_SLOW)
+            stamp, _, frame, came = self._waiting.pop(0)
+            limit = self._limit + max(0.0, stamp - frame.stamp)  # a camera whose clock is behind waits for its poses
+            if measured and not self._patient and time.perf_counter() - came > limit:
+                self._counters.drop_frame(frame, _RARE_POSES if arrival - came > limit else TOO_SLOW)
                 continue
             update = self._mapper.take(frame)
             if update is not None:
@@ -55,6 +60,9 @@ class FrameQueue:
                 if measured:
                     self._counters.updated(self.lag)
                 self._mapper.look_after(update)
+                if self._calibrator.after_keyframe():
+                    corrected = self._mapper.corrected_stamp
+                    self._waiting = sorted((corrected(f), number, f, arrived) for _, number, f, arrived in self._waiting)
         if worked:
             self.worked = time.perf_counter()
         return worked

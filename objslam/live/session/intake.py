@@ -106,7 +106,7 @@ class Intake:
         with self._lock:
             if camera not in self._cameras:
                 return self._refuse("frame of an unknown camera", checks.told(camera))
-            at, newest = frame.stamp, self.newest
+            at, newest = frame.stamp + self._clock.shift, self.newest
             if math.isfinite(newest):
                 at = self._place(frame.stamp)
                 if at < newest - self._settings.live.max_late:

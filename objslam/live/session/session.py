@@ -15,14 +15,15 @@ from objslam.core.result import RunResult
 from objslam.core.snapshot import Snapshot
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError, one_line
+from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import TOO_SLOW, FrameQueue
 from objslam.live.session.intake import Intake
 from objslam.live.session.snapshots import Describer, take_snapshot
-from objslam.sources.journal.file import Journal, messages
-from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
+from objslam.sources.journal.file import Journal, calibrations, messages
+from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Message, NoteMessage
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
 _IDLE = 0.05  # The longest sleep of the idle thread, and wait of a snapshot for a frame, s. A larger value answers later.
@@ -52,7 +53,8 @@ class Session(Intake):
     ) -> None:
         super().__init__(settings, Counters(), self._enqueue)
         self._mapper = Mapper(settings, self.counters)
-        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, patient)
+        self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
+        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, patient)
         self._name, self._journal_file, self._resume = name, journal, resume
         self._journal = Journal(journal, resume) if journal is not None else None
         if self._journal is not None and self._journal.torn:
@@ -133,6 +135,7 @@ class Session(Intake):
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join()
+        self._calibrator.close()
         if self._journal is not None:
             try:
                 self._journal.close()
@@ -163,6 +166,17 @@ class Session(Intake):
                 self._changed.notify_all()
         return True
 
+    def _record(self, message: CalibrationMessage) -> bool:
+        """Write a calibration into the journal, and return whether the session may use it."""
+        with self._changed:
+            try:
+                if self._journal is not None:
+                    self._journal.write(message)
+            except OutputError as error:
+                self.counters.drop(f"calibrations that could not be written to the journal: {error.message}")
+                return False
+        return True
+
     def _drop_oldest_frame(self) -> None:
         for i, (message, _) in enumerate(self._queue):
             if isinstance(message, FrameMessage):
@@ -172,10 +186,14 @@ class Session(Intake):
                 return
 
     def _replay_journal(self) -> None:
-        past = messages(self._journal_file, self.counters.ledger) if self._journal_file and self._resume else ()
-        for message in past:
-            self.recall(message)
-            self._frames_waiting.take(message, time.perf_counter(), measured=False)
+        if not self._journal_file or not self._resume:
+            return
+        self._calibrator.expect(calibrations(self._journal_file))
+        for message in messages(self._journal_file, self.counters.ledger):
+            if not isinstance(message, CalibrationMessage):
+                self.recall(message)
+                self._frames_waiting.take(message, time.perf_counter(), measured=False)
+        self._calibrator.begin()
 
     def _work(self) -> None:
         self._guard(self._serve)

@@ -14,10 +14,10 @@ from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association, Trajectory
 from objslam.graph.marginals import largest_sigma
+from objslam.live.calibration.collected import offline_rays
 from objslam.live.mapper.landmark_table import covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
-from objslam.live.session.finalize import offline_rays
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
 _MOST = 200  # The most rays that describe an object. They are spread evenly over its rays. A larger number takes longer.
@@ -85,6 +85,7 @@ def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) ->
         update=m.counters.update(),
         counters=m.counters.accepted(),
         dropped=m.counters.dropped(),
+        calibration=m.calibration,
     )
 
 

@@ -17,7 +17,9 @@ _MAX_REJECTED = 400  # The picture shows at most this many rejected rays, becaus
 _MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
 _MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
 _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
-_CROSS_POINTS = 5  # A label avoids a true object as much as this many points of the path.
+_WEIGHT = 5  # A label avoids each point of a cross or of an ellipse as much as this many points of the path.
+_CROSS_SIZE = 8.0  # The cross of a true object has this width and height, points.
+_ELLIPSE_POINTS = 96  # A label avoids this many points of an ellipse. With fewer, its corner fits between two of them.
 _LONG_SIDE, _SHORT_SIDE = 9.0, 5.5  # The longer side of the map and the smallest width of the figure, inches.
 _FONT = 8.0  # Labels and legend have this font size, points.
 _USED, _REJECTED = "#8fbfee", "#ef8f86"  # Used rays are light blue, and rejected rays are light red.
@@ -57,7 +59,9 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
     _draw_rays(axes, result)
     _draw_paths(axes, result)
     if len(crosses):
-        axes.plot(*crosses.T, "+", color="black", markersize=8, markeredgewidth=1.1, zorder=6, label="ground truth")
+        axes.plot(
+            *crosses.T, "+", color="black", markersize=_CROSS_SIZE, markeredgewidth=1.1, zorder=6, label="ground truth"
+        )
     _draw_objects(axes, result, points)
     axes.set_title(_title(result, int((~shown).sum())), fontsize=10, loc="left")
     legend = figure.legend(loc="outside lower left", ncols=4, fontsize=_FONT, frameon=False)
@@ -145,6 +149,18 @@ def _draw_objects(axes: Any, result: RunResult, points: Floats) -> None:
         axes.add_line(Line2D([], [], **dot, **hollow, label="unresolved"))
 
 
+def _outlines(result: RunResult, shown: Bools) -> Floats:
+    """Return points (P, 2), m, on the 2-sigma ellipses of the shown objects."""
+    turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    points = [np.zeros((0, 2))]
+    for o in (o for o, seen in zip(result.map.objects, shown.tolist(), strict=True) if seen):
+        if o.status == "ok" and o.covariance is not None and np.isfinite(o.covariance).all():
+            values, vectors = np.linalg.eigh(o.covariance[:2, :2])
+            points.append(o.position[:2] + 2 * ((vectors * np.sqrt(np.maximum(values, 0))) @ circle).T)
+    return np.concatenate(points)
+
+
 def _title(result: RunResult, outside: int) -> str:
     resolved, total, rays = len(result.map.resolved()), len(result.map), len(result.rays)
     text = f"{resolved} object{'s' * (resolved != 1)}"
@@ -175,7 +191,12 @@ def _draw_labels(axes: Any, renderer: Any, result: RunResult, points: Floats, sh
     anchors = to_pixels.transform(points[chosen]) if chosen else np.zeros((0, 2))
     frame = axes.get_window_extent(renderer)
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS), :2, 3]
-    avoid = to_pixels.transform(np.concatenate([path, np.repeat(crosses, _CROSS_POINTS, axis=0)]))
+    arm = _CROSS_SIZE / 2 * axes.figure.dpi / 72
+    arms = to_pixels.transform(crosses)[:, None] + arm * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    rims = to_pixels.transform(_outlines(result, shown))
+    avoid = np.concatenate(
+        [to_pixels.transform(path), np.repeat([*arms.reshape(-1, 2), *rims], _WEIGHT, axis=0).reshape(-1, 2)]
+    )
     edges = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
     corners, found = place_labels(anchors, sizes, edges, avoid)
     led = needs_leader(anchors, corners, sizes)

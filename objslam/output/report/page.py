@@ -4,7 +4,7 @@ import base64
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -15,16 +15,17 @@ import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.types import Images
 from objslam.errors import ConfigError, OutputError
-from objslam.evaluation.alignment import lay_truth
-from objslam.evaluation.evaluate import evaluate
+from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.plot.style import REJECTED_BELOW, captions, is_date, label_colours
 from objslam.output.report.charts import Histogram, axis_end, histogram
 from objslam.output.report.crops import Crop, best_rays, cut_crops, images_of
+from objslam.output.report.trends import trends
 from objslam.results.files import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY
-from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
+from objslam.results.read import load_json, load_map, load_rays, load_truth
 
 _BINS, _FEW_BINS = 32, 16  # The histogram of all rays has 32 bins. The histogram of one object has 16 bins.
 _COUNTS = {
@@ -78,15 +79,16 @@ def write_report(
     import jinja2
 
     progress("reading the result", 0, 0)
-    objects, rays, summary = load_map(out), load_rays(out), _json(out / SUMMARY)
+    objects, rays, summary = load_map(out), load_rays(out), load_json(out / SUMMARY)
     try:
         settings = load_settings(out / CONFIG)
     except ConfigError as error:
         raise OutputError(error.message.splitlines()[0], where=error.where) from error
-    errors, scores = _evaluation(out, objects)
+    errors, scores = _evaluation(out)
     chosen = {o.id: best_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects.objects}
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
+    images = _on_one_clock(images, summary.get("calibration"))
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     crops_of = {number: [pictures[i] for i in index.tolist() if i in pictures] for number, index in chosen.items()}
@@ -116,6 +118,8 @@ def write_report(
         with_errors=any(card.error is not None for card in cards),
         with_existence=any(card.object.existence is not None for card in cards),
         histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
+        trends=trends(rays),
+        calibration=summary.get("calibration"),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
@@ -128,6 +132,13 @@ def write_report(
     )
     write_file(out / REPORT, page.encode("utf-8", errors="replace"))
     return out / REPORT
+
+
+def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
+    """Return the images of each camera with the stamps that the run gave them, if it estimated the offset of their clock."""
+    found = calibration["parameters"] if calibration else {}
+    clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}
+    return {name: replace(listed, stamps=listed.stamps + clock[name]) for name, listed in images.items()}
 
 
 def _cards(
@@ -159,35 +170,21 @@ def _cards(
     return sorted(cards, key=lambda card: (_natural(card.object.label), card.object.id))
 
 
-def _evaluation(out: Path, objects: ObjectMap) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
+def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
     """Return the error, m, and the match, as text, of each matched object by id. Return also the content of evaluation.json.
 
-    If this file does not exist, this function compares the map with the ground truth. A map in a coordinate frame of its
-    own is first aligned with the truth. Without a ground truth, there are no errors, and the content is None.
+    If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default.
+    Without a ground truth, there are no errors, and the content is None.
     """
     if (out / EVALUATION).is_file():
-        scores = _json(out / EVALUATION)
+        scores = load_json(out / EVALUATION)
     else:
-        truth = load_truth(out)
-        if truth is None:
+        if load_truth(out) is None:
             return {}, None
-        align = "none" if lay_truth(objects, truth) is truth else "se2"
-        scores = evaluate(objects, truth, load_trajectory(out), align=align).to_dict()  # type: ignore[arg-type]
+        scores = evaluate_folder(out).to_dict()
     matched = scores.get("objects", [])
     whose = "to id {} there" if scores.get("truth") else "truth id {}"
     return {o["id"]: (float(o["error"]), whose.format(o["truth_id"])) for o in matched}, scores
-
-
-def _json(file: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
-    except ValueError as error:
-        raise OutputError(f"is not JSON: {error}", where=str(file)) from error
-    if not isinstance(data, dict):
-        raise OutputError("is not a JSON object", where=str(file))
-    return data
 
 
 def _changed(settings: Settings) -> list[tuple[str, str, str]]:

@@ -14,17 +14,25 @@ _HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/befo
 """The viewer hides these entities until the user clicks on them, because they are opaque and would hide the map."""
 
 
-def blueprint(view_point: ViewPoint, cameras: list[tuple[str, str]], *, solver: bool = True, live: bool = False) -> Any:
+def blueprint(
+    view_point: ViewPoint,
+    cameras: list[tuple[str, str]],
+    *,
+    solver: bool = True,
+    calibrated: bool = False,
+    live: bool = False,
+) -> Any:
     """Make the layout: the map on the left, cameras and curves on the right, the event log below.
 
     Args:
         cameras: the entity path and the name of each camera.
         solver: whether the recording has iterations of the solver.
+        calibrated: whether the recording has shared errors by iteration.
         live: whether to show the curves of a running session instead of the curves of a finished run.
     """
     views = [rrb.Spatial2DView(origin=path, name=name, background=[40, 44, 52]) for path, name in cameras]
     right = [rrb.Tabs(*views) if len(views) > 1 else views[0]] if views else []
-    right.append(_live_curves() if live else _curves(solver))
+    right.append(_live_curves() if live else _curves(solver, calibrated))
     column = rrb.Vertical(*right, row_shares=[3, 2][-len(right) :])
     # The log shows no entity path, because all lines share it, and no times, because each text begins with its time.
     shown = {"LogLevel": True, "Body": True, "EntityPath": False}
@@ -55,13 +63,16 @@ def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] =
     )
 
 
-def _curves(solver: bool) -> Any:
+def _curves(solver: bool, calibrated: bool) -> Any:
     # Each view has a curve of the drive and a curve of the solver. The viewer shows the curve of the chosen timeline.
     pairs = {"residual": ("residual, deg", "cost"), "boxes": ("boxes", "rounds")}
     views = [
         _curve([f"plots/{drive}", *([f"plots/{step}"] if solver else [])], f"{name}; {step}" if solver else name)
         for drive, (name, step) in pairs.items()
     ]
+    if calibrated and solver:
+        views.append(_curve(["plots/calibration"], "shared errors"))
+        views.append(_curve(["plots/calibration_sigma"], "their sigmas"))
     seconds = rrb.BarChartView(origin="plots/seconds", name="seconds")
     return rrb.Tabs(*views, seconds, rrb.TextDocumentView(origin="summary", name="summary"), active_tab=0)
 

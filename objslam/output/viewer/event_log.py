@@ -195,6 +195,13 @@ def summary_text(result: RunResult) -> str:
         rows.append(("cost", f"{summary['cost_before']:.4g} to {summary['cost_after']:.4g}"))
     rows += [(f"seconds: {name}", f"{value:.2f}") for name, value in seconds.items()]
     lines = [f"**{summary.get('log', 'run')}**, {summary.get('mode', result.settings.mode)} mode", "", *table(rows)]
+    if calibration := summary.get("calibration"):
+        lines += ["", "| shared error | found | sigma | prior sigma | unit | |", "|---|---:|---:|---:|---|---|"]
+        for name, of in calibration["parameters"].items():
+            remark = "" if of["observable"] else "not observable from this log"
+            shown = " | ".join(f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
+            lines.append(f"| {name} | {shown} | {of['unit']} | {remark} |")
+        lines += [f"This log cannot tell apart: {' and '.join(pair)}." for pair in calibration["traded_off"]]
     if result.trace:
         lines += ["", "| round | objects | unexplained | cost |", "|---|---:|---:|---:|"]
         for number, r in enumerate(result.trace):

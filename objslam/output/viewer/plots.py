@@ -7,6 +7,7 @@ import rerun as rr
 
 from objslam.core.result import RunResult
 from objslam.core.statistics import grouped_quantile
+from objslam.core.trace import Parameters
 from objslam.output.plot.style import ray_kinds
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
@@ -14,6 +15,11 @@ from objslam.output.viewer.times import iteration_column, stamp_column
 _GAP, _GAP_STEPS = 1.0, 5.0
 """A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 times the median step of stamps."""
 _BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # Curves have these colours.
+_MANY = (
+    *(_BLUE, _ORANGE, _GREEN, (190, 70, 70), (140, 90, 190), (140, 100, 80)),
+    *((220, 120, 190), _GREY, (180, 180, 50), (60, 180, 200)),
+)
+"""The colours of curves that are many; the eleventh curve has the first colour again."""
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:
@@ -55,6 +61,33 @@ def log_costs(recording: Any, result: RunResult) -> None:
         unexplained = np.array([float((found.object < 0).sum()) for _, _, found in steps])
         _send(recording, "plots/rounds/objects", at, objects, _GREEN, "objects")
         _send(recording, "plots/rounds/unexplained", at, unexplained, _GREY, "rays that no object explains")
+
+
+def log_parameters(recording: Any, result: RunResult) -> None:
+    """Log the shared errors by iteration, in standard deviations of their priors.
+
+    `plots/calibration/NAME` has the value of a parameter, `plots/calibration_sigma/NAME` its standard deviation, which
+    is 1 before the first step. The last points are the result of the run.
+    """
+    if result.calibration is None or not result.trace:
+        return
+    prior = dict(zip(result.calibration.names, result.calibration.prior.tolist(), strict=True))
+    rows: list[tuple[int, Parameters]] = []
+    at = 0
+    for one in result.trace:
+        rows += [(at + i, step.parameters) for i, step in enumerate(one.iterations) if step.parameters is not None]
+        at += len(one.iterations)
+    found = result.calibration
+    rows.append((max(at - 1, 0), Parameters(found.names, found.values, found.sigma)))
+    numbers = np.array([number for number, _ in rows])
+    begun = np.append(max(numbers[0] - 1, 0), numbers)
+    for i, name in enumerate(found.names):
+        values = np.array([row.values[i] / prior[name] for _, row in rows])
+        sigma = np.array([1.0, *(row.sigma[i] / prior[name] for _, row in rows)])
+        colour = _MANY[i % len(_MANY)]
+        part = rr.escape_entity_path_part(name)
+        _send(recording, f"plots/calibration/{part}", iteration_column(numbers), values, colour, name)
+        _send(recording, f"plots/calibration_sigma/{part}", iteration_column(begun), sigma, colour, name)
 
 
 def _send(recording: Any, path: str, at: Any, values: Any, colour: tuple[int, int, int], name: str) -> None:

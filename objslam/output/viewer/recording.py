@@ -15,7 +15,7 @@ from objslam.output.viewer.cameras import camera_path, log_cameras
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
 from objslam.output.viewer.objects import log_objects, log_truth
 from objslam.output.viewer.paths import log_base, log_paths, log_steps, thinned
-from objslam.output.viewer.plots import log_costs, log_residuals
+from objslam.output.viewer.plots import log_costs, log_parameters, log_residuals
 from objslam.output.viewer.rays import log_rays
 from objslam.output.viewer.surface import log_surfaces
 from objslam.output.viewer.times import iteration_column, stamp_column
@@ -39,7 +39,9 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])
     used = [c for i, c in enumerate(result.cameras) if (result.keyframes.camera == i).any()]
     cameras = [(camera_path(c), c.name) for c in used]
-    recording.send_blueprint(blueprint(view_point, cameras, solver=bool(result.trace)))
+    recording.send_blueprint(
+        blueprint(view_point, cameras, solver=bool(result.trace), calibrated=result.calibration is not None)
+    )
     recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     log_paths(recording, result, truth)
     log_surfaces(recording, result)
@@ -57,6 +59,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
         _log_events(recording, events, stamp_column)
     log_steps(recording, result)
     log_costs(recording, result)
+    log_parameters(recording, result)
     rounds = round_events(result.trace, result.rays.label_names)
     _log_events(recording, rounds, lambda at: iteration_column(at.astype(np.int64)))
     recording.log("summary", rr.TextDocument(summary_text(result), media_type="text/markdown"), static=True)

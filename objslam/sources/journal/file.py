@@ -13,7 +13,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,6 +24,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, label_table
 from objslam.errors import LogError, OutputError
 from objslam.sources.journal.records import (
+    CALIBRATION_KIND,
+    CalibrationMessage,
     CameraMessage,
     FrameMessage,
     HeldMounts,
@@ -194,6 +196,17 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
         rest = file.stat().st_size - stream.tell()
     if rest:
         ledger.drop("torn record at the end of the journal", where=f"{file}, {rest} bytes")
+
+
+def calibrations(file: Path) -> Iterator[CalibrationMessage]:
+    """Read only the calibrations of the journal `file`. Each takes effect at a keyframe, whose frame may come before it."""
+    with file.open("rb") as stream:
+        for content in _records(stream):
+            if content.startswith(CALIBRATION_KIND):
+                with suppress(LogError):  # `messages` drops and counts it too
+                    message = decode(content)
+                    assert isinstance(message, CalibrationMessage)
+                    yield message
 
 
 def read_journal(path: Path, ledger: Ledger) -> Log:

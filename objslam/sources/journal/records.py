@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.errors import LogError
 
@@ -19,6 +20,8 @@ _MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the same, the
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
+CALIBRATION_KIND = b"S"
+"""The first byte of a calibration message."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,18 @@ class NoteMessage:
     odometry: Floats
 
 
-Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage
+@dataclass(frozen=True)
+class CalibrationMessage:
+    """The shared errors that a session takes out of its map and of all later messages.
+
+    keyframe: the number of keyframes that the map had before it took them out.
+    """
+
+    keyframe: int
+    calibration: Calibration
+
+
+Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | CalibrationMessage
 
 
 def encode(message: Message) -> bytes:
@@ -109,6 +123,10 @@ def encode(message: Message) -> bytes:
         return _MOUNT.pack(_MOUNT_KIND, message.stamp, *message.pose[:3].ravel().tolist(), len(name)) + name
     if isinstance(message, NoteMessage):
         return _NOTE_KIND + json.dumps([message.clock, message.odometry.ravel().tolist()]).encode()
+    if isinstance(message, CalibrationMessage):
+        found = message.calibration
+        numbers = [array.tolist() for array in (found.values, found.covariance, found.prior)]
+        return CALIBRATION_KIND + json.dumps([message.keyframe, found.names, *numbers]).encode()
     if isinstance(message, CameraMessage):
         c = message.camera
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
@@ -135,6 +153,11 @@ def decode(data: bytes) -> Message:
         if kind == _NOTE_KIND:
             clock, odometry = json.loads(data[1:])
             return NoteMessage(float(clock), _array(odometry, (4, 4)))
+        if kind == CALIBRATION_KIND:
+            keyframe, names, values, covariance, prior = json.loads(data[1:])
+            n = len(names)
+            numbers = _array(values, (n,)), _array(covariance, (n, n)), _array(prior, (n,))
+            return CalibrationMessage(int(keyframe), Calibration(tuple(map(str, names)), *numbers))
         if kind == _CAMERA_KIND:
             name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
             lens = (_array(matrix, (3, 3)), model, _array(distortion, (-1,)))

@@ -106,7 +106,8 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
 def _missing(assembly: Assembly) -> tuple[str, ...]:
     missing = [str(error) for error in (*assembly.problems, *assembly.left_out)]
     found = assembly.paths
-    path = (found.localization or found.odometry) if found is not None else None
+    paths = () if found is None else (found.localization, found.odometry)
+    path = next((one for one in paths if one is not None), None)
     for topics, camera, _ in assembly.cameras:
         where, frames = f"camera {camera.name}", topics.detections or topics.image
         if topics.detections is None:

@@ -105,6 +105,22 @@ def test_labels_do_not_overlap_in_the_saved_picture(drawn: Any) -> None:
             assert not (a.x0 < b.x1 and b.x0 < a.x1 and a.y0 < b.y1 and b.y0 < a.y1)
 
 
+def test_labels_leave_ellipses_and_crosses_free(drawn: Any) -> None:
+    positions = np.array([[2.0, 2.0, 0.5], [8.0, 4.0, 0.5], [5.0, 12.0, 0.5], [2.0, 9.0, 0.5], [8.0, 9.0, 0.5]])
+    result, truth = synthetic_result(positions, ["cup"] * 5, keyframes=60, sigma=0.1)
+    figure = drawn(result, truth)
+    axes, renderer = figure.axes[0], figure.canvas.get_renderer()
+    arm = 4 * figure.dpi / 72
+    crosses = axes.transData.transform(positions[:, :2])[:, None] + arm * np.array(
+        [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]
+    )
+    rims = np.concatenate([ellipse.get_verts() for ellipse in axes.patches])  # px
+    for box in [t.get_window_extent(renderer) for t in axes.texts]:
+        low, high = [box.x0, box.y0], [box.x1, box.y1]
+        for points in (crosses.reshape(-1, 2), rims):
+            assert not ((points > low) & (points < high)).all(axis=1).any()
+
+
 def test_ellipses_are_two_sigma_in_the_plane(drawn: Any) -> None:
     result, _ = synthetic_result(*clusters(), keyframes=30, unresolved=(0,))
     ellipses = drawn(result).axes[0].patches

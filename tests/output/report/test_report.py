@@ -21,7 +21,8 @@ from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.errors import OutputError
-from objslam.evaluation.evaluate import evaluate, evaluate_folder, write_evaluation
+from objslam.evaluation.evaluate import evaluate
+from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.mapping import pipeline
 from objslam.output.report import write_report
 from objslam.output.report.charts import HEIGHT, axis_end, histogram

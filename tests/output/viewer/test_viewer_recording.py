@@ -17,9 +17,10 @@ from synthetic_result import clusters, synthetic_result
 from waiting import LIMIT
 
 from objslam.config import Settings
+from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
 from objslam.core.result import RunResult
-from objslam.core.trace import Iteration, Round
+from objslam.core.trace import Iteration, Parameters, Round
 from objslam.core.types import Association, Images, Surface, Truth
 from objslam.output.plot.style import object_colours, ray_kinds
 from objslam.output.viewer.application import program
@@ -339,3 +340,25 @@ def drop_rays(result: RunResult, keep: np.ndarray) -> RunResult:
     arrays = {name: getattr(result, name)[keep] for name in ("origins", "directions", "residual", "weight")}
     association = dataclasses.replace(result.association, object=result.association.object[keep])
     return dataclasses.replace(result, rays=result.rays.take(keep), association=association, **arrays)
+
+
+def test_shared_errors_are_curves_over_the_iterations(record: Any, tmp_path: Path) -> None:
+    result, _ = whole(tmp_path, keyframes=5)
+    names, prior = ("odometry.scale", "front camera/left.clock"), np.array([0.03, 0.1])
+    final = Calibration(names, np.array([0.012, -0.2]), np.diag([0.006, 0.004]) ** 2, prior)
+    first, second = result.trace
+    moved = Parameters(names, np.array([0.03, -0.1]), np.array([0.015, 0.05]))
+    steps = (*first.iterations[:1], dataclasses.replace(first.iterations[1], parameters=moved), *first.iterations[2:])
+    trace = (dataclasses.replace(first, iterations=steps), second)
+    r = record(dataclasses.replace(result, trace=trace, calibration=final))
+    for part, value, sigma in (
+        ("odometry.scale", [1.0, 0.4], [1.0, 0.5, 0.2]),
+        ("front\\ camera\\/left.clock", [-1.0, -2.0], [1.0, 0.5, 0.04]),
+    ):
+        at = r.get(f"/plots/calibration/{part}", "iteration")
+        assert at == [1, 4]
+        curve = r.get(f"/plots/calibration/{part}", "Scalars:scalars")
+        np.testing.assert_allclose([row[0] for row in curve], value)
+        assert r.get(f"/plots/calibration_sigma/{part}", "iteration") == [0, 1, 4]
+        np.testing.assert_allclose([row[0] for row in r.get(f"/plots/calibration_sigma/{part}", "Scalars:scalars")], sigma)
+    assert not [path for path in record(result).paths() if path.startswith("/plots/calibration")]

@@ -1,0 +1,62 @@
+"""The command `objslam doctor`, which looks for wrong input in a log and says what is probably wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import console, progress_bar, report, say
+from objslam.cli.options import Config, Mode, Set, settings_of, with_options
+from objslam.sources import SourceOptions, read
+
+if TYPE_CHECKING:
+    from objslam.mapping.checks.diagnosis import Diagnosis
+
+_ROWS = 8  # The number of hypotheses in the table. The others explain less.
+
+
+@with_options
+def doctor(
+    log: Annotated[Path, typer.Argument(help="A log folder, a ROS bag, or another recording that `objslam info` reads.")],
+    mode: Mode = None,
+    config: Config = None,
+    set_: Set = None,
+    *,
+    options: SourceOptions,
+) -> None:
+    """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written."""
+    from objslam.core.diagnostics import Ledger
+    from objslam.frontend.known_errors import take_out_expected
+    from objslam.mapping.checks.diagnosis import diagnose
+    from objslam.mapping.pipeline import chosen_poses
+
+    settings = settings_of(mode, config, set_)
+    ledger = Ledger()
+    with progress_bar() as show:
+        said = take_out_expected(chosen_poses(read(log, ledger, options), settings), settings)
+        found = diagnose(said, settings, show, thorough=True)
+    report(ledger)
+    _show_trials(found)
+    for finding in found.findings:
+        say(f"wrong: {finding.message}")
+    if not found.findings:
+        say("nothing wrong was found")
+
+
+def _show_trials(found: Diagnosis) -> None:
+    """Print how well the boxes fit with the log as it is, and with the hypotheses that explain most."""
+    from rich.table import Table
+
+    if not found.trials:
+        say("there are too few boxes to judge how well they agree")
+        return
+    table = Table(title="what the boxes say")
+    for name in ("what if", "boxes that fit", "score", "drives where it heads"):
+        table.add_column(name, justify="left" if name == "what if" else "right")
+    for trial in found.trials[: _ROWS + 1]:
+        what = "the log as it is" if trial.hypothesis is None else f"with {trial.hypothesis.what}"
+        straight = "" if trial.straight is None else f"{100 * trial.straight:.0f} %"
+        table.add_row(what, f"{100 * trial.share:.0f} %", f"{trial.score:.2f}", straight)
+    console().print(table)

@@ -1,0 +1,59 @@
+"""Evaluation of a result folder: its truth, the alignment that its frame needs, and evaluation.json."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from objslam.errors import LogError
+from objslam.evaluation.alignment import Alignment
+from objslam.evaluation.evaluate import Evaluation, check_radius, evaluate
+from objslam.io.atomic_files import write_file
+from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, dump_json
+from objslam.results.read import load_map, load_summary, load_trajectory, load_truth
+
+AlignmentChoice = Literal["auto", "none", "se2", "sim2", "se3", "sim3"]
+"""An alignment, or `auto`: the alignment that the frame of the map needs (see `choose_alignment`)."""
+
+_IN_SPACE = "the map has the frame of the odometry, which is not planar"
+
+
+def choose_alignment(out: Path) -> tuple[Alignment, str]:
+    """Return the alignment that the frame of the result in `out` needs, and the reason for it.
+
+    A map in the frame of a localisation needs none. A map in the frame of the odometry has its own origin and heading, and
+    needs se2. If its path is not planar, the direction of gravity may be unknown too, and it needs se3.
+    """
+    summary = load_summary(out)
+    if summary.get("map_frame") == "localization":
+        return "none", "a localisation fixed the frame of the map"
+    if summary.get("map_frame") == "odometry":
+        planar = summary.get("planar") is not False
+        return ("se2", "the map has the frame of the odometry") if planar else ("se3", _IN_SPACE)
+    return "none", "the result does not say in which frame its map is"
+
+
+def evaluate_folder(
+    out: Path, truth: Path | None = None, *, align: AlignmentChoice = "auto", radius: float = 0.5
+) -> Evaluation:
+    """Compare the result folder `out` with the ground truth at the path `truth` (see `load_truth`).
+
+    By default, the ground truth of the result's log is used. LogError if there is no truth, OutputError if the result cannot
+    be read, ConfigError if the radius is not positive.
+    """
+    check_radius(radius)
+    map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
+    if known is None:
+        if truth is None:
+            raise LogError("the log of this result has no ground truth", where=str(out), hint="give --truth FILE")
+        message = f"no ground truth here: looked for {GROUNDTRUTH}/{OBJECTS} or {GROUNDTRUTH}/{TRAJECTORY}"
+        raise LogError(message, where=str(truth), hint="give an objects file, or a folder with such a file")
+    if not known.objects and known.trajectory is None:
+        raise LogError("the ground truth is empty", where=str(truth or out), hint="give --truth FILE")
+    kind, why = choose_alignment(out) if align == "auto" else (align, "as asked")
+    evaluation = evaluate(map_, known, path, align=kind, radius=radius)
+    return replace(evaluation, why=why, truth=None if truth is None else str(truth))
+
+
+def write_evaluation(evaluation: Evaluation, out: Path) -> None:
+    """Write evaluation.json into the result folder `out`. OutputError if the file cannot be written."""
+    write_file(out / EVALUATION, dump_json(evaluation.to_dict()).encode())

@@ -1,0 +1,155 @@
+"""Take known shared errors out of a log, or of each part of it: odometry, cameras, directions, and stamps of frames."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.geometry import make_pose
+from objslam.core.types import CameraLog, Images, Log, Trajectory
+
+ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
+"""The errors of odometry."""
+AXES = ("roll", "tilt", "yaw")
+"""The rotations of a camera on the base, about x, y and z."""
+_SQUEEZED = 1e-3
+"""The time (s) at an end of the path into which a clock's offset squeezes the frames that it moves beyond that end. A larger
+value moves more frames. A smaller one lets stamps of fast cameras become equal, as float64 holds Unix time to 0.2 us."""
+
+
+def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
+    """Return the log with errors taken out of odometry, cameras, and stamps and depths of frames.
+
+    error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it, as `later`
+    says. Otherwise a clock may move them off its ends.
+    """
+    path, odometry = log.robot_path if stay else None, log.odometry
+    if odometry is not None:
+        odometry = corrected_odometry(odometry, turns(odometry), error)
+    cameras = tuple(corrected_camera(one, error, path) for one in log.cameras)
+    return replace(log, odometry=odometry, cameras=cameras)
+
+
+def turns(odometry: Trajectory) -> Floats:
+    """Return by how much the odometry turns about the vertical axis in each step (N-1,), rad."""
+    rotation = odometry.poses[:, :3, :3]
+    if len(rotation) < 2:
+        return np.zeros(0)
+    return np.asarray(Rotation.from_matrix(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)).as_rotvec()[:, 2])
+
+
+def corrected_odometry(odometry: Trajectory, turn: Floats, error: Mapping[str, float]) -> Trajectory:
+    """Return the odometry with its ways and its turns (N-1,) corrected. Its first pose stays."""
+    scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+    if scale == turn_scale == turn_bias == 0:
+        return odometry
+    more = np.append(0.0, np.cumsum(turn_scale * turn + turn_bias * np.diff(odometry.stamps)))
+    ways = (1 + scale) * np.diff(odometry.poses[:, :3, 3], axis=0)
+    middle = (more[1:] + more[:-1]) / 2  # a scaled arc begins and ends at other headings, its chord lies between them
+    cos, sin = np.cos(middle), np.sin(middle)
+    x, y, z = ways.T
+    ways = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
+    turned = Rotation.from_rotvec(np.outer(more, [0.0, 0.0, 1.0])).as_matrix() @ odometry.poses[:, :3, :3]
+    places = odometry.poses[0, :3, 3] + np.vstack([np.zeros(3), np.cumsum(ways, axis=0)])
+    return Trajectory(odometry.stamps, make_pose(turned, places))
+
+
+class OdometryCorrection:
+    """Corrects odometry pose by pose, while it comes, as `corrected_odometry` does for a whole path. The first pose stays.
+
+    A session corrects every pose, and this takes a fraction of the time that a path of two poses takes.
+    """
+
+    def __init__(
+        self, error: Mapping[str, float], said: Trajectory | None = None, corrected: Trajectory | None = None
+    ) -> None:
+        """Start a correction by errors, by their names. It continues the corrected path after that of the robot."""
+        self._scale, self._turn_scale, self._turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        self._stamp: float | None = None
+        self._before = self._place = np.zeros(0)
+        self._turned = 0.0
+        if said is not None and corrected is not None:
+            self._stamp, self._before, self._place = float(said.stamps[-1]), said.poses[-1], corrected.poses[-1, :3, 3]
+            turn = corrected.poses[-1, :3, :3] @ said.poses[-1, :3, :3].T
+            self._turned = math.atan2(turn[1, 0], turn[0, 0])
+
+    def correct(self, stamp: float, pose: Floats) -> Floats:
+        """Return the next pose (4, 4) without the errors."""
+        if self._scale == self._turn_scale == self._turn_bias == 0:
+            return pose
+        if self._stamp is None:
+            self._stamp, self._before, self._place = stamp, pose, pose[:3, 3]
+            return pose
+        turn = Rotation.from_matrix(pose[:3, :3] @ self._before[:3, :3].T).as_rotvec()[2]
+        more = float(self._turn_scale * turn + self._turn_bias * (stamp - self._stamp))
+        way = (1 + self._scale) * (pose[:3, 3] - self._before[:3, 3])
+        self._place = self._place + _about_z(self._turned + more / 2) @ way  # a chord lies between its two headings
+        self._turned += more
+        self._stamp, self._before = stamp, pose
+        return make_pose(_about_z(self._turned) @ pose[:3, :3], self._place)
+
+
+def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:
+    """Return camera poses on the base (..., 4, 4), turned about the axes of base and moved along them."""
+    turn = Rotation.from_rotvec([error.get(f"{name}.{axis}", 0.0) for axis in AXES]).as_matrix()
+    move = np.array([error.get(f"{name}.{axis}", 0.0) for axis in "xyz"])
+    return make_pose(turn @ base_T_camera[..., :3, :3], base_T_camera[..., :3, 3] + move)
+
+
+def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
+    """Return unit directions (R, 3), those of `mine` (R,) as a camera whose focal length is longer by a share sees them."""
+    if focal == 0:
+        return directions
+    longer = np.where(mine[:, None], directions * [1.0, 1.0, 1 + focal], directions)
+    return np.asarray(longer / np.linalg.norm(longer, axis=1, keepdims=True))
+
+
+def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
+    """Return stamps (N,) plus an offset of their clock. A stamp that was on the path stays on it, and the order stays.
+
+    Stamps that the offset moves beyond an end of the path are squeezed into the last millisecond before that end, where
+    they have the pose of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes.
+    """
+    moved = stamps + clock
+    if clock == 0 or path is None:
+        return moved
+    begin, end = float(path.stamps[0]), float(path.stamps[-1])
+    squeezed = min(_SQUEEZED, (end - begin) / 2)
+    if clock > 0:
+        rest, beyond = end - squeezed, moved > end - squeezed
+        inside = rest + squeezed * (moved - rest) / (squeezed + clock)
+    else:
+        rest, beyond = begin + squeezed, moved < begin + squeezed
+        inside = rest - squeezed * (rest - moved) / (squeezed - clock)
+    on_path = (stamps >= begin) & (stamps <= end)
+    return np.where(on_path & beyond, np.clip(inside, begin, end), moved)
+
+
+def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
+    """Return a camera and its data with errors taken out. path: where its stamps stay, as `later` says, or None."""
+    camera, name = one.camera, one.camera.name
+    clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
+    longer = 1 + error.get("range_scale", 0.0)
+    corrected = replace(
+        camera,
+        base_T_camera=corrected_mount(camera.base_T_camera, error, name),
+        matrix=camera.matrix * np.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]]),
+        depth_scale=camera.depth_scale / longer,
+    )
+
+    def moved(images: Images | None) -> Images | None:
+        return None if images is None else replace(images, stamps=later(images.stamps, clock, path))
+
+    found = one.detections
+    if found is not None:
+        found = replace(found, frame_stamps=later(found.frame_stamps, clock, path), depths=found.depths * longer)
+    mount = None if one.mount is None else Trajectory(one.mount.stamps, corrected_mount(one.mount.poses, error, name))
+    return CameraLog(corrected, found, moved(one.rgb), moved(one.depth), mount)
+
+
+def _about_z(angle: float) -> Floats:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

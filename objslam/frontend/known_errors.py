@@ -1,0 +1,78 @@
+"""The shared errors that a log has, and those that a calibration file says. They are taken out where none are estimated."""
+
+from pathlib import Path
+
+from objslam.config import Settings
+from objslam.core.calibration import Calibration, kind
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log
+from objslam.errors import ConfigError
+from objslam.frontend.corrected_log import AXES, ODOMETRY, take_out
+from objslam.io.calibration_yaml import load_calibration
+
+_CAMERA = ("clock", *AXES, "focal", "x", "y", "z")
+
+
+def error_names(log: Log) -> tuple[str, ...]:
+    """Return the names of all errors that the measurements of a log can share."""
+    odometry = () if log.odometry is None else ODOMETRY
+    cameras = tuple(f"{one.camera.name}.{name}" for one in log.cameras for name in _CAMERA)
+    return (*odometry, *cameras, "range_scale")
+
+
+def prior_sigma(name: str, settings: Settings) -> float:
+    """Return the standard deviation of an error by the settings, 0 if they hold it."""
+    what = kind(name)
+    return float(getattr(settings.calibration, "translation" if what in ("x", "y", "z") else what))
+
+
+def estimates(settings: Settings, odometry: bool) -> bool:
+    """Return whether the settings ask to estimate the shared errors of a log. odometry: whether it is used."""
+    use = settings.calibration.use
+    return settings.mode == "joint" and odometry if use == "auto" else use
+
+
+def known_errors(settings: Settings) -> Calibration | None:
+    """Return what calibration.file says of the shared errors, None without a file. ConfigError if the file is wrong."""
+    return None if settings.calibration.file is None else load_calibration(Path(settings.calibration.file))
+
+
+def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Ledger) -> None:
+    """Warn of errors in calibration.file that the log does not have."""
+    names = error_names(log)
+    others = ", ".join(name for name in known.names if name not in names)
+    if others:
+        where = settings.calibration.file
+        ledger.warn(f"{where}: nothing in the log is called {others}, so this is not used ({_parts(log)})")
+
+
+def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
+    """Return the log without those errors of calibration.file that the run does not estimate.
+
+    These are all errors in fixed mode and with calibration.use=false, else those that the settings hold. The ledger warns of
+    errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
+    """
+    known, names, file = known_errors(settings), error_names(log), settings.calibration.file
+    if known is None:
+        return log
+    if not set(known.names) & set(names):
+        raise ConfigError(f"it fits nothing in the log {log.name}: {', '.join(known.names)}", where=file, hint=_parts(log))
+    warn_of_others(known, log, settings, ledger)
+    estimated = settings.mode == "joint" and estimates(settings, log.odometry is not None)
+    held = {
+        name: value
+        for name, value in zip(known.names, known.values.tolist(), strict=True)
+        if name in names and not (estimated and prior_sigma(name, settings) > 0)
+    }
+    return take_out(log, held)
+
+
+def take_out_expected(log: Log, settings: Settings) -> Log:
+    """Return the log without all errors of calibration.file, whether a run estimates them or not."""
+    of = settings.calibration.model_copy(update={"use": False})
+    return take_out_known(log, settings.model_copy(update={"calibration": of}), Ledger())
+
+
+def _parts(log: Log) -> str:
+    cameras = ", ".join(one.camera.name for one in log.cameras)
+    return f"the log has {'no' if log.odometry is None else 'an'} odometry and these cameras: {cameras or 'none'}"

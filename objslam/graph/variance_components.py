@@ -1,0 +1,281 @@
+"""Estimate the noise of a log's measurements from its residuals: iterated variance components (Koch 1999, 3.6).
+
+Each kind of noise has the size at which the squares of its residuals sum up to their redundancy. The redundancy is what
+poses, landmarks and shared errors leave of the residuals. It is measured with random probes (Hutchinson 1990).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.geometry import adjoint, inverse
+from objslam.core.noise import NoiseFactors
+from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.graph.factors.odometry import motions
+from objslam.graph.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
+
+_PROBES = 12
+"""The number of random probes. More are slower, and tell the redundancy of n residuals to sqrt(2 / (n * probes)) of it."""
+_ITERATIONS = 20
+"""The most iterations. Each takes one factorisation of the linear system, and MRCLAM takes 12 to 17."""
+_CONVERGED = 0.02
+"""The relative change of all factors below which the iteration ends. A larger value ends it sooner."""
+_LIMITS = (0.05, 20.0)
+"""The smallest and the largest factor. Noise beyond them is no noise of a sensor that the settings describe at all."""
+_TOGETHER = 3.0
+"""The time (s) for which errors may hang together: wheels lag behind a command, and a detector's box sits aside for a while.
+A longer time finds slower errors, from fewer independent sums."""
+_MOST_SHRINKAGE = 0.3
+"""The largest shrinkage that is made up for. A map that is smaller by more has another cause."""
+_LEAST_TOLD = 0.3
+"""The least share of the squared ways that neighbours predict, for the prediction to be used. A larger one uses it less."""
+_MEAN_NORMAL = np.sqrt(np.pi / 2)
+"""Scales the mean absolute value of Gaussian numbers to their standard deviation."""
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """What the rows of a linear system are: n bearings, q ranges and s motions, with their nominal noise.
+
+    bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
+    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: m. parts: (3, s, 6, 6) covariances of the motions by
+    the noise along, across and in turning. rest: (s, 6, 6) covariances without this noise. motion_axes: (3, s, 6)
+    these directions in the frame of the motion. motion_window: (s,), ray_window: (n,) which rows may err together.
+    """
+
+    bearing_axes: Floats
+    bearing_weight: Floats
+    owner: Ints
+    range_sigma: Floats
+    bias: float
+    parts: Floats
+    rest: Floats
+    motion_axes: Floats
+    motion_window: Ints
+    ray_window: Ints
+
+
+def estimate_noise(
+    of: Linearised, system: LinearSystem, errors: CalibratedMeasurements, theta: Floats, prior_residuals: float
+) -> NoiseFactors:
+    """Return the noise that agrees best with the residuals of a solved graph, as factors on the nominal noise.
+
+    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: the number of
+    residuals that the nominal noise counts for, in each kind. Kinds of noise that are not unknown keep their factor.
+    """
+    kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
+    root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
+    prior = sparse.csc_matrix(root)
+    below = sparse.csc_matrix((len(theta), system.jacobian.shape[1]))
+    full = sparse.vstack(
+        [sparse.hstack([system.jacobian, sparse.csc_matrix(system.sides)]), sparse.hstack([below, prior])], format="csr"
+    )
+    residual = np.append(system.residual, root @ (theta - errors.mean))
+    probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), _PROBES))
+    begin = errors.noise
+    noise = begin
+    for _ in range(_ITERATIONS):
+        rescale = _rescaling(system, rows, begin, noise, len(residual))
+        jacobian = sparse.csc_matrix(rescale @ full)
+        told = np.column_stack([probes, rescale @ residual])
+        left = told - jacobian @ factor(jacobian).solve(jacobian.T @ told)
+        other = _updated(system, rows, noise, kinds, probes, left, prior_residuals)
+        done, noise = other.like(noise, _CONVERGED), other
+        if done:
+            break
+    force, curvature = shrinking_force(of)
+    return replace(noise, shrinkage=min(force / curvature, _MOST_SHRINKAGE))
+
+
+def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Rows:
+    keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
+    ranged = np.isfinite(rays.range)
+    steps = np.flatnonzero(keyframes.measured)
+    parts = [motions(*one)[1][steps] for one in errors.drift_components(theta)] if len(steps) else [np.zeros((0, 6, 6))] * 4
+    origins, directions = rays.in_map(of.map_T_camera)
+    to_landmark = of.positions[of.association.object[of.which]] - origins
+    off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
+    second = np.floor(np.maximum.accumulate(keyframes.stamps) / _TOGETHER).astype(np.int64)
+    pair = np.column_stack([of.association.object[of.which], second[rays.keyframe]])
+    to_camera = adjoint(inverse(keyframes.base_T_camera[1:][steps]))
+    return _Rows(
+        bearing_axes=_azimuth_elevation(rays.direction, keyframes.base_T_camera[rays.keyframe]),
+        bearing_weight=np.minimum(1.0, HUBER_K * rays.sigma / np.maximum(off, 1e-12)),
+        owner=of.association.object[of.which][ranged],
+        range_sigma=errors.rays.range_sigma[of.which][ranged],
+        bias=errors.settings.depth.bias,
+        parts=np.array(parts[:3]),
+        rest=parts[3],
+        motion_axes=np.moveaxis(to_camera[:, :, [3, 4, 2]], 2, 0),
+        motion_window=np.unique(second[1:][steps], return_inverse=True)[1],
+        ray_window=np.unique(pair, axis=0, return_inverse=True)[1].ravel(),
+    )
+
+
+def _rescaling(system: LinearSystem, rows: _Rows, before: NoiseFactors, after: NoiseFactors, size: int) -> sparse.csr_matrix:
+    """What turns rows (size, ...) that are whitened by one noise into rows that are whitened by another."""
+    scale = np.ones(size)
+    scale[: system.first_range] = before.rays / after.rays
+    ranges = slice(system.first_range, system.first_range + len(rows.owner))
+    scale[ranges] = _range_sigma(rows, before) / _range_sigma(rows, after)
+    steps = len(rows.rest)
+    first, last = system.first_motion, system.first_motion + 6 * steps
+    blocks = whitening(_motion_covariance(rows, after)) @ np.linalg.inv(whitening(_motion_covariance(rows, before)))
+    row, column = (
+        first + 6 * np.arange(steps)[:, None, None] + np.arange(6)[axes] for axes in ((slice(None), None), (None,))
+    )
+    here = np.r_[:first, last:size]
+    at = [np.concatenate([here, np.broadcast_to(i, blocks.shape).ravel()]) for i in (row, column)]
+    return sparse.csr_matrix((np.concatenate([scale[here], blocks.ravel()]), (at[0], at[1])), shape=(size, size))
+
+
+def _updated(
+    system: LinearSystem,
+    rows: _Rows,
+    noise: NoiseFactors,
+    kinds: frozenset[str],
+    probes: Floats,
+    left: Floats,
+    prior: float,
+) -> NoiseFactors:
+    """One step of the iteration. left: (M, probes + 1) what the solution leaves of the probes and of the residuals."""
+    found = noise.to_dict(None)
+    residual, kept = left[:, -1], left[:, :-1]
+    if "rays" in kinds and len(rows.bearing_weight):
+        found["rays"] = _ray_noise(rows, noise.rays, residual, probes, kept, prior)
+    if "ranges" in kinds and len(rows.owner):
+        found["ranges"], found["range_bias"] = _range_noise(system, rows, noise, residual, prior)
+    steps = len(rows.rest)
+    motion = slice(system.first_motion, system.first_motion + 6 * steps)
+    if "odometry" in kinds and steps:
+        root = whitening(_motion_covariance(rows, noise))
+        pushed = np.einsum("kji,kj->ki", root, residual[motion].reshape(-1, 6))
+        one, two = (np.einsum("kji,kjp->kip", root, m[motion].reshape(-1, 6, _PROBES)) for m in (probes, kept))
+        for k, name in enumerate(("along", "across", "turning")):
+            variance = found[name] ** 2
+            axis = rows.motion_axes[k]
+            root_of_part = np.sqrt(np.einsum("kii->k", rows.parts[k]) / (axis**2).sum(axis=1))
+            own, first, second = (
+                _summed(root_of_part[:, None] * np.einsum("ki,kip->kp", axis, part), rows.motion_window)
+                for part in (pushed[..., None], one, two)
+            )
+            share = len(own) / steps
+            squares = share * variance**2 * (own**2).sum()
+            redundancy = share * variance * (first * second).sum() / _PROBES
+            found[name] = np.sqrt((prior + squares) / (prior + max(redundancy, 0.0)))
+    limited = {k: float(v if k == "shrinkage" else np.clip(v, *_LIMITS)) for k, v in found.items()}
+    return NoiseFactors(**limited)
+
+
+def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:
+    """The factor on the noise of rays: that of single rays, or a larger one if rays of one object err together for a while.
+
+    The mean of absolute values is robust. The larger of azimuth and elevation counts: a sensor may have told one of them.
+    """
+    axes, count = rows.bearing_axes, len(rows.bearing_weight)
+    off = np.einsum("njk,nk->nj", axes, residual[: 2 * count].reshape(-1, 2)) / np.sqrt(rows.bearing_weight)[:, None]
+    one, two = (np.einsum("njk,nkp->njp", axes, m[: 2 * count].reshape(-1, 2, _PROBES)) for m in (probes, kept))
+    largest = 0.0
+    for window in (np.arange(count), rows.ray_window):
+        root = np.sqrt(np.bincount(window))[:, None]
+        groups = len(root)
+        sums = _summed(off, window) / root
+        first, second = (_summed(m.reshape(count, -1), window).reshape(groups, 2, -1) / root[:, None] for m in (one, two))
+        redundancy = (first * second).sum(axis=(0, 2)) / _PROBES
+        size = groups * (np.abs(sums).mean(axis=0) * _MEAN_NORMAL * factor) ** 2
+        largest = max(largest, float(((prior + size) / (prior + np.maximum(redundancy, 0.0))).max()))
+    return float(np.sqrt(largest))
+
+
+def _summed(values: Floats, window: Ints) -> Floats:
+    """The sums (W, D) of the rows of (n, D) in each window (n,)."""
+    sums = np.zeros((int(window.max()) + 1, values.shape[1]))
+    np.add.at(sums, window, values)
+    return sums
+
+
+def _range_noise(
+    system: LinearSystem, rows: _Rows, noise: NoiseFactors, residual: Floats, prior: float
+) -> tuple[float, float]:
+    """The factors on the noise of single ranges, and on the bias that all ranges of an object share."""
+    count = int(rows.owner.max()) + 1
+    number = np.bincount(rows.owner, minlength=count)
+    off = residual[system.first_range : system.first_range + len(rows.owner)] * _range_sigma(rows, noise)
+    middle = np.nan_to_num(grouped_median(off, rows.owner, count))
+    within = np.median(np.abs(off - middle[rows.owner]) / rows.range_sigma) / NORMAL_MEDIAN
+    free = max(len(off) - int((number > 0).sum()), 0)
+    ranges = np.sqrt((prior + free * within**2) / (prior + free))
+    if rows.bias == 0:
+        return ranges, 1.0
+    has = number > 1
+    typical = np.sqrt(grouped_median(rows.range_sigma**2, rows.owner, count)[has]) * ranges
+    squares = max((middle[has] ** 2 - typical**2 / number[has]).sum(), 0.0) / rows.bias**2
+    weight = min(prior, float(_PRIOR_OBJECTS))
+    return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
+
+
+_PRIOR_OBJECTS = 4
+"""The number of objects that the bias of ranges in the settings counts for. A larger number changes it less."""
+
+
+def shrinking_force(of: Linearised) -> tuple[float, float]:
+    """Return the force that makes a joint solution too small, and the curvature against it, both per share of the size.
+
+    Noise in the rays makes the path jitter. Its steps get longer than those of the odometry, and a smaller map is the
+    cheapest way out (errors in variables; Neyman and Scott 1948). The force is the difference between what the residuals of
+    the ways do to the size and what they do if the ways are taken as their neighbours predict them, without their noise.
+    The curvature is that of all measured lengths.
+    """
+    keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
+    steps = np.flatnonzero(keyframes.measured)
+    if not len(steps) or keyframes.localized_every or keyframes.odom_T_base is None:
+        return 0.0, 1.0
+    camera_T_base = inverse(keyframes.base_T_camera)
+    solved, said = (
+        (inverse(path[:-1]) @ path[1:])[steps, :3, 3] for path in (of.map_T_camera @ camera_T_base, keyframes.odom_T_base)
+    )
+    turn = keyframes.base_T_camera[1:][steps, :3, :3]
+    variance = turn @ of.measured.odometry()[1][steps, 3:, 3:] @ np.swapaxes(turn, 1, 2)
+    told = from_neighbours(said, np.maximum(np.diff(keyframes.stamps)[steps], 0.0))
+
+    def product(one: Floats, two: Floats) -> float:
+        return float((one * np.linalg.solve(variance, two[..., None])[..., 0]).sum())
+
+    ways, by_neighbours = product(said, said), product(told, said)
+    force = product(solved, solved - said)
+    if by_neighbours > _LEAST_TOLD * ways:
+        force -= product(told, solved - said) * ways / by_neighbours
+    ranged = np.isfinite(rays.range)
+    lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum())
+    return max(force, 0.0), max(lengths, 1.0)
+
+
+def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
+    """(q,) m: the noise of ranges, with their object's share of the bias as `batch_solver` counts it."""
+    number = np.bincount(rows.owner)[rows.owner] if len(rows.owner) else np.zeros(0)
+    return np.sqrt((rows.range_sigma * noise.ranges) ** 2 + number * (rows.bias * noise.range_bias) ** 2)
+
+
+def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
+    """(s, 6, 6) covariances of the motions."""
+    variances = np.array([noise.along, noise.across, noise.turning]) ** 2
+    return np.asarray(rows.rest + np.tensordot(variances, rows.parts, 1))
+
+
+def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:
+    """(n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation above the base's plane.
+
+    GTSAM's basis of a direction (`Unit3::basis`) begins with the cross product with the axis that it has least of.
+    """
+    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    basis = np.stack([first, np.cross(directions, first)], axis=2)
+    up = base_T_camera[:, 2, :3]
+    elevation = up - (up * directions).sum(axis=1, keepdims=True) * directions
+    length = np.linalg.norm(elevation, axis=1, keepdims=True)
+    elevation = np.where(length > 1e-6, elevation / np.maximum(length, 1e-12), first)
+    axes = np.stack([np.cross(directions, elevation), elevation], axis=1)
+    return np.asarray(axes @ basis)

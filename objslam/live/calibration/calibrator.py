@@ -1,0 +1,145 @@
+"""Calibrate a session while it runs: when a worker estimates the shared errors, and when the map takes up what it found."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.config import Noise, Settings
+from objslam.core.arrays import Floats
+from objslam.core.calibration import OBSERVABLE, Calibration
+from objslam.live.calibration.collected import collect
+from objslam.live.calibration.recalibration import recalibrate
+from objslam.live.calibration.worker import Request, Worker
+from objslam.live.counters import Counters
+from objslam.sources.journal.records import CalibrationMessage
+
+if TYPE_CHECKING:
+    from objslam.live.mapper.mapper import Mapper
+
+_GROWTH = 1.5
+"""The growth factor of keyframes between two calibrations. A larger factor calibrates more rarely. With any factor above 1,
+the work of all calibrations together grows linearly with the session."""
+_DELAY = 0.15
+"""The keyframes from the start of a calibration until the map takes it up, as a share of all keyframes. With a larger share,
+more sessions take it up at the same keyframe, however fast the machine is. But the map is corrected later."""
+_CHANGED = 1.0
+"""The change of an error, in standard deviations, from which the map is corrected. With a larger value it is rarer."""
+
+
+def observed(found: Calibration, now: Floats) -> Calibration:
+    """Return a calibration in which the errors that the session cannot observe stay at their values `now` (P,).
+
+    The others get what is most probable then. Else noise would move the map to and fro with each calibration.
+    """
+    stay = found.sigma > OBSERVABLE * found.prior
+    if not stay.any():
+        return found
+    values, covariance = found.values.copy(), found.covariance
+    values[~stay] += covariance[np.ix_(~stay, stay)] @ np.linalg.solve(covariance[np.ix_(stay, stay)], (now - values)[stay])
+    values[stay] = now[stay]
+    return replace(found, values=values)
+
+
+class Calibrator:
+    """Decides after each keyframe whether a calibration begins or takes effect.
+
+    A calibration begins at fixed numbers of keyframes, and takes effect a fixed share of keyframes later, or as soon as the
+    worker is done. What takes effect is recorded with the number of keyframes, so that a resumed session does the same.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        counters: Counters,
+        mapper: Mapper,
+        record: Callable[[CalibrationMessage], bool],
+        name: str,
+        patient: bool,
+    ) -> None:
+        """Prepare for a session. record: writes to the journal. patient: whether the session may wait for the worker."""
+        self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
+        self._next = settings.live.calibrate_from or math.inf
+        self._asked: tuple[int, Request] | None = None  # the number of keyframes, and what is to be calibrated
+        self._worker: Worker | None = None
+        self._known: deque[CalibrationMessage] = deque()
+        self._replaying = False
+
+    def expect(self, known: Iterable[CalibrationMessage]) -> None:
+        """Take up these calibrations, and begin no others until `begin`."""
+        self._known, self._replaying = deque(known), True
+
+    def begin(self) -> None:
+        """Go on after a resumed journal. A calibration that had no effect yet begins anew."""
+        self._replaying = False
+        if self._asked is not None:
+            self._worker = Worker(self._asked[1])
+
+    def after_keyframe(self) -> bool:
+        """Begin a calibration or take one up, if it is time, and return whether the map was corrected."""
+        number, changed = self._mapper.state.next_id.keyframe, False
+        while self._known and self._known[0].keyframe <= number:
+            self._take_up(self._known.popleft().calibration)
+            self._asked, changed = None, True
+        if self._worker is not None:
+            changed |= self._finish(number)
+        if number >= self._next:
+            self._next = math.ceil(_GROWTH * number)
+            if self._asked is None or self._replaying:
+                self._ask(number)
+        return changed
+
+    def close(self) -> None:
+        """End the worker."""
+        if self._worker is not None:
+            self._worker.close()
+
+    def _ask(self, number: int) -> None:
+        """Begin a calibration of all keyframes. Nothing begins if no shared errors are estimated.
+
+        The noise stays that of the settings, as in the map. The end of the session estimates it.
+        """
+        m = self._mapper.state
+        found = collect(m, self._name, count_dropped=False)
+        if found.errors is None or found.theta is None or not len(found.theta) or not found.association.count:
+            return
+        settings = m.given.model_copy(update={"noise": Noise(rays=False, ranges=False, odometry=False)})
+        errors = replace(found.errors, settings=settings)
+        request = Request(errors, found.theta, found.association, found.map_T_camera, settings)
+        self._asked = number, request
+        if not self._replaying:
+            self._worker = Worker(request)
+
+    def _finish(self, number: int) -> bool:
+        """Take up the worker's calibration if it is time and it differs from the present one. Return whether it was."""
+        worker, m = self._worker, self._mapper.state
+        assert worker is not None
+        assert self._asked is not None
+        due = number >= self._asked[0] * (1 + _DELAY) and not m.graph.is_rebuilding
+        if not due or not (self._patient or worker.done):
+            return False
+        found = worker.result()
+        self._worker = self._asked = None
+        if found is None:
+            self._counters.accept("calibrations given up")
+            return False
+        now = np.array([m.errors.get(name, 0.0) for name in found.names])
+        found = observed(found, now)
+        far = (np.abs(found.values - now) > _CHANGED * found.sigma).any()
+        if not far:
+            self._counters.accept("calibrations without a change")
+            return False
+        if not self._record(CalibrationMessage(number, found)):
+            return False
+        self._take_up(found)
+        return True
+
+    def _take_up(self, calibration: Calibration) -> None:
+        recalibrate(self._mapper.state, calibration)
+        self._mapper.map_has_moved()
+        self._counters.accept("calibrations")

@@ -1,0 +1,151 @@
+"""The keyframes and rays of a session as a log has them, and as a function of the errors that all measurements share."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
+from objslam.errors import ObjslamError
+from objslam.frontend.corrected_log import refocused
+from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.live.mapper.state import MapState
+from objslam.mapping.alternation import seen_something
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a session has collected, as offline mapping takes it.
+
+    keyframes: in time order, as they were measured. rays: theirs, as they were measured. association: of the rays.
+    map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: the same keyframes
+    and rays as a function of the shared errors, None if neither errors nor noise are estimated. theta: (P,) the values by
+    which the session corrects its measurements. Errors that the session takes out but does not estimate are taken out here.
+    """
+
+    keyframes: Keyframes
+    rays: Rays
+    association: Association
+    map_T_camera: Floats
+    positions: Floats
+    log: Log
+    errors: SharedErrors | None
+    theta: Floats | None
+
+
+def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
+    """Collect the keyframes, the rays, the association and the estimate of a session. name: that of the log.
+
+    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping, and counted if the
+    caller asks for it. Tracks with enough rays become objects too, but a solve may leave them unresolved.
+    """
+    m.graph.refresh()
+    k, r = m.keyframes, m.rays
+    order = m.time_order()
+    if k.localized.any():
+        off = order[~k.localized[order]]
+        if len(off) and count_dropped:
+            boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
+            m.counters.drop("keyframes that the localisation does not cover", where, len(off))
+            m.counters.drop("boxes that the localisation does not cover", where, boxes)
+        order = order[k.localized[order]]
+    number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
+    number[k.id[order]] = np.arange(len(order))
+    owner, label, place = _owners(m)
+    at = number[r.keyframe]
+    rows = np.flatnonzero(at >= 0)
+    rows = rows[np.argsort(at[rows], kind="stable")]
+    poses = m.graph.poses(k.id[order])
+    kept = np.unique(at[rows])
+    keyframes, rays = seen_something(as_measured(m, order), rays_as_measured(m, rows, at[rows]))
+    owners, index = np.unique(owner[rows], return_inverse=True)
+    objects = owners[owners >= 0]
+    association = Association(index - (len(owners) - len(objects)), label[objects])
+    log = recorded_log(m, name, keyframes)
+    errors = _shared_errors(m, log, keyframes, rays)
+    held = {n: value for n, value in m.errors.items() if errors is None or n not in errors.names}
+    if held and len(rays):
+        values = np.array(list(held.values()))
+        known = SharedErrors(log, keyframes, rays, m.given, tuple(held), values, np.eye(len(held)))
+        keyframes, rays, _ = known.at(values)
+        log = known.corrected_log(values)
+        errors = None if errors is None else replace(errors, log=log, keyframes=keyframes, rays=rays)
+    theta = None if errors is None else corrections(m, errors)
+    return Collected(keyframes, rays, association, poses[kept], place[objects], log, errors, theta)
+
+
+def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> SharedErrors | None:
+    if not len(rays):
+        return None
+    try:
+        return shared_errors(log, keyframes, rays, m.given)
+    except ObjslamError as error:  # the file of the calibration has changed since the session began
+        m.counters.ledger.warn(f"the shared errors are not estimated: {error}")
+        return None
+
+
+def corrections(m: MapState, errors: SharedErrors) -> Floats:
+    """Return the values (P,) by which a session corrects its measurements, and the expected value of all others."""
+    return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
+
+
+def as_measured(m: MapState, rows: Ints) -> Keyframes:
+    """Return the keyframes in these rows (n,), with the stamps and mounts that came. The rest depends on the paths."""
+    return replace(m.keyframe_arrays(rows), stamps=m.keyframes.sent[rows], base_T_camera=m.keyframes.mount[rows])
+
+
+def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
+    """Return the rays in these rows (R,) before their correction. keyframe: (R,) index of each ray's keyframe."""
+    longer = 1 + m.errors.get("range_scale", 0.0)
+    rays = offline_rays(m, rows, keyframe)
+    direction = rays.direction
+    for number, camera in enumerate(m.cameras):
+        mine = m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe[rows])] == number
+        direction = refocused(direction, mine, 1 / (1 + m.errors.get(f"{camera.name}.focal", 0.0)) - 1)
+    return replace(rays, direction=direction, range=rays.range / longer, range_sigma=rays.range_sigma / longer)
+
+
+def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
+    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe there."""
+    names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
+    columns = {name: getattr(m.rays, name)[rows] for name in names}
+    return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
+
+
+def recorded_log(m: MapState, name: str, keyframes: Keyframes) -> Log:
+    """Return the paths and cameras of a session as they came, without its detections.
+
+    keyframes: as they were measured. The poses of moving cameras are known at these.
+    """
+    return Log(
+        name=name,
+        cameras=tuple(CameraLog(camera, mount=_mount(keyframes, number)) for number, camera in enumerate(m.sent_cameras)),
+        odometry=m.course.driven.trajectory(),
+        localization=m.course.localized.trajectory(),
+    )
+
+
+def _mount(keyframes: Keyframes, camera: int) -> Trajectory | None:
+    """Return base_T_camera over time, None if the camera did not move on the robot."""
+    mine = np.flatnonzero(keyframes.camera == camera)
+    mounts = keyframes.base_T_camera[mine]
+    if not len(mine) or (mounts == mounts[0]).all():
+        return None
+    stamps, first = np.unique(keyframes.stamps[mine], return_index=True)
+    return Trajectory(stamps, mounts[first])
+
+
+def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
+    """Return the object (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) of the objects."""
+    landmarks, rays = m.landmarks, m.rays
+    owner = rays.owner.copy()
+    first = int(landmarks.id.max(initial=-1)) + 1
+    enough = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
+    label = np.zeros(first + len(enough), dtype=np.int64)
+    label[landmarks.id] = landmarks.label
+    place = np.zeros((len(label), 3))
+    place[landmarks.id] = landmarks.position
+    for i, track in enumerate(enough, first):
+        owner[np.searchsorted(rays.number, track.numbers())] = i
+        label[i], place[i] = track.label, track.position
+    return owner, label, place

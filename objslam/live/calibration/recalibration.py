@@ -1,0 +1,161 @@
+"""Take other values of the shared errors out of a live map: out of its path, keyframes, rays, tracks and graph."""
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import Calibration
+from objslam.core.geometry import inverse
+from objslam.core.types import Keyframes, Log
+from objslam.errors import SolveError
+from objslam.frontend.corrected_log import refocused
+from objslam.frontend.odometry_drift import scaled_noise
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.graph.factors.localization import localizations
+from objslam.graph.factors.priors import anchor
+from objslam.live.calibration.collected import as_measured, offline_rays, recorded_log
+from objslam.live.mapper.localization import chain_keyframes
+from objslam.live.mapper.state import MapState
+
+_AT_ONCE = 400
+"""The most keyframes with which the corrected graph is solved at once. With more, it is rebuilt in slices and linearised
+again a few times. A larger number delays the next image for longer."""
+_ITERATIONS = 8
+"""The most iterations of the solve at once. More iterations delay the next image for longer."""
+
+
+def recalibrate(m: MapState, calibration: Calibration) -> None:
+    """Take the errors of a calibration out of the map, in place of those that were taken out before.
+
+    The map depends on its state and on the calibration only, so that a resumed session makes the same map.
+    """
+    before = m.errors
+    m.errors = before | dict(zip(calibration.names, calibration.values.tolist(), strict=True))
+    m.calibration = calibration
+    m.settings = scaled_noise(m.given, m.errors)
+    if not len(m.keyframes):
+        return
+    m.graph.refresh()
+    first = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
+    drifted = m.keyframes.drift.copy()
+    times = m.keyframes.stamp.copy()
+    _remeasure_keyframes(m)
+    rays_changed = _remeasure_rays(m, before)
+    drift = _carried(m, drifted)
+    _shift_times(m, times)
+    if not m.keyframes.localized.any():
+        _move_start(m, first)
+    _replace_factors(m, rays_changed)
+    for track, spread in zip(m.tracks, drift[len(m.landmarks) :], strict=True):
+        at = np.searchsorted(m.rays.number, track.numbers())
+        track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread, m.graph)
+    m.landmarks.drift[:] = drift[: len(m.landmarks)]
+    _solve(m)
+
+
+def _remeasure_keyframes(m: MapState) -> None:
+    """Correct cameras, the path, and stamps, mounts and poses of the keyframes."""
+    k = m.keyframes
+    every = np.arange(len(k))
+    log = recorded_log(m, "live", as_measured(m, every))
+    errors, theta = _errors(m, log, as_measured(m, every), every)
+    corrected = errors.corrected_log(theta)
+    m.cameras[:] = [one.camera for one in corrected.cameras]
+    for rows, localized in ((np.flatnonzero(k.localized), True), (np.flatnonzero(~k.localized), False)):
+        of = log if localized else Log(log.name, log.cameras, log.odometry)
+        if not len(rows) or (of.odometry is None and of.localization is None):
+            continue
+        one, theta = _errors(m, of, as_measured(m, rows), rows)
+        moved = one.at(theta, drift=False)[0]
+        k.stamp[rows], k.base_T_camera[rows] = moved.stamps, moved.base_T_camera
+        reckoned = localized | k.by_odometry[rows]
+        k.map_T_base[rows[reckoned]] = moved.map_T_base[reckoned]
+    m.course.recalibrate(m.errors, corrected.odometry, m.settings, k)
+    k.camera_T_start[:] = inverse(k.start_T_base @ k.base_T_camera)
+
+
+def _errors(m: MapState, log: Log, keyframes: Keyframes, rows: Ints) -> tuple[SharedErrors, Floats]:
+    """Return keyframes of a log as a function of the errors that are taken out, and these errors (P,)."""
+    names, theta = tuple(m.errors), np.array(list(m.errors.values()))
+    none = offline_rays(m, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+    return SharedErrors(log, keyframes, none, m.given, names, theta, np.eye(len(names))), theta
+
+
+def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
+    """Correct the rays, which had the errors `before` taken out, and return whether any may have changed."""
+    rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
+    longer = _ratio(m, before, "range_scale")
+    focal = [_ratio(m, before, f"{one.name}.focal") for one in m.cameras]
+    rays.range[:] *= longer
+    rays.range_sigma[:] *= longer
+    for number, ratio in enumerate(focal):
+        rays.direction[:] = refocused(rays.direction, camera == number, ratio - 1)
+    return any(ratio != 1 for ratio in (longer, *focal))
+
+
+def _ratio(m: MapState, before: dict[str, float], name: str) -> float:
+    return (1 + m.errors.get(name, 0.0)) / (1 + before.get(name, 0.0))
+
+
+def _carried(m: MapState, drifted: Floats) -> Floats:
+    """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
+
+    drifted: (K, 6, 6) the drift of the keyframes before. An object takes the drift of the keyframe whose drift it had.
+    """
+    order = m.time_order()
+    passed = np.maximum.accumulate(drifted[order][:, 2, 2])
+    had = np.array([*m.landmarks.drift[:, 2, 2], *(track.drift[2, 2] for track in m.tracks)])
+    return np.asarray(m.keyframes.drift[order[np.searchsorted(passed, had).clip(max=len(order) - 1)]])
+
+
+def _shift_times(m: MapState, times: Floats) -> None:
+    """Shift the stamps of landmarks and tracks as those of the keyframes, which were `times` (K,) before."""
+    order = np.argsort(times, kind="stable")
+    shift = (m.keyframes.stamp - times)[order]
+
+    def shifted(stamps: Floats) -> Floats:
+        return np.asarray(stamps + shift[np.searchsorted(times[order], stamps).clip(max=len(order) - 1)])
+
+    m.landmarks.first[:], m.landmarks.last[:] = shifted(m.landmarks.first), shifted(m.landmarks.last)
+    for track in m.tracks:
+        track.first, track.last = shifted(np.array([track.first, track.last])).tolist()
+
+
+def _move_start(m: MapState, before: Floats) -> None:
+    """Move the whole map with the first keyframe, whose pose (4, 4) was held at `before`."""
+    now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
+    m.graph.drop_absolute()
+    m.move(now @ inverse(before))
+    m.graph.add_absolute(int(m.keyframes.id[0]), anchor(int(m.keyframes.id[0]), now))
+
+
+def _replace_factors(m: MapState, rays_changed: bool) -> None:
+    """Replace the factors of motions, of absolute poses and of rays by those of the corrected measurements."""
+    k, rays = m.keyframes, m.rays
+    for number in k.id.tolist():
+        m.graph.drop_motion(number)
+    chain_keyframes(m)
+    for row in np.flatnonzero(k.localized).tolist():
+        number = int(k.id[row])
+        one = m.keyframe_arrays(np.array([row]))
+        m.graph.add_absolute(number, localizations(one, m.settings, number, m.localization.planar)[0])
+    used = np.flatnonzero(rays.used & (rays.owner >= 0))
+    if rays_changed and len(used):
+        m.graph.drop_rays(rays.number[used])
+        m.graph.add_rays(m.bearings(used))
+
+
+def _solve(m: MapState) -> None:
+    """Move the estimate to the corrected measurements, at once or over the next keyframes.
+
+    The rays are tested again at the next full solve and not now. Until the map has settled, those of one object may seem to
+    be of two.
+    """
+    m.schedule.relinearise_soon()
+    if len(m.keyframes) <= _AT_ONCE:
+        try:
+            m.graph.solve(_ITERATIONS)
+            m.read_positions()
+            return
+        except SolveError:
+            m.counters.accept("solves given up")
+    m.rebuild_in_slices()

@@ -1,0 +1,122 @@
+"""Estimate shared errors in a process of its own. GTSAM lets no other thread of a process run while it solves."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from objslam.config import Settings
+    from objslam.core.arrays import Floats
+    from objslam.core.calibration import Calibration
+    from objslam.core.types import Association
+    from objslam.frontend.shared_errors import SharedErrors
+
+_PATIENT = 600.0
+"""The longest time, s, that a calibration may take. A larger value waits longer for a process that hangs."""
+_NICE = 10
+"""By how much the priority of the process is lower than that of the session. A larger number slows it down more."""
+_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a calibration starts from. theta: (P,) the errors now. map_T_camera: (K, 4, 4) poses of its keyframes."""
+
+    errors: SharedErrors
+    theta: Floats
+    association: Association
+    map_T_camera: Floats
+    settings: Settings
+
+    def solve(self) -> Calibration | None:
+        """Return the shared errors that fit best, None if they cannot be estimated. SolveError if there is no solution."""
+        from objslam.core.diagnostics import Ledger
+        from objslam.graph.batch_solver import solve_joint
+
+        e = self.errors
+        found = solve_joint(
+            e.keyframes,
+            e.rays,
+            self.association,
+            self.settings,
+            Ledger(),
+            start=self.map_T_camera,
+            errors=e,
+            theta=self.theta,
+        )
+        return found.calibration
+
+
+class Worker:
+    """A process that solves one request."""
+
+    def __init__(self, request: Request) -> None:
+        """Start the process."""
+        self._answer = b""
+        self._process: subprocess.Popen[bytes] | None = None
+        package = str(Path(__file__).parents[3])
+        paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
+        with suppress(OSError):  # then there is no answer, which `result` says
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **_THREADS, "PYTHONPATH": paths},
+                start_new_session=True,  # Ctrl+C ends the session, and the session ends this process.
+            )
+        self._thread = threading.Thread(
+            target=self._run, args=(pickle.dumps(request),), name="objslam calibration", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def done(self) -> bool:
+        """Whether `result` returns at once."""
+        return not self._thread.is_alive()
+
+    def result(self) -> Calibration | None:
+        """Wait for the process, and return the calibration. None if there is none, or if the process failed."""
+        self._thread.join()
+        if not self._answer:
+            return None
+        found: Calibration | None = pickle.loads(self._answer)  # noqa: S301 - from this program itself
+        return found
+
+    def close(self) -> None:
+        """End the process without waiting for its answer."""
+        if self._process is not None:
+            self._process.kill()
+        self._thread.join()
+
+    def _run(self, request: bytes) -> None:
+        if self._process is None:
+            return
+        try:
+            answer, _ = self._process.communicate(request, timeout=_PATIENT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
+            return
+        if self._process.returncode == 0:
+            self._answer = answer
+
+
+def main() -> None:
+    """Read a request from stdin, and write its calibration to stdout."""
+    os.nice(_NICE)
+    request: Request = pickle.load(sys.stdin.buffer)  # noqa: S301 - from this program itself
+    answer = pickle.dumps(request.solve())
+    sys.stdout.buffer.write(answer)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""Tests of the stamps and the boxes of a log: do they belong to the poses and to the images of the calibration?"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from objslam.core.camera import Camera
+from objslam.core.types import Detections, Log
+from objslam.mapping.checks.finding import Finding
+
+_OVERLAP = 0.5
+"""The least share of frames within the time of the poses. A larger share finds fault with logs that begin late."""
+_UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+"""Units of time, by how many of them are a second."""
+_FEWEST = 20
+"""The fewest boxes that are judged. A few boxes may lie anywhere."""
+_PART = 0.9
+"""The share of boxes that must be odd. A smaller share finds fault with logs of a few odd boxes."""
+_WITHOUT_AREA = 0.2
+"""The share of boxes without area above which the corners are not x1 y1 x2 y2. No detector writes such boxes."""
+_OUTSIDE = 0.1
+"""The share of boxes with a centre outside the image above which they belong to a larger image."""
+_LEAST_SPAN = 0.55
+"""The share of the image's width and height that the boxes of a long log reach. A larger share warns more often."""
+_LONG = 200
+"""The number of boxes from which on they should reach most of the image."""
+
+
+def check_stamps(log: Log) -> Finding | None:
+    """Return whether the frames of a log were taken at other times than its poses."""
+    path = log.localization or log.odometry
+    stamps = [c.detections.frame_stamps for c in log.cameras if c.detections is not None]
+    if path is None or not stamps or not sum(map(len, stamps)):
+        return None
+    frames = np.concatenate(stamps)
+
+    def share(factor: float) -> float:
+        inside = (frames / factor >= path.stamps[0] - 1) & (frames / factor <= path.stamps[-1] + 1)
+        return float(inside.mean())
+
+    here = share(1.0)
+    if here >= _OVERLAP:
+        return None
+    span = f"frames {frames.min():.3f} to {frames.max():.3f}, poses {path.stamps[0]:.3f} to {path.stamps[-1]:.3f}"
+    for factor, unit in _UNITS.items():
+        for by, who in ((factor, "frames"), (1 / factor, "poses")):
+            if share(by) > max(_OVERLAP, 2 * here):
+                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
+    length, whole = float(np.ptp(frames)), float(np.ptp(path.stamps))
+    for factor, unit in _UNITS.items():
+        for ratio, who in ((length / max(whole, 1e-9), "frames"), (whole / max(length, 1e-9), "poses")):
+            if 0.5 < ratio / factor < 2:
+                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
+    what = f"only {100 * here:.0f} % of the frames lie in the time of the poses ({span})"
+    return Finding("stamps apart", f"{what}: the camera and the poses have different clocks", spoils=False)
+
+
+def check_boxes(log: Log) -> list[Finding]:
+    """Return what is wrong with the boxes of a log, seen from their corners alone."""
+    found: list[Finding] = []
+    for one in log.cameras:
+        if one.detections is not None and len(one.detections) >= _FEWEST:
+            first = next(_judge(one.detections, one.camera), None)
+            if first is not None:
+                found.append(first)
+    return found
+
+
+def _judge(found: Detections, camera: Camera) -> Iterator[Finding]:
+    boxes, name = found.boxes, f"boxes of camera {camera.name}"
+    size = f"{camera.width} x {camera.height} px"
+    if (boxes.max(axis=1) <= 1.5).mean() > _PART:
+        yield Finding("boxes 0..1", f"the {name} lie between 0 and 1: they are probably shares of the image, not px")
+    flat = float(((boxes[:, 2] <= boxes[:, 0]) | (boxes[:, 3] <= boxes[:, 1])).mean())
+    if flat > _WITHOUT_AREA:
+        yield Finding(
+            "boxes without area",
+            f"{100 * flat:.0f} % of the {name} have x2 <= x1 or y2 <= y1: "
+            "they are not x1 y1 x2 y2 but probably x y width height",
+        )
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    outside = float(((centre < 0) | (centre > camera.size)).any(axis=1).mean())
+    if outside > _OUTSIDE:
+        yield Finding(
+            "boxes outside",
+            f"{100 * outside:.0f} % of the {name} have their centre outside the image of {size}: they belong to a larger "
+            "image, or are not x1 y1 x2 y2",
+        )
+    reach = np.quantile(boxes[:, 2:], 0.99, axis=0) / camera.size
+    if len(boxes) >= _LONG and (reach < _LEAST_SPAN).all():
+        yield Finding(
+            "boxes in a corner",
+            f"the {name} reach only {100 * reach[0]:.0f} % of the width and {100 * reach[1]:.0f} % of the height of {size}: "
+            "they probably belong to a smaller image",
+            spoils=False,
+        )

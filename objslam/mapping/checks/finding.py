@@ -1,0 +1,21 @@
+"""What a check found."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong with the input.
+
+    name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the positions
+    of a map cannot be relied on, because the error is not corrected.
+    """
+
+    name: str
+    message: str
+    spoils: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what summary.json holds."""
+        return {"name": self.name, "message": self.message, "spoils_positions": self.spoils}

@@ -1,0 +1,192 @@
+"""Tests of the poses of a log: can a robot move like this?"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.geometry import interpolate
+from objslam.core.types import Log, Trajectory
+from objslam.mapping.checks.finding import Finding
+
+FASTEST = 40.0
+"""The typical speed (m/s) above which poses are not in metres. It is that of a car on a motorway. A larger speed warns less
+often."""
+_FASTEST_TURN = 8.0
+"""The typical turn rate (rad/s) above which headings are not in radians. A larger rate warns less often."""
+_JUMP = 5.0
+"""The speed (m/s) above which a step of an otherwise slow path may be a jump, as live.max_speed."""
+_JUMP_TURN = 20.0
+"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump, as four times live.max_speed."""
+_JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
+"""The way (m) and the turn (rad) of a step that may be a jump. Larger values leave out small corrections."""
+_TIMES = 20.0
+"""How many times faster than the robot's usual speed a jump is. A larger number warns less often."""
+_FEWEST_STEPS = 20
+"""The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
+_STILL = 1e-4
+"""The way (m) and turn (rad) between two poses below which the robot stands."""
+_FROZEN_SECONDS = 8.0
+"""The shortest time (s) without motion that may be a frozen path. Robots that stop for long have boxes that stop too."""
+_MOVING_PX = 12.0
+"""The spread (px) of the boxes of one label about their median, within seconds, from which on a camera moves."""
+_LEAST_STEP = 0.01
+"""The least step (m) of a path whose direction is judged, for shorter steps are noise."""
+_PIECE = 1.0
+"""The time (s) over which ways are compared. A longer time suits noisy poses."""
+_LEAST_PIECE = 0.3
+"""The least way in such a time, as a share of the longest. Shorter ways are noise."""
+_OTHER_SCALE = 0.1
+"""The least difference of the two ways, as a logarithm. Real odometry errs by up to 8 %. A larger one warns less often."""
+_BEFORE = 0.3
+"""The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
+
+
+def check_path(log: Log) -> list[Finding]:
+    """Return what is wrong with the poses of a log, seen from the poses alone, and from whether the boxes move."""
+    found: list[Finding] = []
+    for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
+        if path is not None and len(path) > _FEWEST_STEPS:
+            found += _judge_speed(path, name)
+            found += _judge_stops(path, name, log)
+    if log.localization is not None and log.odometry is not None:
+        found += _compare_ways(log.localization, log.odometry)
+    return found
+
+
+def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Finding]:
+    """Compare how far the robot went by its localisation and by its odometry, in pieces of time."""
+    begin, end = max(localization.stamps[0], odometry.stamps[0]), min(localization.stamps[-1], odometry.stamps[-1])
+    times = np.arange(begin, end, _PIECE)
+    if len(times) < _FEWEST_STEPS:
+        return
+    places = [interpolate(path.stamps, path.poses, times, np.inf)[0][:, :3, 3] for path in (localization, odometry)]
+    by_map, by_wheels = (np.linalg.norm(np.diff(place, axis=0), axis=1) for place in places)
+    moved = np.minimum(by_map, by_wheels) > _LEAST_PIECE * np.maximum(by_map, by_wheels).max()
+    if moved.sum() < _FEWEST_STEPS:
+        return
+    ratio = np.log(by_map[moved] / by_wheels[moved])
+    middle = float(np.median(ratio))
+    sigma = 1.5 * float(np.median(np.abs(ratio - middle))) / np.sqrt(moved.sum())
+    if abs(middle) > max(_OTHER_SCALE, 5 * sigma):
+        yield Finding(
+            "scales differ",
+            f"the localisation goes {np.exp(middle):.3g} times as far as the odometry: one of them is not in metres, or has "
+            "a wrong scale",
+        )
+
+
+def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
+    seconds = np.diff(path.stamps)
+    way, angle = steps(path.poses)
+    moving = (way > _STILL) | (angle > _STILL)
+    if moving.sum() < _FEWEST_STEPS:
+        return
+    speed, rate = way / seconds, angle / seconds
+    usual, usual_rate = float(np.median(speed[moving])), float(np.median(rate[moving]))
+    if usual > FASTEST:
+        unit = "the positions are probably in mm instead of m" if usual < 1e4 else "the stamps are probably not in s"
+        yield Finding(
+            f"{name} too fast",
+            f"the {name} moves at {usual:.0f} m/s, which no robot does: {unit}",
+        )
+        return
+    if usual_rate > _FASTEST_TURN:
+        yield Finding(
+            f"{name} turns too fast",
+            f"the {name} turns at {usual_rate:.0f} rad/s, as no robot does: the yaw is probably in degrees instead of rad",
+        )
+        return
+    fast = float(np.quantile(speed[moving], 0.9)), float(np.quantile(rate[moving], 0.9))
+    # A gap in the poses is no jump, for the speed over the gap is what a robot can do.
+    jumps = (speed > max(_JUMP, _TIMES * fast[0] / 4)) & (way > _JUMP_WAY)
+    jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1] / 4)) & (angle > _JUMP_ANGLE)
+    if jumps.any():
+        first = int(np.argmax(jumps))
+        yield Finding(
+            f"{name} jumps",
+            f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {way[first]:.2f} m and "
+            f"{np.degrees(angle[first]):.0f} deg at stamp {path.stamps[first + 1]:.3f}): "
+            "poses before and after a jump do not belong together",
+            spoils=name == "odometry" or log_is_split(way, jumps),
+        )
+
+
+def log_is_split(way: Floats, jumps: Bools) -> bool:
+    """Return whether jumps of a localisation do not cancel: it went to another map, and did not correct itself only once."""
+    return bool(jumps.any() and way[jumps].max() > 1.0)
+
+
+def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
+    """Find long times without motion in which boxes move."""
+    way, angle = steps(path.poses)
+    still = (way < _STILL) & (angle < _STILL)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
+    frozen, begin = 0.0, None
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        start, end = float(path.stamps[first]), float(path.stamps[last])
+        if end - start >= _FROZEN_SECONDS and _boxes_move(log, start, end):
+            begin = start if begin is None else begin
+            frozen += end - start
+    if begin is not None:
+        whole = float(path.stamps[-1] - path.stamps[0])
+        yield Finding(
+            f"{name} frozen",
+            f"the {name} stands still for {frozen:.0f} of {whole:.0f} s while the boxes move (from stamp {begin:.3f}): "
+            "the poses are probably frozen",
+        )
+
+
+def _boxes_move(log: Log, start: float, end: float) -> bool:
+    """Return whether most labels have boxes that go through the image between two stamps."""
+    moving, still = 0, 0
+    for one in log.cameras:
+        found = one.detections
+        if found is None:
+            continue
+        inside = (found.stamps >= start + 1) & (found.stamps <= end - 1)
+        centre = (found.boxes[inside, :2] + found.boxes[inside, 2:]) / 2
+        label = found.label[inside]
+        for name in np.unique(label):
+            mine = centre[label == name]
+            if len(mine) >= 5:
+                spread = float(np.median(np.abs(mine - np.median(mine, axis=0)).max(axis=1)))
+                moving, still = moving + (spread > _MOVING_PX), still + (spread <= _MOVING_PX / 2)
+    return moving > 2 * still and moving > 0
+
+
+def steps(poses: Floats) -> tuple[Floats, Floats]:
+    """Return the way (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
+    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turn = Rotation.from_matrix(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    return way, np.asarray(turn.magnitude())
+
+
+def straightness(path: Trajectory) -> float | None:
+    """Return how much a robot drives along one direction of its base: 1 for wheels, near 0 for poses with wrong axes.
+
+    It is the length of the mean direction of motion in base, of the motions that are long enough to have a direction. None
+    if there are too few of them, or if the robot hardly turns, for then all axes fit.
+    """
+    if len(path) < _FEWEST_STEPS:
+        return None
+    later = np.searchsorted(path.stamps, path.stamps + _BEFORE)
+    first = np.flatnonzero(later < len(path))
+    last = later[first]
+    way = path.poses[last, :3, 3] - path.poses[first, :3, 3]
+    length = np.linalg.norm(way, axis=1)
+    near = path.stamps[last] - path.stamps[first] < 4 * _BEFORE
+    noise = float(np.median(length[near])) if near.any() else 0.0
+    kept = near & (length > max(3 * _LEAST_STEP, noise / 2))
+    if kept.sum() < _FEWEST_STEPS:
+        return None
+    first, last, direction = first[kept], last[kept], way[kept] / length[kept, None]
+    if np.linalg.norm(direction.mean(axis=0)) > 0.9:
+        return None
+    # The base between the two poses: its axes are the mean of both, to first order.
+    middle = path.poses[first, :3, :3] + path.poses[last, :3, :3]
+    in_base = np.einsum("nji,nj->ni", middle, direction)
+    size = np.linalg.norm(in_base, axis=1, keepdims=True)
+    in_base = in_base / np.maximum(size, 1e-9)
+    return float(np.linalg.norm(in_base.mean(axis=0)))

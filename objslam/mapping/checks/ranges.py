@@ -1,0 +1,164 @@
+"""Compare measured ranges with the distances that bearings alone give."""
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.statistics import grouped_median
+from objslam.mapping.checks.agreement import Agreement, Part
+from objslam.mapping.checks.finding import Finding
+
+_FEWEST = 40
+"""The fewest ranges that are judged. Fewer ranges tell a scale poorly."""
+_POINTS = 4
+"""The fewest points whose ranges are judged. Fewer points may have been placed wrongly by chance."""
+_PARALLAX = np.radians(20.0)
+"""The least angle (rad) between the rays of a point that tells a distance. A larger angle leaves fewer points."""
+_SPREAD = 0.1
+"""The most by which the ratios of half of the points may differ from their median, as a share. A wrong unit or scale is the
+same for all points, while points that are placed wrongly differ."""
+_SPREAD_OF_UNITS = 0.3
+"""As `_SPREAD`, for a factor so large that it must be a unit."""
+_LEAST = 0.06
+"""The least share by which ranges must be wrong. Smaller shares come from the depth of things and from odometry."""
+_SIGMAS = 5.0
+"""How many standard deviations the share must be away from 0. A larger number warns less often."""
+_UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
+"""Metres in other units of length."""
+_CLOSE = 0.25
+"""The logarithm up to which a factor is one of these units."""
+_UNIT = 0.7
+"""The logarithm of a factor from which on no error of a calibration explains it."""
+_GROUP = 8
+"""The fewest boxes of a label in a window whose ranges tell a factor. Fewer boxes tell it poorly."""
+_ALONE = 1.1
+"""The crowd (`Part.crowd`) up to which a label is one thing in a window. In a larger crowd, ends of ranges lie apart."""
+_LEAST_BY_ODOMETRY = 0.18
+"""The least share by which ranges must be wrong by odometry, which joint mode corrects by several percent itself."""
+_FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
+"""The factors on ranges that are tried; a larger number finds the best more exactly."""
+_TELLS = 0.5
+"""The share of the spread without ranges to which the right ranges must bring the ends together. A smaller share leaves
+fewer labels that tell a factor."""
+
+
+def check_ranges(found: Agreement, part: Part) -> Finding | None:
+    """Return whether ranges are too long or too short for the way of the robot."""
+    if not part.drifts:
+        return _by_bearings(found)
+    if part.crowd <= _ALONE:
+        return _by_spread(found, part)
+    in_crowd = _by_bearings(found)
+    return in_crowd if in_crowd is not None and in_crowd.name != "depth scale" else None
+
+
+def _by_spread(found: Agreement, part: Part) -> Finding | None:
+    """Judge ranges by odometry: with ranges of the right length, the boxes of a label in a window lie at one place.
+
+    Bearings alone place points poorly in a short window.
+    """
+    rays = found.rays
+    origins, directions = rays.in_map(found.keyframes.map_T_camera)
+    window = np.array([part.window[camera][frame] for camera, frame in zip(*_frames(found), strict=True)])
+    group = rays.label + len(rays.label_names) * window[rays.keyframe]
+    factors = []
+    for number in np.unique(group[np.isfinite(rays.range)]):
+        mine = (group == number) & np.isfinite(rays.range)
+        if mine.sum() >= _GROUP:
+            factors.append(_best_factor(origins[mine], directions[mine], rays.range[mine]))
+    known = np.log([factor for factor in factors if factor > 0])
+    if len(known) < _POINTS:
+        return None
+    ratio = float(np.exp(-np.median(known)))
+    most = _SPREAD_OF_UNITS if abs(np.log(ratio)) > _UNIT else _SPREAD
+    if np.median(np.abs(known + np.log(ratio))) > most or abs(ratio - 1) < _LEAST_BY_ODOMETRY:
+        return None
+    return _in_words(ratio, "the way of the odometry")
+
+
+def _frames(found: Agreement) -> tuple[list[int], list[int]]:
+    return found.keyframes.camera.tolist(), found.keyframes.frame.tolist()
+
+
+def _best_factor(origins: Floats, directions: Floats, ranges: Floats) -> float:
+    """Return the factor on ranges (n,) that brings their ends closest together for their length, 0 if none does."""
+    ends = origins + _FACTORS[:, None, None] * (ranges[:, None] * directions)
+    spread = np.linalg.norm(ends - np.median(ends, axis=1, keepdims=True), axis=2)
+    relative = np.median(spread, axis=1) / (_FACTORS * np.median(ranges))
+    best = int(relative.argmin())
+    # At very long ranges only the directions count: they must disagree, or the robot stood still.
+    return float(_FACTORS[best]) if relative[best] < _TELLS * relative[-1] and 0 < best < len(_FACTORS) - 1 else 0.0
+
+
+def _by_bearings(found: Agreement) -> Finding | None:
+    """Judge ranges by the places where bearings meet.
+
+    A range ends on the surface of a thing and a bearing goes to its centre, so a constant difference is no error. Both the
+    ratio and the growth of the range with the distance must be wrong.
+    """
+    rays = found.rays
+    held = (found.point >= 0) & np.isfinite(rays.range)
+    if held.sum() < _FEWEST:
+        return None
+    origins, _ = rays.in_map(found.keyframes.map_T_camera)
+    held &= _well_placed(found)[np.maximum(found.point, 0)]
+    if held.sum() < _FEWEST:
+        return None
+    owner = found.point[held]
+    distance = np.linalg.norm(found.points[owner] - origins[held], axis=1)
+    count = len(found.points)
+    ratios = grouped_median(rays.range[held] / distance, owner, count)
+    known = np.log(ratios[np.isfinite(ratios)])
+    ratio = float(np.exp(np.median(known)))
+    if len(known) < _POINTS or np.median(np.abs(known - np.median(known))) > _SPREAD:
+        return None
+    scaled = rays.range[held] / ratio
+    miss = np.abs(scaled - distance)
+    kept = miss <= 3 * float(np.median(miss)) + 1e-9
+    owner, distance, scaled = owner[kept], distance[kept], scaled[kept]
+    number = np.maximum(np.bincount(owner, minlength=count), 1)
+    d = distance - (np.bincount(owner, distance, minlength=count) / number)[owner]
+    r = scaled - (np.bincount(owner, scaled, minlength=count) / number)[owner]
+    spread = float((d**2).sum())
+    if spread <= 0:
+        return None
+    slope = float((d * r).sum() / spread)
+    sigma = float(np.sqrt(((r - slope * d) ** 2).mean() / spread))
+    growth = ratio * slope
+    if abs(np.log(ratio)) > _UNIT:
+        return _in_words(ratio, "the distances by bearings")
+    off = min(abs(ratio - 1), abs(growth - 1))
+    if (ratio - 1) * (growth - 1) <= 0 or off < _LEAST or abs(slope - 1 / ratio) < _SIGMAS * sigma:
+        return None
+    return _in_words(ratio, "the distances by bearings")
+
+
+def _in_words(ratio: float, than: str) -> Finding:
+    """Return the finding for ranges that are a factor too long."""
+    for factor, unit in _UNITS.items():
+        if abs(np.log(ratio / factor)) < _CLOSE:
+            return Finding(
+                f"depth in {unit}",
+                f"the depths are {ratio:.3g} times too long for {than}: they are probably in {unit} instead of m "
+                "(depth_scale is the units of a depth image per metre)",
+            )
+    return Finding(
+        "depth scale",
+        f"the depths are {100 * abs(ratio - 1):.0f} % too {'long' if ratio > 1 else 'short'} for {than}: "
+        "the scale of the depth (depth_scale), of the poses, or the focal length is wrong",
+    )
+
+
+def _well_placed(found: Agreement) -> Bools:
+    """Return which points (N,) are seen under a wide angle."""
+    origins, _ = found.rays.in_map(found.keyframes.map_T_camera)
+    held = found.point >= 0
+    owner = found.point[held]
+    to = found.points[owner] - origins[held]
+    to = to / np.linalg.norm(to, axis=1, keepdims=True)
+    count = len(found.points)
+    mean = np.stack([np.bincount(owner, column, minlength=count) for column in to.T], axis=1)
+    mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    off = np.arccos(np.clip(np.einsum("ri,ri->r", to, mean[owner]), -1.0, 1.0))
+    widest = np.zeros(count)
+    np.maximum.at(widest, owner, off)
+    return np.asarray(widest > _PARALLAX / 2)

@@ -1,0 +1,59 @@
+"""A check of the shared errors that names wrong input: an error far beyond its prior has a cause."""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration, kind
+from objslam.core.diagnostics import Ledger
+from objslam.mapping.checks.finding import Finding
+
+MOST_SIGMAS = 3.0
+"""The size of a shared error, in standard deviations of its prior, above which the user is warned. A larger value warns less
+often."""
+
+_CAUSES = {
+    "clock": "do the stamps of the camera and of the poses use the same clock?",
+    "scale": "is the odometry in metres?",
+    "turn_scale": "is the odometry's rotation in radians, and its wheel base right?",
+    "turn_bias": "does the odometry turn while the robot stands?",
+    "yaw": "is base_T_camera right?",
+    "tilt": "is base_T_camera right?",
+    "roll": "is base_T_camera right?",
+    "range_scale": "is the depth in metres (depth_scale)?",
+    "focal": "are the camera matrix and the boxes of the same image size?",
+}
+
+
+def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
+    """Warn of each shared error that is far from what its prior expected, and name what may be wrong.
+
+    The prior is that of the settings, or a calibration file. An error as in the file is large, but no surprise.
+    """
+    for name, of in calibration.to_dict()["parameters"].items():
+        expected = of["prior_mean"]
+        sigmas = abs(of["value"] - expected) / of["prior_sigma"]
+        if sigmas > MOST_SIGMAS:
+            cause = _CAUSES.get(kind(name), "is the calibration right?")
+            unit = "" if of["unit"] == "share" else f" {of['unit']}"
+            far = f"{sigmas:.1f} times its prior sigma"
+            if expected:
+                far += f" from the {expected:.3g}{unit} of the calibration file; if it has changed, calibrate anew"
+            ledger.warn(f"the shared error {name} is {of['value']:.3g}{unit}, {far}: {cause}")
+
+
+def uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
+    """Return a finding for each shared error that ended at its bound (P,): the true one is larger, and is not corrected.
+
+    An error that was expected there, by a calibration file, is one that the file tells.
+    """
+    ended = np.abs(calibration.values) >= 0.999 * bounds
+    ended &= np.abs(calibration.values - calibration.expected) > calibration.prior
+    return [
+        Finding(
+            f"{name} at its bound",
+            f"the shared error {name} ended at its bound of {bound:.3g}, so it is not corrected: "
+            + _CAUSES.get(kind(name), "is the calibration right?"),
+        )
+        for name, bound, at in zip(calibration.names, bounds.tolist(), ended.tolist(), strict=True)
+        if at
+    ]

@@ -1,0 +1,221 @@
+"""Estimate small errors of the calibration at given poses: what camera rotation, clock or focal length fits the rays best.
+
+The points of an `Agreement` move with the errors. One error after the other is taken in, the one that explains most first.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.calibration import UNITS, kind
+from objslam.core.types import Keyframes, Log, Rays
+from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.mapping.checks.agreement import Agreement
+
+_PRIORS = {"clock": 0.3, "yaw": 0.2, "tilt": 0.2, "roll": 0.2, "focal": 0.2, "translation": 0.3}
+"""Wide prior standard deviations of the errors that are looked for (s, rad, share, m). They bound the search."""
+_HARMFUL = {"clock": 0.12, "yaw": 0.035, "tilt": 0.035, "roll": 0.035, "focal": 0.05, "x": 0.1, "y": 0.1}
+"""The sizes (s, rad, share, m) from which on an error is worth a warning. Smaller ones are those of a usual calibration."""
+_KINDS = tuple(_HARMFUL)
+_LEAST_GAIN = 40.0
+"""The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
+_LEAST_SHARE = 0.04
+"""The least decrease as a share of all squared deviations. Rays of a real log are never independent, so many small
+deviations are no proof. A larger value finds fewer errors."""
+_ROUNDS = 6
+"""The number of Gauss-Newton steps. More are more exact."""
+_CLOCK_SIGMA = 0.05
+"""The standard deviation (s) of a clock that was found by trial. A larger value says less about the clock."""
+_CAUCHY = 3.0
+"""The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
+
+CAUSES = {
+    "clock": "the clock of the camera and that of the poses differ",
+    "yaw": "base_T_camera is turned about the vertical axis",
+    "tilt": "base_T_camera is tilted up or down",
+    "roll": "base_T_camera is rolled",
+    "focal": "the camera matrix has another focal length, or belongs to another image size",
+    "x": "base_T_camera is moved forward or back",
+    "y": "base_T_camera is moved aside",
+}
+"""What is wrong if an error of each kind is large."""
+
+
+@dataclass(frozen=True)
+class SmallErrors:
+    """Errors that explain the residuals. names, values (P,), sigma (P,): in the units of `core.calibration`.
+
+    errors: the measurements with these errors taken out. harmful: the names of those that are worth a warning.
+    """
+
+    errors: SharedErrors
+    names: tuple[str, ...]
+    values: Floats
+    sigma: Floats
+
+    @property
+    def harmful(self) -> tuple[str, ...]:
+        """The names of the errors that are worth a warning."""
+        return tuple(n for n, v in zip(self.names, self.values.tolist(), strict=True) if abs(v) > _HARMFUL[kind(n)])
+
+    def corrected(self, log: Log) -> Log:
+        """Return a log with the errors taken out."""
+        every = np.zeros(len(self.errors.names))
+        for name, value in zip(self.names, self.values.tolist(), strict=True):
+            every[self.errors.names.index(name)] = value
+        return shared(log, self.errors.keyframes, self.errors.rays, self.errors.settings).corrected_log(every)
+
+    def in_words(self) -> str:
+        """Return the harmful errors with their sizes."""
+        parts = []
+        for name, value, sigma in zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True):
+            if name in self.harmful:
+                unit = UNITS.get(kind(name), "share")
+                if unit == "rad":
+                    value, sigma, unit = np.degrees(value), np.degrees(sigma), "deg"
+                elif unit == "share":
+                    value, sigma, unit = 100 * value, 100 * sigma, "%"
+                parts.append(f"{name} {value:+.2f} +- {sigma:.2f} {unit}")
+        return ", ".join(parts)
+
+    def causes(self) -> str:
+        """Return what is probably wrong."""
+        return "; ".join(dict.fromkeys(CAUSES[kind(name)] for name in self.harmful))
+
+
+def shared(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors:
+    """Return the errors that are looked for, as parameters of the measurements."""
+    of = settings.calibration.model_copy(
+        update={**_PRIORS, "use": True, "file": None, "scale": 0.0, "turn_scale": 0.0, "turn_bias": 0.0, "range_scale": 0.0}
+    )
+    wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
+    found = shared_errors(log, keyframes, rays, wide)
+    assert found is not None  # every log has a camera, and every camera a clock
+    return found
+
+
+def find_small_errors(
+    log: Log, found: Agreement, settings: Settings, noise: tuple[float, float], kinds: tuple[str, ...] = _KINDS
+) -> SmallErrors | None:
+    """Return the errors that explain the residuals of the rays that fit, None if there are none.
+
+    noise: the errors of the poses (rad, m).
+    """
+    held = found.point >= 0
+    if held.sum() < 10 * len(_KINDS):
+        return None
+    errors = shared(log, found.keyframes, found.rays, settings)
+    wanted = np.array([i for i, name in enumerate(errors.names) if kind(name) in kinds])
+    number, owner = np.unique(found.point[held], return_inverse=True)
+    points = found.points[number]
+    theta = np.zeros(len(errors.names))
+    chosen: list[int] = []
+    for _ in range(2 * len(_KINDS)):
+        system = _linearise(errors, theta, points, owner, held, noise)
+        gains = np.zeros(len(theta))
+        for i in wanted.tolist():
+            if i not in chosen:
+                gains[i] = system.gain([*chosen, i]) - (system.gain(chosen) if chosen else 0.0)
+        best = int(gains.argmax())
+        if gains[best] < max(_LEAST_GAIN * system.variance, _LEAST_SHARE * system.cost):
+            break
+        chosen.append(best)
+        for _ in range(_ROUNDS):
+            system = _linearise(errors, theta, points, owner, held, noise)
+            step, moved = system.step(chosen)
+            theta[chosen] = np.clip(theta[chosen] + step, -errors.bounds[chosen], errors.bounds[chosen])
+            points = points + moved
+        if len(chosen) == len(wanted):
+            break
+    if not chosen:
+        return None
+    system = _linearise(errors, theta, points, owner, held, noise)
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(system.matrix[np.ix_(chosen, chosen)])) * system.variance)
+    return SmallErrors(errors, tuple(errors.names[i] for i in chosen), theta[chosen], sigma)
+
+
+def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
+    """Return errors of a log whose frames were moved by an offset (s) as errors of the log itself."""
+    own = shared(log, found.keyframes, found.rays, settings)
+    values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)
+    sigmas = dict.fromkeys(values, _CLOCK_SIGMA)
+    if errors is not None:
+        for name, value, sigma in zip(errors.names, errors.values.tolist(), errors.sigma.tolist(), strict=True):
+            values[name], sigmas[name] = values.get(name, 0.0) + value, sigma
+    return SmallErrors(own, tuple(values), np.array(list(values.values())), np.array(list(sigmas.values())))
+
+
+@dataclass(frozen=True)
+class _System:
+    """The normal equations of the errors with the points taken out. matrix (P, P), vector (P,), cost: squared deviations.
+
+    back: (N, 3, P) how the points follow the errors, own: (N, 3) how they move by themselves.
+    """
+
+    matrix: Floats
+    vector: Floats
+    cost: float
+    variance: float
+    back: Floats
+    own: Floats
+
+    def gain(self, which: list[int]) -> float:
+        """By how much these errors decrease the cost."""
+        at = np.ix_(which, which)
+        return float(self.vector[which] @ np.linalg.lstsq(self.matrix[at], self.vector[which], rcond=1e-9)[0])
+
+    def step(self, which: list[int]) -> tuple[Floats, Floats]:
+        """The step of these errors, and that of the points (N, 3)."""
+        step = np.linalg.lstsq(self.matrix[np.ix_(which, which)], -self.vector[which], rcond=1e-9)[0]
+        return np.asarray(step), np.asarray(self.own + self.back[:, :, which] @ step)
+
+
+def _linearise(
+    errors: SharedErrors, theta: Floats, points: Floats, owner: Ints, held: Bools, noise: tuple[float, float]
+) -> _System:
+    """Return the normal equations at errors (P,) and points (N, 3). owner: (n,) the point of each of the held rays."""
+    yaw, place = noise
+    target = points[owner]
+
+    def residual(values: Floats) -> tuple[Floats, Floats, Floats]:
+        keyframes, rays, _ = errors.at(values, drift=False)
+        origins, directions = rays.in_map(keyframes.map_T_camera)
+        return _across(origins[held], directions[held], target)
+
+    e, basis, distance = residual(theta)
+    sigma = np.sqrt(errors.rays.sigma[held] ** 2 + yaw**2 + (place / distance) ** 2)
+    weight = 1 / (1 + (np.linalg.norm(e, axis=1) / sigma / _CAUCHY) ** 2) / sigma**2
+    by_error = np.stack([_slope(residual, theta, i, errors.steps[i] / 5) for i in range(len(theta))], axis=2)
+    by_point = basis / distance[:, None, None]  # (n, 2, 3)
+    n, p = len(points), len(theta)
+    h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
+    weighted = weight[:, None, None] * by_point
+    np.add.at(h_pp, owner, np.einsum("nki,nkj->nij", weighted, by_point))
+    np.add.at(h_pt, owner, np.einsum("nki,nkp->nip", weighted, by_error))
+    np.add.at(g_p, owner, np.einsum("nki,nk->ni", weighted, e))
+    h_pp += 1e-6 * np.eye(3)
+    solved, own = np.linalg.solve(h_pp, h_pt), np.linalg.solve(h_pp, g_p[..., None])[..., 0]
+    whole = weight[:, None, None] * by_error
+    matrix = np.einsum("nkp,nkq->pq", whole, by_error) - np.einsum("nip,niq->pq", h_pt, solved)
+    vector = np.einsum("nkp,nk->p", whole, e) - np.einsum("nip,ni->p", h_pt, own)
+    cost = float((weight[:, None] * e**2).sum() - (g_p * own).sum())
+    variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
+    return _System(matrix, vector, cost, variance, np.asarray(-solved), np.asarray(-own))
+
+
+def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
+    move = step * np.eye(len(theta))[i]
+    return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
+
+
+def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the angles (n, 2) between rays and points, the axes across the rays (n, 2, 3), and the distances (n,)."""
+    to = target - origins
+    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
+    level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
+    basis = np.stack([level, np.cross(directions, level)], axis=1)
+    return np.einsum("nki,ni->nk", basis, to / distance[:, None]), basis, distance

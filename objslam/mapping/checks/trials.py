@@ -1,0 +1,100 @@
+"""Try hypotheses about wrong input on a bounded part of a log, and name the one that explains the log much better."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from objslam.config import Settings
+from objslam.core.types import Log
+from objslam.mapping.checks.agreement import Agreement, Part, agreement
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses import Hypothesis, hypotheses
+from objslam.mapping.checks.path import straightness
+
+_TIMES, _MORE = 1.2, 0.06
+"""By what factor, and by how much, the score must grow for a hypothesis to hold. Larger values name fewer causes."""
+_CROWD = 1.4
+"""The crowd (`Part.crowd`) from which on rays meet by chance. The anonymous posts of the MRCLAM robots have 1.9."""
+_CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
+"""As `_TIMES` and `_MORE`, in a crowd."""
+_MORE_BOXES = 25
+"""How many more boxes must fit. A larger number asks for longer logs."""
+_CROOKED, _STRAIGHT = 0.62, 0.85
+"""The straightness of a path below which its axes may be wrong, and that which they must give when they are put right. Of
+real logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59."""
+_NOT_WORSE = 0.8
+"""The share of the score that a hypothesis about the axes of a path must keep. Boxes of sparse logs tell little of axes."""
+_EQUAL = 0.95
+"""The share of the best score from which on another hypothesis is as good. A larger share names fewer alternatives."""
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a hypothesis explains. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown."""
+
+    hypothesis: Hypothesis | None
+    score: float
+    share: float
+    straight: float | None
+
+
+def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Settings, progress: Progress) -> list[Trial]:
+    """Return a trial of the log as it is, and then one for each hypothesis, the best first."""
+    first = Trial(None, before.score if before else 0.0, before.share if before else 0.0, _straight(log))
+    every = list(hypotheses(part.log))
+    trials = []
+    for number, hypothesis in enumerate(every):
+        progress("doctor", number, len(every))
+        changed = hypothesis.put_right(part.log)
+        found = agreement(part, changed, settings)
+        of_path = changed.localization is not part.log.localization or changed.odometry is not part.log.odometry
+        straight = _straight(changed) if of_path else first.straight
+        trials.append(Trial(hypothesis, found.score if found else 0.0, found.share if found else 0.0, straight))
+    return [first, *sorted(trials, key=lambda trial: -trial.score)]
+
+
+def verdict(trials: list[Trial], part: Part) -> Finding | None:
+    """Return the hypothesis that explains the boxes, or the path, much better than the log as it is."""
+    first, rest = trials[0], trials[1:]
+    times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
+
+    def holds(trial: Trial) -> bool:
+        more = trial.score > max(times * first.score, first.score + least)
+        more &= (trial.score - first.score) * part.boxes > _MORE_BOXES
+        # Boxes alone must not make a straight path crooked.
+        return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
+
+    def straightens(trial: Trial) -> bool:
+        return bool(_is_crooked(first) and (trial.straight or 0.0) > _STRAIGHT and trial.score >= _NOT_WORSE * first.score)
+
+    good = [trial for trial in rest if straightens(trial)] or [trial for trial in rest if holds(trial)]
+    if not good:
+        return None
+    best = good[0]
+    others = [t for t in good[1:] if t.score >= _EQUAL * best.score and t.hypothesis is not None]
+    assert best.hypothesis is not None
+    causes = list(dict.fromkeys([best.hypothesis.cause, *(t.hypothesis.cause for t in others if t.hypothesis)]))[:3]
+    fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
+    if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
+        fit += ", and the robot drives where it heads"
+    return Finding(best.hypothesis.name, f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}")
+
+
+def crooked(log: Log) -> bool:
+    """Return whether the path of a log goes in directions that do not fit its headings."""
+    straight = _straight(log)
+    return straight is not None and straight < _CROOKED
+
+
+def _is_crooked(trial: Trial) -> bool:
+    return trial.straight is not None and trial.straight < _CROOKED
+
+
+def _is_straight(trial: Trial) -> bool:
+    return trial.straight is not None and trial.straight > _STRAIGHT
+
+
+def _straight(log: Log) -> float | None:
+    path = log.localization or log.odometry
+    return None if path is None else straightness(path)

@@ -1,0 +1,25 @@
+"""A solution and its log without the shared errors that the solve found."""
+
+from dataclasses import replace
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.alternation import Solution, with_noise_of
+from objslam.mapping.checks.shared_errors import warn_of_large_errors
+
+
+def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple[Solution, Log]:
+    """Return a solution with the prior of its shared errors and the drift at the stamps of its keyframes, and the log
+    without these errors. Warn of those that are large.
+
+    errors: those that the solve estimated.
+    """
+    calibration = solution.estimate.calibration
+    if calibration is None:
+        return solution, errors.log
+    calibration = errors.with_prior(calibration)
+    warn_of_large_errors(calibration, ledger)
+    timed = with_noise_of(errors, solution.estimate).drift_at_stamps(solution.keyframes, calibration.values)
+    solution = replace(solution, keyframes=timed, estimate=replace(solution.estimate, calibration=calibration))
+    return solution, errors.corrected_log(calibration.values)

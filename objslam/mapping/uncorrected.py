@@ -1,0 +1,32 @@
+"""The residuals that the rays would have if the shared errors were left in the measurements."""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import angles_off, interpolate, inverse
+from objslam.core.types import Trajectory
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.alternation import Solution
+
+
+def uncorrected_residual(errors: SharedErrors, solution: Solution, path: Trajectory) -> Floats | None:
+    """Return the angles (R,), rad, between the rays as measured and their objects, NaN without an object.
+
+    As measured means that the shared errors have the mean of their prior: the frames their stamps, and the cameras their
+    place on the robot. The objects and the solved path at its full rate stay, so this shows what the correction changed.
+    None if no shared errors were estimated.
+    """
+    if solution.estimate.calibration is None:
+        return None
+    before, rays, _ = errors.at(errors.mean, drift=False)
+
+    def along(stamps: Floats) -> Floats:
+        return interpolate(path.stamps, path.poses, np.clip(stamps, path.stamps[0], path.stamps[-1]), np.inf)[0]
+
+    motion = inverse(along(solution.keyframes.stamps)) @ along(before.stamps)
+    origins, directions = rays.in_map(solution.estimate.map_T_base @ motion @ before.base_T_camera)
+    owner = solution.association.object
+    residual = np.full(len(rays), np.nan)
+    held = owner >= 0
+    residual[held] = angles_off(origins[held], directions[held], solution.estimate.positions[owner[held]])
+    return residual

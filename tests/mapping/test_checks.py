@@ -1,0 +1,220 @@
+"""Wrong input is named, and clean logs are not found fault with."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log, Trajectory
+from objslam.errors import LogError
+from objslam.mapping import pipeline
+from objslam.mapping.checks.diagnosis import diagnose
+from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
+from objslam.simulation.wrong_inputs import MISTAKES, join, with_cameras, with_frame_stamps, with_poses
+
+AMBIGUOUS = ("mirrored", "upside down")
+NAMED = {
+    "clock +1 s": ("clock", "1 s ahead"),
+    "clock +5 s": ("clock", "5 s ahead"),
+    "poses in mm": ("mm instead of m",),
+    "x and y of poses swapped": ("x and y of the poses are swapped",),
+    "y of poses negated": ("y to the right",),
+    "yaw of poses negated": ("yaw of the poses is clockwise",),
+    "yaw in degrees": ("degrees instead of rad",),
+    "poses' quaternion wxyz": ("w first",),
+    "map_T_base inverted": ("base_T_map",),
+    "poses frozen": ("frozen",),
+    "poses frozen at half": ("frozen",),
+    "poses jump": ("jumps 3 times",),
+    "second half in another map": ("jumps 1 time",),
+    "base_T_camera inverted": ("camera_T_base",),
+    "base_T_camera identity": ("base_T_camera is not set",),
+    "image mirrored": AMBIGUOUS,
+    "image upside down": AMBIGUOUS,
+    "boxes 0..1": ("shares of the image",),
+    "boxes xywh": ("x y width height",),
+    "boxes cxcywh": ("centre, width, height",),
+    "boxes yxyx": ("x and y of the boxes are swapped",),
+    "boxes of half the image size": ("0.5 times as large",),
+    "boxes of twice the image size": ("2 times as large",),
+    "depth in mm": ("mm instead of m",),
+    "depth +10 %": ("depths", "too long"),
+}
+"""What must be said of each mistake, in both modes."""
+SIZED = {
+    "camera yaw +3 deg": ("front.yaw -2",),
+    "camera pitch +3 deg": ("front.tilt -",),
+    "camera roll +3 deg": ("front.roll -",),
+    "camera 0.2 m aside": ("front.y -0.2",),
+    "clock +0.2 s": ("front.clock -0.",),
+    "focal +10 %": ("front.focal -",),
+    "focal -10 %": ("front.focal +",),
+    "image centre +20 px": ("front.yaw -",),
+    "camera moved in the middle": ("moved the camera",),
+}
+"""What must be said of each small error in fixed mode, which estimates none of them."""
+
+
+@cache
+def drive(mode: str, seed: int = 0, depth: bool = False) -> Log:
+    """300 frames; localisation for the mode fixed, odometry alone for the mode joint."""
+    room = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "frames": 300}
+    poses = {"odometry": None, "localization": PoseNoise(xy=0.02, yaw=0.005)}
+    if mode == "joint":
+        poses = {"odometry": Odometry(), "localization": None}
+    return simulate(preset("demo", **room, **poses, depth=DepthNoise() if depth else None), seed)
+
+
+def findings(log: Log, mode: str):
+    return diagnose(log, load_settings(None, (f"mode={mode}",))).findings
+
+
+UNTOLD = pytest.mark.xfail(reason="an odometry that is 10 % too short would look the same", strict=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        pytest.param(name, mode, marks=UNTOLD if (name, mode) == ("depth +10 %", "joint") else ())
+        for name in NAMED
+        for mode in ("fixed", "joint")
+    ],
+)
+def test_a_mistake_is_named_and_spoils_the_map(name, mode):
+    found = findings(MISTAKES[name](drive(mode, depth="depth" in name)), mode)
+    said = " ".join(finding.message for finding in found)
+    assert all(words in said for words in NAMED[name]), said
+    assert any(finding.spoils for finding in found)
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_a_small_error_at_fixed_poses_is_named(name):
+    said = " ".join(finding.message for finding in findings(MISTAKES[name](drive("fixed")), "fixed"))
+    assert all(words in said for words in SIZED[name]), said
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+@pytest.mark.parametrize(("name", "unit"), [("frames' stamps in ms", "in ms"), ("frames' stamps in ns", "in ns")])
+def test_stamps_in_other_units_are_refused_by_name(mode, name, unit):
+    with pytest.raises(LogError, match=f"stamps of the frames are probably {unit} instead of s"):
+        findings(MISTAKES[name](drive(mode)), mode)
+
+
+def test_stamps_of_another_clock_that_begins_at_zero_have_their_unit_too():
+    log = drive("fixed")
+    start = log.localization.stamps[0]
+    with pytest.raises(LogError, match="in ms"):
+        findings(with_frame_stamps(log, lambda stamps: 1e3 * (stamps - start)), "fixed")
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_clean_log_is_not_found_fault_with(mode, seed):
+    assert findings(drive(mode, 10 + seed, depth=seed % 2 == 1), mode) == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_shared_errors_of_a_usual_robot_are_no_alarm(seed):
+    priors = {"odometry.scale": 0.03, "odometry.turn_scale": 0.05, "front.clock": 0.1, "front.tilt": 0.02, "front.yaw": 0.03}
+    rng = np.random.default_rng(seed)
+    errors = {name: sigma * rng.standard_normal() for name, sigma in priors.items()}
+    assert findings(add_shared_errors(drive("joint", 30 + seed, depth=True), errors), "joint") == ()
+
+
+@pytest.mark.parametrize("interleaved", [True, False])
+def test_boxes_of_another_recording_are_found(interleaved):
+    found = findings(join(drive("fixed"), drive("fixed", 1), interleaved=interleaved), "fixed")
+    assert any(finding.name in ("mixed recordings", "halves differ") and finding.spoils for finding in found), found
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.3, "times as far as the odometry"), (1.0, "")])
+def test_localisation_and_odometry_go_equally_far(factor, said):
+    room = {"objects": 6, "classes": 6, "pixel_sigma": 2.0, "frames": 150}
+    log = simulate(preset("demo", **room, odometry=Odometry(), localization=PoseNoise(xy=0.02, yaw=0.005)), 2)
+    poses = log.localization.poses.copy()
+    poses[:, :3, 3] *= factor
+    scaled = replace(log, localization=Trajectory(log.localization.stamps, poses))
+    messages = " ".join(finding.message for finding in findings(scaled, "fixed"))
+    assert said in messages
+    assert bool(said) == bool(messages)
+
+
+def test_a_robot_that_stands_is_not_frozen():
+    """The boxes stand as well."""
+    log = drive("fixed")
+    path = log.localization
+    middle = len(path) // 2
+    poses = np.concatenate([path.poses[:middle], np.repeat(path.poses[middle : middle + 1], len(path) - middle, axis=0)])
+
+    def stop(one):
+        d = one.detections
+        late = d.stamps > path.stamps[middle]
+        boxes = d.boxes.copy()
+        for label in np.unique(d.label):
+            mine = late & (d.label == label)
+            boxes[mine] = np.median(d.boxes[mine], axis=0) if mine.any() else boxes[mine]
+        return replace(one, detections=replace(d, boxes=boxes))
+
+    stopped = with_cameras(replace(log, localization=Trajectory(path.stamps, poses)), stop)
+    assert not any("frozen" in finding.name for finding in findings(stopped, "fixed"))
+
+
+def test_a_mirrored_world_is_the_path_that_goes_wrong():
+    """y and yaw negated together are a mirrored map: the path heads where it goes, and only the boxes tell."""
+    both = with_poses(drive("fixed"), lambda poses: np.diag([1, -1, 1, 1]) @ poses @ np.diag([1, -1, 1, 1]))
+    said = " ".join(finding.message for finding in findings(both, "fixed"))
+    assert "mirrored" in said
+
+
+def run(log: Log, mode: str, *more: str):
+    ledger = Ledger()
+    settings = load_settings(None, (f"mode={mode}", "output.recording=false", *more))
+    return pipeline.run(log, settings, ledger), ledger
+
+
+@pytest.mark.parametrize("name", ["base_T_camera inverted", "y of poses negated", "boxes yxyx", "clock +1 s"])
+def test_a_map_of_wrong_input_has_no_object_that_is_ok(name):
+    wrong = MISTAKES[name](drive("fixed"))
+    result, ledger = run(wrong, "fixed")
+    assert result.map.resolved() == ()
+    assert any("no object is called ok" in warning for warning in ledger.warnings)
+    (first, *_) = result.summary["wrong_input"]
+    assert first["spoils_positions"]
+    assert first["message"] in result.summary["warnings"]
+
+
+def test_the_checks_can_be_switched_off():
+    result, _ = run(MISTAKES["y of poses negated"](drive("fixed")), "fixed", "checks.use=false")
+    assert result.map.resolved()
+    assert result.summary["wrong_input"] == []
+
+
+def test_a_clean_map_is_as_it_is_without_the_checks():
+    with_checks, _ = run(drive("fixed"), "fixed")
+    without, _ = run(drive("fixed"), "fixed", "checks.use=false")
+    assert with_checks.summary["wrong_input"] == []
+    for one, other in zip(with_checks.map.objects, without.map.objects, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+@pytest.mark.parametrize(
+    "name", ["camera yaw +3 deg", "camera 0.2 m aside", "clock +0.2 s", "focal +10 %", "image centre +20 px"]
+)
+def test_small_errors_widen_the_covariances_to_the_true_errors(name):
+    log = MISTAKES[name](drive("fixed"))
+    place = {item.label: item.position for item in log.truth.objects}
+
+    def sigmas_off(*more):
+        objects = run(log, "fixed", *more)[0].map.resolved()
+        off = [np.linalg.norm(item.position - place[item.label]) / item.sigma for item in objects]
+        return np.array(off)
+
+    widened, plain = sigmas_off(), sigmas_off("checks.use=false")
+    assert np.median(plain) > 5
+    assert np.median(widened) < 1.5
+    assert (widened < 3).mean() > 0.85
