@@ -19,6 +19,7 @@ class Estimate:
     optimum of the last solve. For Eq. 1 the error is the sum of distances, m.
     calibration: the shared errors that were estimated, or None. The poses belong to measurements without these errors.
     noise: the noise that was estimated beside them, None without an estimate.
+    box_offset: the share of an object's size by which the centres of its boxes err together. None if boxes have no size.
     """
 
     map_T_base: Floats
@@ -32,3 +33,4 @@ class Estimate:
     iterations: int
     calibration: Calibration | None = None
     noise: NoiseFactors | None = None
+    box_offset: float | None = None

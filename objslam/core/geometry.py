@@ -237,3 +237,11 @@ def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
     """Return the angles (R,), rad in [0, pi], between unit directions (R, 3) and points (R, 3), seen from origins (R, 3)."""
     to = points - origins
     return np.arctan2(np.linalg.norm(np.cross(to, directions), axis=1), np.einsum("ri,ri->r", to, directions))
+
+
+def evenly_spread(number: int) -> Floats:
+    """Return unit directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
+    k = np.arange(number) + 0.5
+    z, azimuth = 1 - 2 * k / number, k * (np.pi * (3 - np.sqrt(5)))
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)

@@ -145,6 +145,7 @@ def summarise(
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "noise": None if estimate.noise is None else estimate.noise.to_dict(),
+        "box_offset": None if estimate.box_offset is None else round(estimate.box_offset, 4),
         "dropped": dict(ledger.dropped),
         "dropped_examples": {k: v for k, v in ledger.examples.items() if v},
         "cost_before": estimate.cost_before,

@@ -20,6 +20,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import Progress, seen_something, solve
+from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.shared_errors import uncorrected
 from objslam.mapping.checks.verdict import say, widened
@@ -60,6 +61,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         if settings.checks.use and solution.estimate.calibration is not None:
             diagnosis = diagnosis.with_findings(uncorrected(solution.estimate.calibration, errors.bounds))
             say(diagnosis, ledger)
+    solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)

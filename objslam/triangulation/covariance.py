@@ -1,10 +1,9 @@
 """Compute covariance and parallax of triangulated objects, and fuse rays with ranges, for many objects at once, in torch."""
 
-import math
-
 import torch
 from torch import Tensor
 
+from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.ac_ransac import Bundle
 from objslam.triangulation.point_to_lines import Lines, object_sum
@@ -113,7 +112,7 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
     rays = _used(bundle, use)
     widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
-    axes = _sphere(64, rays.direction)
+    axes = torch.from_numpy(evenly_spread(64)).to(rays.direction)
     few = torch.nonzero((rays.number > 1) & (rays.number <= _EVERY_PAIR))[:, 0]
     many = torch.nonzero(rays.number > _EVERY_PAIR)[:, 0]
     for objects, members, real in (*rays.chunks(few, _EVERY_PAIR), *rays.chunks(many, len(axes))):
@@ -178,12 +177,3 @@ def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
     eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], matrices, eye))
     regular = finite & (eigenvalues[:, 0] > 1e-10 * eigenvalues[:, 2]) & (eigenvalues[:, 2] > 0)
     return torch.linalg.inv(torch.where(regular[:, None, None], matrices, eye)), regular
-
-
-def _sphere(number: int, like: Tensor) -> Tensor:
-    """Return directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
-    k = torch.arange(number, dtype=like.dtype, device=like.device) + 0.5
-    z = 1 - 2 * k / number
-    azimuth = k * (math.pi * (3 - math.sqrt(5)))
-    radius = (1 - z.square()).sqrt()
-    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)

@@ -173,6 +173,9 @@ def test_a_map_that_is_corrected_is_that_of_a_session_that_knew(log, file):
     m, other = late._mapper.state, early._mapper.state
     recalibrate(m, other.calibration)
     _, at, there = np.intersect1d(m.keyframes.sent, other.keyframes.sent, return_indices=True)
+    # A frame whose corrected stamp is beyond the odometry takes the pose of its end, which may still be on its way.
+    known = other.keyframes.stamp[there] < other.course.odometry.newest - 0.2
+    at, there = at[known], there[known]
     assert len(at) > 50
     for name in ("stamp", "base_T_camera", "map_T_base", "start_T_base", "camera_T_start", "drift"):
         np.testing.assert_allclose(getattr(m.keyframes, name)[at], getattr(other.keyframes, name)[there], atol=1e-6)

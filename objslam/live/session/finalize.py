@@ -15,6 +15,7 @@ from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import Solution, solve, without_errors
+from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 
@@ -49,6 +50,7 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
+    solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     accepted = m.counters.accepted()
