@@ -4,6 +4,7 @@ More rays from the same side do not average such an error out, so that many of t
 """
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -37,13 +38,14 @@ the scatter of all rays for longer."""
 
 
 @dataclass(frozen=True)
-class _Sides:
+class Sides:
     """C sides from which one object was seen.
 
-    alike: (C, C) the covariance of the errors of two sides, over the variance of an error. mean: (A C,) rad, by how much the
-    rays of a side miss the object along A axes. white: (A C,) rad, the standard deviation of this mean if each ray errs by
-    itself. shift: (A C, 3) rad per m, its derivative by the object's place. offset: (A C, 3) rad, that by an offset of the
-    boxes of this side, in sizes of the object. pull: (C, 3, 3) m, how far such an offset moves the object.
+    alike: (C, C) the covariance of the errors of two sides, over the variance of an error. mean: (C, A) rad, by how much the
+    rays of a side miss the object along A axes, in azimuth and elevation. white: (C,) rad, the standard deviation of this
+    mean if each ray errs by itself. shift: (C, A, 3) rad per m, its derivative by the object's place. offset: (C, A, 3) rad,
+    its derivative by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3) m, how far such an offset
+    moves the object.
     """
 
     alike: Floats
@@ -53,6 +55,27 @@ class _Sides:
     offset: Floats
     pull: Floats
 
+    def in_elevation(self) -> Self:
+        """Return the same sides without the errors in azimuth."""
+        return replace(self, mean=self.mean[:, 1:], shift=self.shift[:, 1:], offset=self.offset[:, 1:])
+
+
+@dataclass(frozen=True)
+class SizedRays:
+    """R rays of boxes that show the size of their objects.
+
+    landmark: (R,) the object of each ray. origin, direction: (R, 3) in map. distance: (R,) m to the object. noise: (R,) rad.
+    size: (R,) rad, the angular size of the boxes. along: (R,) 1/m, one over the noise of the range, 0 without a range.
+    """
+
+    landmark: Ints
+    origin: Floats
+    direction: Floats
+    distance: Floats
+    noise: Floats
+    size: Floats
+    along: Floats
+
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution whose covariances hold the errors that boxes share.
@@ -61,86 +84,96 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     function of the side. `rays.box_sigma` is the prior of the share. If it has its default, the rays tell the share.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
-    seen = _seen_sides(solution, cameras, settings) if prior > 0 else {}
-    if not seen:
+    rays = _sized_rays(solution, cameras, settings)
+    if prior == 0 or not len(rays.landmark):
         return solution
+    joint = settings.mode == "joint"
+    seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
     learnt = prior == type(settings.rays)().box_sigma if told == "auto" else told
     # Solved poses follow the boxes, but a pose in the plane cannot follow them up and down.
-    if learnt and settings.mode == "joint":
+    if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base)
-    share = _share(list(seen.values()), prior) if learnt else prior
+    share = (
+        _share([one.in_elevation() for one in seen.values()] if joint else list(seen.values()), prior) if learnt else prior
+    )
     map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
     sizes = extents(solution.rays, solution.association, estimate.positions, map_T_camera, solution.keyframes, cameras)
-    added = np.nan_to_num(sizes.prod(axis=1))[:, None, None] * np.eye(3)
+    covariance = estimate.covariance.copy()
     for j, sides in seen.items():
-        added[j] += np.einsum("cik,cd,djk->ij", sides.pull, sides.alike, sides.pull)
-    return replace(solution, estimate=replace(estimate, covariance=estimate.covariance + share**2 * added, box_offset=share))
+        covariance[j] += offset_covariance(sides, sizes[j], share)
+    return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share))
 
 
-def _seen_sides(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> dict[int, _Sides]:
-    """Return the sides of each object that has a place and boxes which show its size."""
+def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
+    """Return by how much (3, 3) m^2 the offsets of boxes widen the covariance of an object.
+
+    extent: (2,) m, its width and height. share: the standard deviation of an offset, as a share of the size.
+    """
+    by_side = np.einsum("cik,cd,djk->ij", sides.pull, sides.alike, sides.pull)
+    return np.asarray(share**2 * (by_side + np.nan_to_num(extent.prod()) * np.eye(3)))
+
+
+def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
+    """Return the used rays of objects that have a place, if their boxes show a size."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0) & sees_size)
     which = which[placed[association.object[which]]]
-    if not len(which):
-        return {}
-    rays, landmark, count = solution.rays.take(which), association.object[which], association.count
-    origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
-    towards = estimate.positions[landmark] - origins
-    distance = np.linalg.norm(towards, axis=1)
-    size = np.sqrt(np.maximum(size_per_metre(rays, keyframes, cameras), 0.0).prod(axis=1))
+    rays, landmark = solution.rays.take(which), association.object[which]
+    origin, direction = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
+    distance = np.linalg.norm(estimate.positions[landmark] - origin, axis=1)
     angle, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
-    noise = np.hypot(angle, place / distance)
+    size = np.sqrt(np.maximum(size_per_metre(rays, keyframes, cameras), 0.0).prod(axis=1))
+    along = np.where(np.isfinite(rays.range), 1 / rays.range_sigma, 0.0)
+    return SizedRays(landmark, origin, direction, distance, np.hypot(angle, place / distance), size, along)
+
+
+def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict[int, Sides]:
+    """Return the sides of each object (N, 3) m that has rays.
+
+    plain: whether positions are those of Eq. 1, which adds up unit vectors. Then a ray pulls with the inverse of its
+    deviation, else with that of the square of it.
+    """
+    landmark, count = rays.landmark, len(positions)
     lattice = evenly_spread(_SIDES)
-    pairs, cell = np.unique(
-        np.column_stack([landmark, (directions @ lattice.T).argmax(axis=1)]), axis=0, return_inverse=True
-    )
+    pairs = np.column_stack([landmark, (rays.direction @ lattice.T).argmax(axis=1)])
+    pairs, cell = np.unique(pairs, axis=0, return_inverse=True)
     cell, owner, axes = cell.ravel(), pairs[:, 0], _azimuth_elevation(lattice[pairs[:, 1]])
-    flat = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    weight = noise**-2
-    off = np.einsum("rij,rj->ri", flat, towards) / distance[:, None]
-    mean = _summed(axes, cell, weight, off[..., None])
-    shift = _summed(axes, cell, weight, flat / distance[:, None, None])
-    offset = _summed(axes, cell, weight, flat * size[:, None, None])
+    flat = np.eye(3) - rays.direction[:, :, None] * rays.direction[:, None, :]
+    off = np.einsum("rij,rj->ri", flat, positions[landmark] - rays.origin) / rays.distance[:, None]
+    weight = rays.noise**-2
     total = np.bincount(cell, weight)
-    mean, shift, offset = (part / total[:, None, None] for part in (mean, shift, offset))
+    parts = off[..., None], flat / rays.distance[:, None, None], flat * rays.size[:, None, None]
+    mean, shift, offset = (_summed(axes, cell, weight, part) / total[:, None, None] for part in parts)
     miss = np.einsum("ria,ri->ra", axes[cell], off) - mean[cell, :, 0]
     own, number = (np.bincount(landmark, values, count) for values in (weight * (miss**2).sum(axis=1), np.ones(len(cell))))
     free = 2 * (number - np.bincount(owner, minlength=count))
     scatter = (own + _POOLED * (own.sum() + 1) / (free.sum() + 1)) / (free + _POOLED)
     white = np.sqrt(scatter[owner] / total)
 
-    # Eq. 1 adds up unit vectors, so that a ray pulls with the inverse of its deviation, not of the square of it.
-    plain = settings.mode == "fixed" and settings.fixed.loss == "l1"
-    strength = 1 / (noise * distance) if plain else (noise * distance) ** -2
-    along = np.where(np.isfinite(rays.range) & (not plain), 1 / rays.range_sigma, 0.0) ** 2
-    information = ray_information(directions, strength, along, landmark, count)
+    across = rays.noise * rays.distance
+    strength, along = (1 / across, 0 * rays.along) if plain else (across**-2, rays.along**2)
+    information = ray_information(rays.direction, strength, along, landmark, count)
     held = np.linalg.eigvalsh(information)[:, 0] > 0
     inverse = np.zeros_like(information)
     inverse[held] = np.linalg.inv(information[held])
-    pull = np.zeros((len(owner), 3, 3))
-    np.add.at(pull, cell, (strength * size * distance)[:, None, None] * flat)
-    pull = inverse[owner] @ pull
-
-    towards_side = np.zeros((len(owner), 3))
-    np.add.at(towards_side, cell, directions)
-    towards_side /= np.linalg.norm(towards_side, axis=1, keepdims=True)
-    first = 1 if settings.mode == "joint" else 0
+    pull, towards = np.zeros((len(owner), 3, 3)), np.zeros((len(owner), 3))
+    np.add.at(pull, cell, (strength * rays.size * rays.distance)[:, None, None] * flat)
+    np.add.at(towards, cell, rays.direction)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     seen = {}
     for j in np.unique(owner).tolist():
         mine = np.flatnonzero(owner == j)
-        used = slice(first, 2)
-        turned = np.arccos(np.clip(towards_side[mine] @ towards_side[mine].T, -1, 1)) / _ALIKE
-        seen[j] = _Sides(
-            _WITHIN * 0.5**turned,
-            mean[mine, used, 0].ravel(),
-            np.repeat(white[mine], 2 - first),
-            shift[mine, used].reshape(-1, 3),
-            offset[mine, used].reshape(-1, 3),
-            pull[mine],
+        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / _ALIKE
+        seen[j] = Sides(
+            alike=_WITHIN * 0.5**turned,
+            mean=mean[mine, :, 0],
+            white=white[mine],
+            shift=shift[mine],
+            offset=offset[mine],
+            pull=inverse[j] @ pull[mine],
         )
     return seen
 
@@ -152,7 +185,7 @@ def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
     return np.einsum("cia,cid->cad", axes, sums)
 
 
-def _share(seen: list[_Sides], prior: float) -> float:
+def _share(seen: list[Sides], prior: float) -> float:
     """Return the share of their size by which boxes err together: the root of the mean of its square, given the rays.
 
     The places of the objects are unknown, so that the restricted likelihood counts (Patterson and Thompson 1971). The prior
@@ -161,12 +194,11 @@ def _share(seen: list[_Sides], prior: float) -> float:
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = -0.5 * (shares / prior) ** 2
     for sides in seen:
-        axes = len(sides.mean) // len(sides.alike)
-        common = np.kron(sides.alike, np.ones((axes, axes))) * (sides.offset @ sides.offset.T)
-        size, vectors = np.linalg.eigh(common / np.outer(sides.white, sides.white))
-        mean, shift = (
-            vectors.T @ (part / sides.white.reshape(-1, *(1,) * (part.ndim - 1))) for part in (sides.mean, sides.shift)
-        )
+        axes = sides.mean.shape[1]
+        white = np.repeat(sides.white, axes)
+        offset, shift = ((part.reshape(-1, 3) / white[:, None]) for part in (sides.offset, sides.shift))
+        size, vectors = np.linalg.eigh(np.kron(sides.alike, np.ones((axes, axes))) * (offset @ offset.T))
+        mean, shift = vectors.T @ (sides.mean.ravel() / white), vectors.T @ shift
         variance = 1 + shares[:, None] ** 2 * np.maximum(size, 0.0)
         matrix = np.einsum("ki,kj,sk->sij", shift, shift, 1 / variance) + np.eye(3) / _LOOSE**2
         vector = np.einsum("ki,k,sk->si", shift, mean, 1 / variance)

@@ -18,6 +18,7 @@ from objslam.live.calibration.collected import offline_rays
 from objslam.live.mapper.landmark_table import covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
+from objslam.mapping.box_offsets import SizedRays, offset_covariance, sides_of
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
 _MOST = 200  # The most rays that describe an object. They are spread evenly over its rays. A larger number takes longer.
@@ -126,7 +127,9 @@ def _landmark(m: MapState, row: int, position: Floats, covariance: Floats, from_
         seen = m.graph.seen_covariance(j, int(rays.keyframe[mine].max()))
         sigma = float(largest_sigma(wider * seen[None])[0])
     status = status_of(sigma, away, count, parallax, bool(np.isfinite(obs.range).any()), limits)
-    fixed = status == "ok"
+    fixed, extent = status == "ok", _extent(m, some, position) if count else None
+    if fixed and extent is not None:
+        covariance = covariance + _offsets(m, some, obs, position, np.array(extent))
     return MapObject(
         id=j,
         label=m.labels[int(landmarks.label[row])],
@@ -139,7 +142,7 @@ def _landmark(m: MapState, row: int, position: Floats, covariance: Floats, from_
         rms_deg=_rms_deg(obs, position) if count else 0.0,
         first_seen=float(landmarks.first[row]),
         last_seen=float(landmarks.last[row]),
-        extent=_extent(m, some, position) if count else None,
+        extent=extent,
         ray=None if fixed or not count else (obs.origin[-1], obs.direction[-1]),
     )
 
@@ -170,6 +173,22 @@ def _spread(rows: Ints, most: int) -> Ints:
 def _rms_deg(obs: Observations, position: Floats) -> float:
     off = np.minimum(normalised_residuals(obs, position) * obs.sigma, np.pi)
     return round(float(np.degrees(np.sqrt(np.mean(off**2)))), 4)
+
+
+def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent: Floats) -> Floats:
+    """Return by how much (3, 3) m^2 the offsets of boxes widen a covariance, with the share of the settings.
+
+    at: the rows of the object's rays. obs: these rays in the map.
+    """
+    share = m.settings.rays.box_sigma
+    if share == 0:
+        return np.zeros((3, 3))
+    distance = np.linalg.norm(position - obs.origin, axis=1)
+    size = np.full(len(at), np.sqrt(extent.prod())) / distance
+    along = np.where(np.isfinite(obs.range), 1 / obs.range_sigma, 0.0)
+    one = np.zeros(len(at), dtype=np.int64)
+    rays = SizedRays(one, obs.origin, obs.direction, distance, obs.sigma, size, along)
+    return offset_covariance(sides_of(rays, position[None])[0], extent, share)
 
 
 def _extent(m: MapState, at: Ints, position: Floats) -> tuple[float, float] | None:
