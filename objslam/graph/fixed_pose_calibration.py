@@ -67,8 +67,7 @@ def calibrate_at_poses(
     positions: (N, 3) m, the start, NaN for an object that no ray places. Its rays do not count. noise: with that of the
     poses. SolveError if the linear system has no single solution.
     """
-    placed = np.isfinite(positions[:, 0])
-    held = (association.object >= 0) & placed[association.object]
+    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # -1, no object, indexes the last
     number, owner = np.unique(association.object[held], return_inverse=True)
     points = positions[number]
     if not held.any():
