@@ -21,6 +21,7 @@ from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import seen_something, solve
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.residuals import check_residuals
 from objslam.mapping.checks.shared_errors import uncorrected
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
@@ -63,6 +64,13 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
             say(diagnosis, ledger)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
+    if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
+        calibrated = estimate.calibration is not None
+        missing = check_residuals(
+            objects, keyframes, solution.rays, solution.association, residual, settings, calibrated=calibrated
+        )
+        diagnosis = diagnosis.with_findings([missing] if missing else [])
+        say(diagnosis, ledger)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
     path = log.robot_path
     assert path is not None  # build_keyframes raises LogError otherwise
