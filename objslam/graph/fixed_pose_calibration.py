@@ -24,7 +24,7 @@ _STRETCHES = 50
 """The number of stretches of the drive that count as independent. Fewer, longer stretches allow for errors that last
 longer, and tell the size of these errors less exactly."""
 _FREE = 1e-6
-"""The information (m^-2) that keeps an object determined which no ray places. A larger value moves other objects."""
+"""The information (m^-2) that keeps an object determined that no ray places. A larger value moves other objects."""
 
 Noise = tuple[Floats, float]
 """The standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins."""
@@ -76,7 +76,7 @@ def calibrate_at_poses(
     prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
     for _ in range(_ROUNDS):
         system = linearise_points(errors, theta, points, owner, held, noise)
-        worse = max(system.variance, _dependence(system, keyframe) / system.curvature**2)
+        worse = max(system.variance, _dependence(system, keyframe, prior) / system.curvature**2)
         try:
             covariance = np.asarray(np.linalg.inv(system.matrix / worse + prior), dtype=np.float64)
         except np.linalg.LinAlgError as error:
@@ -146,16 +146,20 @@ def linearise_points(
     return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, np.asarray(back), np.asarray(own))
 
 
-def _dependence(system: PointSystem, keyframe: Ints) -> float:
+def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
     """Return by what factor (at least 1) the vector varies more than it would if all rays erred independently.
 
     Rays of one frame share the error of its pose, and those of some seconds that of the localisation, or of a detector. The
-    sum over such a stretch of the drive shows it (cluster-robust covariance; Liang and Zeger 1986).
+    sum over such a stretch of the drive shows it (cluster-robust covariance; Liang and Zeger 1986). The error where this is
+    worst counts for all. prior: (P, P) information. Errors about which it says more than the rays do not count.
     """
+    told = np.diagonal(system.matrix) > np.diagonal(prior)
+    if not told.any():
+        return 1.0
     stretch = keyframe * _STRETCHES // (int(keyframe.max()) + 1)
     sums = np.zeros((_STRETCHES, system.scores.shape[1]))
     np.add.at(sums, stretch, system.scores)
-    return max(1.0, float(((sums**2).sum(axis=0) / np.maximum(np.diagonal(system.matrix), 1e-300)).max()))
+    return max(1.0, float(((sums**2).sum(axis=0)[told] / np.diagonal(system.matrix)[told]).max()))
 
 
 def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
