@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,13 +16,17 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.calibration import Calibration
     from objslam.core.diagnostics import Ledger
-    from objslam.mapping.alternation import Progress
+    from objslam.mapping.progress import Progress
 
 
 @with_options
 def calibrate(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of one robot, as for `objslam run`.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The calibration file to write.")] = Path("calibration.yaml"),
+    mode: Annotated[
+        Literal["fixed", "joint"] | None,
+        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against the localisation."),
+    ] = None,
     config: Config = None,
     set_: Set = None,
     *,
@@ -40,9 +44,11 @@ def calibrate(
     from objslam.io.atomic_files import write_file
     from objslam.io.calibration_yaml import dump_calibration, load_calibration
 
-    settings = settings_of("joint", config, ["output.recording=false", *(set_ or ())])
-    if settings.mode != "joint" or settings.calibration.use is False:
-        raise ConfigError("nothing to calibrate", hint="calibrate needs mode=joint, and not calibration.use=false")
+    settings = settings_of(mode or "joint", config, ["output.recording=false", *(set_ or ())])
+    if settings.calibration.use is False:
+        raise ConfigError("nothing to calibrate", hint="calibrate needs another value than calibration.use=false")
+    if settings.mode == "fixed":
+        settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"use": True})})
     _check_target(out, overwrite)
     found: list[Calibration] = []
     failed: list[ObjslamError] = []
@@ -71,12 +77,15 @@ def calibrate(
 
 
 def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: Ledger, show: Progress) -> Calibration:
-    """Return the shared errors of one log. ConfigError if it has no odometry, SolveError if the estimation fails."""
+    """Return the shared errors of one log. ConfigError if it lacks the poses for it, SolveError if the estimation fails."""
     from objslam.errors import ConfigError, SolveError
     from objslam.mapping import pipeline
     from objslam.sources import read
 
     log = read(path, ledger, options)
+    if settings.mode == "fixed" and log.localization is None:
+        hint = "the log needs localisation, or give --mode joint"
+        raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
     if log.odometry is None and settings.calibration.use == "auto":
         hint = "the log needs odometry, or give --set calibration.use=true"
         raise ConfigError("nothing to calibrate", where=str(path), hint=hint)

@@ -10,7 +10,8 @@ class CalibrationSettings(Section):
     or at the value of `file`."""
 
     use: Literal["auto"] | bool = "auto"
-    """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off."""
+    """auto: estimate the errors in joint mode if the log has odometry. true asks for it, false switches it off. In fixed
+    mode, true estimates the errors of the cameras against the localisation."""
     file: str | None = None
     """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it. An error in it that is
     not estimated has the value of the file."""

@@ -21,15 +21,26 @@ def error_names(log: Log) -> tuple[str, ...]:
 
 
 def prior_sigma(name: str, settings: Settings) -> float:
-    """Return the standard deviation of an error by the settings, 0 if they hold it."""
+    """Return the standard deviation of an error by the settings, 0 if they hold it.
+
+    In fixed mode the errors are estimated against the poses, from bearings. So those of odometry and of ranges are held.
+    """
     what = kind(name)
+    if settings.mode == "fixed" and (name in ODOMETRY or what == "range_scale"):
+        return 0.0
     return float(getattr(settings.calibration, "translation" if what in ("x", "y", "z") else what))
 
 
-def estimates(settings: Settings, odometry: bool) -> bool:
-    """Return whether the settings ask to estimate the shared errors of a log. odometry: whether it is used."""
+def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
+    """Return whether the shared errors of a log are estimated.
+
+    odometry: whether it is used. localized: whether there is a localisation. In fixed mode the poses must be known, so
+    plain odometry tells no error.
+    """
     use = settings.calibration.use
-    return settings.mode == "joint" and odometry if use == "auto" else use
+    if settings.mode == "fixed":
+        return use is True and localized
+    return odometry if use == "auto" else use
 
 
 def known_errors(settings: Settings) -> Calibration | None:
@@ -49,8 +60,8 @@ def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Led
 def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
     """Return the log without those errors of calibration.file that the run does not estimate.
 
-    These are all errors in fixed mode and with calibration.use=false, else those that the settings hold. The ledger warns of
-    errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
+    These are all errors if it estimates none, else those that the settings hold. The ledger warns of errors in the file that
+    the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:
@@ -58,7 +69,7 @@ def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
     if not set(known.names) & set(names):
         raise ConfigError(f"it fits nothing in the log {log.name}: {', '.join(known.names)}", where=file, hint=_parts(log))
     warn_of_others(known, log, settings, ledger)
-    estimated = settings.mode == "joint" and estimates(settings, log.odometry is not None)
+    estimated = estimates(settings, log.odometry is not None, log.localization is not None)
     held = {
         name: value
         for name, value in zip(known.names, known.values.tolist(), strict=True)

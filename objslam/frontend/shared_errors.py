@@ -85,8 +85,19 @@ class SharedErrors:
 
     @property
     def steps(self) -> Floats:
-        """(P,) steps over which derivatives are taken."""
-        return np.array([_STEPS.get(kind(name), _STEP) for name in self.names])
+        """(P,) steps over which derivatives are taken.
+
+        Without odometry a clock is told by the path alone. Then its step is at least as long as two steps of the path. So
+        the noise of the poses that make a residual is not in its derivative, where it would shift the clock.
+        """
+        steps = {**_STEPS}
+        path = self.log.robot_path
+        if self.keyframes.odom_T_base is None and path is not None and len(path) > 1:
+            apart = 2 * float(np.median(np.diff(path.stamps)))
+            steps["clock"] = float(
+                np.clip(apart, _STEPS["clock"], max(_STEPS["clock"], self.settings.calibration.max_clock))
+            )
+        return np.array([steps.get(kind(name), _STEP) for name in self.names])
 
     @property
     def bounds(self) -> Floats:
@@ -221,7 +232,7 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
     keyframes, rays: those that are solved. An error is a parameter if its prior is not 0 and something was measured with it.
     """
     names: tuple[str, ...] = ()
-    if estimates(settings, keyframes.odom_T_base is not None):
+    if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
         cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
         measured = {
             **cameras,

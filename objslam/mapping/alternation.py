@@ -1,8 +1,7 @@
-"""Alternate association and solve until the association is stable, or do each once if the poses are fixed."""
+"""Alternate association and solve until the association is stable. `fixed_poses` does both where the poses are fixed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -23,6 +22,8 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
+from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
+from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -35,9 +36,6 @@ _FIRST = 2.0
 MANY, SECOND = 5, 0.25
 """The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
 values accept fewer second objects."""
-
-Progress = Callable[[str, int, int], None]
-"""A function of the stage's name, the work done, and the total work (0 if it is unknown)."""
 
 
 @dataclass(frozen=True)
@@ -68,35 +66,30 @@ def solve(
 ) -> Solution:
     """Find and solve the objects of a log.
 
-    In fixed mode the association runs once, at the given poses. In joint mode the poses are explored first. Then association
-    and solve alternate until no ray changes its object. If the settings ask for it, every label is one object instead. The
-    joint mode also tries this if no frame has two boxes of one label, and keeps it if the rays agree.
+    In fixed mode the association runs once, at the given poses, unless the cameras are calibrated against these poses. In
+    joint mode the poses are explored first. Then association and solve alternate until no ray changes its object. If the
+    settings ask for it, every label is one object instead. The joint mode also tries this if no frame has two boxes of one
+    label, and keeps it if the rays agree.
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
-    the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. The joint mode
-    estimates them, and takes them out of the keyframes and rays. SolveError if the joint mode has neither odometry
-    nor localisation.
+    the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are
+    estimated, and taken out of the keyframes and rays. SolveError if the joint mode has neither odometry nor localisation.
     """
-    from objslam.graph import batch_solver
-    from objslam.graph.fixed_pose_triangulation import pose_noise, triangulate_at
-
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     if settings.mode == "fixed":
+        at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if not frames.localized_every:
-            ledger.warn("the poses are plain odometry, so the map drifts with them (--mode joint corrects both)")
-        progress("association", 0, 0)
-        if settings.association.method == "by_label":
-            association = associate_by_label(rays_of_keyframes)
+            cause = " and tell no calibration" if settings.calibration.use is True else ""
+            ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
+        if errors is None:
+            progress("association", 0, 0)
+            association, rounds = at.associate(), list[dict[str, int]]()
+            progress("solve", 0, 0)
+            estimate = at.solve(association, trace)
         else:
-            noise = pose_noise(rays, frames, settings)
-            association = _associate(frames, rays, cameras, settings, frames.map_T_camera, noise)
-        progress("solve", 0, 0)
-        placed = triangulate_at(keyframes.map_T_camera, keyframes, rays_of_keyframes, association, settings)
-        estimate = batch_solver.solve_fixed(keyframes, rays_of_keyframes, association, placed, settings, trace)
-        if trace is not None:
-            trace.end_round("fixed", association, estimate)
-        rounds: list[dict[str, int]] = []
+            at, association, estimate, rounds = calibrate_fixed(at, errors, ledger, progress, trace)
+            keyframes, rays_of_keyframes = at.seen, at.rays_seen
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:

@@ -19,13 +19,15 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import Progress, seen_something, solve
+from objslam.mapping.alternation import seen_something, solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.residuals import check_residuals
 from objslam.mapping.checks.shared_errors import uncorrected
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.uncorrected import uncorrected_residual
 
@@ -64,6 +66,13 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
+    if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
+        calibrated = estimate.calibration is not None
+        missing = check_residuals(
+            objects, keyframes, solution.rays, solution.association, residual, settings, calibrated=calibrated
+        )
+        diagnosis = diagnosis.with_findings([missing] if missing else [])
+        say(diagnosis, ledger)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
     path = log.robot_path
     assert path is not None  # build_keyframes raises LogError otherwise

@@ -6,7 +6,7 @@ exist only near surfaces (Dong et al., ASH, T-PAMI 2022).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_dept
 from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
+from objslam.mapping.progress import Progress
 
 _BLOCK = 6
 """The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
@@ -40,8 +41,6 @@ _AHEAD = 4
 _TOUCH = 4
 """The step (px) at which Open3D samples a depth image to find the blocks that the image touches. It must equal Open3D's own
 step. A larger step drops more images as out of reach."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

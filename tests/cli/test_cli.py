@@ -902,6 +902,29 @@ def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
     assert not (tmp_path / "robot.yaml").exists()
 
 
+def test_calibrate_at_known_poses_and_run_with_what_it_found(objslam, tmp_path):
+    log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
+    write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
+    file, fast = tmp_path / "robot.yaml", ("--set", "association.method=by_label")
+    done = objslam("calibrate", str(tmp_path / "log"), "--mode", "fixed", "-o", str(file), *fast)
+    assert done.code == 0, done.err
+    found = load_calibration(file)
+    assert abs(found.values[0] - 0.15) < 4 * found.sigma[0]
+    assert found.names[0] == "front.clock"
+    settings = (*fast, "--set", "calibration.use=true", "--calibration", str(file))
+    done = objslam("run", str(tmp_path / "log"), "-o", str(tmp_path / "out"), *settings)
+    assert done.code == 0, done.err
+    assert "errors that all measurements share" in done.out
+    parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
+    assert parameters["front.clock"]["prior_sigma"] == pytest.approx(found.sigma[0], rel=1e-6)
+
+
+def test_calibrate_at_fixed_poses_without_localisation_says_what_it_needs(objslam, tmp_path, late_camera):
+    done = objslam("calibrate", str(late_camera), "--mode", "fixed", "-o", str(tmp_path / "robot.yaml"))
+    assert done.code == 2
+    done.says("nothing to calibrate", "localisation")
+
+
 def test_doctor_names_what_is_wrong_and_leaves_the_log_alone(objslam, tmp_path):
     """A camera.yaml with the inverse of base_T_camera, as an optical frame's pose is often written."""
     log = simulate(preset("demo", objects=10, classes=10, frames=200), 3)

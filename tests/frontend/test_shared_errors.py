@@ -112,13 +112,20 @@ def test_noise_is_scaled_with_what_it_belongs_to(clean):
         ((), ("odometry.scale", "front.clock", "front.yaw", "range_scale"), ("front.focal", "front.x")),
         (("depth.use=false",), ("odometry.scale",), ("range_scale",)),
         (("calibration.yaw=0", "calibration.scale=0"), ("front.roll",), ("front.yaw", "odometry.scale")),
-        (("mode=fixed", "calibration.use=true"), ("front.clock", "front.yaw"), ("odometry.scale",)),
     ],
 )
 def test_parameters_are_what_was_measured_and_is_not_held(clean, overrides, there, missing):
     _, _, errors = measured(clean, load_settings(None, ("mode=joint", *overrides)))
     assert set(there) <= set(errors.names)
     assert not set(missing) & set(errors.names)
+
+
+def test_at_fixed_poses_only_cameras_have_errors(clean):
+    """Bearings from known poses tell nothing of odometry and of ranges; odometry is no known pose."""
+    asked = load_settings(None, ("mode=fixed", "calibration.use=true"))
+    _, _, errors = measured(replace(clean, localization=clean.odometry), asked)
+    assert errors.names == ("front.clock", "front.roll", "front.tilt", "front.yaw")
+    assert measured(clean, asked)[2] is None
 
 
 KNOWN_NOISE = tuple(f"noise.{name}=false" for name in ("rays", "ranges", "odometry"))
@@ -213,6 +220,7 @@ def write_known(tmp_path, values, sigma=0.001):
     "overrides", [("mode=fixed",), ("mode=fixed", "calibration.use=true"), ("mode=joint", "calibration.use=false")]
 )
 def test_known_errors_are_taken_out_where_none_is_estimated(clean, tmp_path, overrides):
+    """A log without localisation tells none in fixed mode, also where that is asked for."""
     settings = load_settings(None, (*overrides, write_known(tmp_path, ERRORS)))
     ledger = Ledger()
     log = take_out_known(add_shared_errors(clean, ERRORS), settings, ledger)
@@ -232,6 +240,17 @@ def test_an_error_that_the_settings_hold_is_held_at_the_known_value(clean, tmp_p
     assert_allclose(log.odometry.poses, clean.odometry.poses)
     _, _, errors = measured(log, settings)
     assert "front.yaw" not in errors.names
+    assert_allclose(errors.mean, vector(errors, ERRORS))
+
+
+def test_a_run_at_fixed_poses_begins_at_the_known_cameras_and_takes_the_rest_out(clean, tmp_path):
+    settings = load_settings(None, ("mode=fixed", "calibration.use=true", write_known(tmp_path, ERRORS)))
+    log = take_out_known(replace(clean, localization=clean.odometry), settings, Ledger())
+    assert_allclose(log.cameras[0].camera.base_T_camera, clean.cameras[0].camera.base_T_camera)
+    assert_allclose(
+        log.cameras[0].detections.depths, clean.cameras[0].detections.depths * (1 + ERRORS["range_scale"]), rtol=1e-9
+    )
+    _, _, errors = measured(log, settings)
     assert_allclose(errors.mean, vector(errors, ERRORS))
 
 

@@ -143,6 +143,21 @@ def test_localisation_and_odometry_go_equally_far(factor, said):
     assert bool(said) == bool(messages)
 
 
+def test_a_path_that_is_five_percent_too_long_shows_against_depths():
+    log = MISTAKES["path scale +5 %"](drive("fixed", depth=True))
+    (found,) = findings(log, "fixed")
+    assert "the depths are 5 % too short" in found.message
+    assert "of the poses" in found.message
+    assert not found.spoils
+
+
+def test_depths_that_end_on_the_surface_of_things_are_no_other_scale():
+    """They are shorter than bearings say, but by a constant: also if the camera is turned as much as a usual one."""
+    log = add_shared_errors(drive("fixed", depth=True), {"front.yaw": -0.03, "front.tilt": -0.015, "front.clock": 0.08})
+    shorter = tuple(replace(c, detections=replace(c.detections, depths=c.detections.depths - 0.1)) for c in log.cameras)
+    assert not any("depths" in found.message for found in findings(replace(log, cameras=shorter), "fixed"))
+
+
 def test_a_robot_that_stands_is_not_frozen():
     """The boxes stand as well."""
     log = drive("fixed")

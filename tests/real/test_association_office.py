@@ -33,14 +33,24 @@ def half(log, second):
     return replace(log, cameras=(replace(camera, detections=part),))
 
 
-def objects(log):
-    resolved = run(log, Settings(), Ledger()).map.resolved()
+def objects(log, ledger=None):
+    resolved = run(log, Settings(), ledger or Ledger()).map.resolved()
     return [o.label for o in resolved], np.array([o.position for o in resolved])
 
 
 @pytest.fixture(scope="module")
-def whole(log):
-    return objects(log)
+def ledger():
+    return Ledger()
+
+
+@pytest.fixture(scope="module")
+def whole(log, ledger):
+    return objects(log, ledger)
+
+
+def test_the_rays_meet_their_objects_as_the_settings_promise(whole, ledger):
+    assert len(whole[0]) > 20
+    assert not any("miss their objects" in warning for warning in ledger.warnings)
 
 
 def test_the_room_has_what_it_has(whole):

@@ -15,8 +15,10 @@ CABINET = np.array([-1.520, 0.454])
 @pytest.mark.parametrize("overrides", [(), ("depth.use=false",), ("fixed.loss=huber",)])
 def test_the_cabinet(data_dir, overrides):
     log = read(data_dir / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
-    result = pipeline.run(log, load_settings(None, ("mode=fixed", *overrides)), Ledger())
+    ledger = Ledger()
+    result = pipeline.run(log, load_settings(None, ("mode=fixed", *overrides)), ledger)
     (cabinet,) = result.map.resolved()
+    assert not any("miss their objects" in warning for warning in ledger.warnings)
     assert cabinet.label == "cabinet"
     assert np.linalg.norm(cabinet.position[:2] - CABINET) <= 0.04
     assert 0 < cabinet.position[2] < 1.0

@@ -10,6 +10,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Ints
 from objslam.core.types import Log
 from objslam.errors import LogError
+from objslam.frontend.known_errors import estimates
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, check_stamps
 from objslam.mapping.checks.finding import Finding
@@ -18,7 +19,8 @@ from objslam.mapping.checks.mixture import check_mixture
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.checks.small_errors import SmallErrors, find_small_errors, with_clock
-from objslam.mapping.checks.trials import Progress, Trial, crooked, try_hypotheses, verdict
+from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdict
+from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
 """The share of boxes that fit below which a run tries hypotheses. A larger share costs more runs a few seconds."""
@@ -104,7 +106,7 @@ def diagnose(
             if errors is not None:
                 cause = f"at the given poses the boxes fit best with {errors.in_words()}: {errors.causes()}"
                 # The objects are given the covariance that such an error causes.
-                findings.append(Finding("calibration", f"{cause} (--mode joint estimates it)", spoils=False))
+                findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
     return Diagnosis(tuple(findings), tuple(trials), errors)
@@ -120,7 +122,8 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErrors | None:
     """Return small errors that are worth a warning, and that a run in this mode does not estimate."""
-    if part.drifts or settings.mode == "joint":
+    localized = part.log.localization is not None
+    if part.drifts or settings.mode == "joint" or estimates(settings, part.log.odometry is not None, localized):
         return None
     noise = pose_noise(part, settings)
     start, best, log = found, 0.0, part.log

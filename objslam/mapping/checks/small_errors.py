@@ -3,22 +3,26 @@
 The points of an `Agreement` move with the errors. One error after the other is taken in, the one that explains most first.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.calibration import UNITS, kind
 from objslam.core.types import Keyframes, Log, Rays
+from objslam.frontend.known_errors import prior_sigma
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.graph.fixed_pose_calibration import PointSystem, linearise_points
 from objslam.mapping.checks.agreement import Agreement
 
 _PRIORS = {"clock": 0.3, "yaw": 0.2, "tilt": 0.2, "roll": 0.2, "focal": 0.2, "translation": 0.3}
 """Wide prior standard deviations of the errors that are looked for (s, rad, share, m). They bound the search."""
 _HARMFUL = {"clock": 0.12, "yaw": 0.035, "tilt": 0.035, "roll": 0.035, "focal": 0.05, "x": 0.1, "y": 0.1}
 """The sizes (s, rad, share, m) from which on an error is worth a warning. Smaller ones are those of a usual calibration."""
+_USUAL = {"focal": 0.05, "translation": 0.1}
+"""The priors (share, m) that a user is advised to give to errors that the settings hold. A larger prior lets a run find a
+larger error."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
 """The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
@@ -29,8 +33,6 @@ _ROUNDS = 6
 """The number of Gauss-Newton steps. More are more exact."""
 _CLOCK_SIGMA = 0.05
 """The standard deviation (s) of a clock that was found by trial. A larger value says less about the clock."""
-_CAUCHY = 3.0
-"""The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
 
 CAUSES = {
     "clock": "the clock of the camera and that of the poses differ",
@@ -81,6 +83,13 @@ class SmallErrors:
                 parts.append(f"{name} {value:+.2f} +- {sigma:.2f} {unit}")
         return ", ".join(parts)
 
+    def remedy(self, settings: Settings) -> str:
+        """Return the options with which a run estimates the harmful errors. settings: of the run that does not."""
+        held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
+        given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
+        options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
+        return " ".join(f"--set {option}" for option in options)
+
     def causes(self) -> str:
         """Return what is probably wrong."""
         return "; ".join(dict.fromkeys(CAUSES[kind(name)] for name in self.harmful))
@@ -111,28 +120,29 @@ def find_small_errors(
     wanted = np.array([i for i, name in enumerate(errors.names) if kind(name) in kinds])
     number, owner = np.unique(found.point[held], return_inverse=True)
     points = found.points[number]
+    angle = np.hypot(errors.rays.sigma, noise[0])
     theta = np.zeros(len(errors.names))
     chosen: list[int] = []
     for _ in range(2 * len(_KINDS)):
-        system = _linearise(errors, theta, points, owner, held, noise)
+        system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
         gains = np.zeros(len(theta))
         for i in wanted.tolist():
             if i not in chosen:
-                gains[i] = system.gain([*chosen, i]) - (system.gain(chosen) if chosen else 0.0)
+                gains[i] = _gain(system, [*chosen, i]) - _gain(system, chosen)
         best = int(gains.argmax())
         if gains[best] < max(_LEAST_GAIN * system.variance, _LEAST_SHARE * system.cost):
             break
         chosen.append(best)
         for _ in range(_ROUNDS):
-            system = _linearise(errors, theta, points, owner, held, noise)
-            step, moved = system.step(chosen)
+            system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
+            step, moved = _step(system, chosen)
             theta[chosen] = np.clip(theta[chosen] + step, -errors.bounds[chosen], errors.bounds[chosen])
             points = points + moved
         if len(chosen) == len(wanted):
             break
     if not chosen:
         return None
-    system = _linearise(errors, theta, points, owner, held, noise)
+    system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
     sigma = np.sqrt(np.diagonal(np.linalg.inv(system.matrix[np.ix_(chosen, chosen)])) * system.variance)
     return SmallErrors(errors, tuple(errors.names[i] for i in chosen), theta[chosen], sigma)
 
@@ -148,74 +158,15 @@ def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agree
     return SmallErrors(own, tuple(values), np.array(list(values.values())), np.array(list(sigmas.values())))
 
 
-@dataclass(frozen=True)
-class _System:
-    """The normal equations of the errors with the points taken out. matrix (P, P), vector (P,), cost: squared deviations.
-
-    back: (N, 3, P) how the points follow the errors, own: (N, 3) how they move by themselves.
-    """
-
-    matrix: Floats
-    vector: Floats
-    cost: float
-    variance: float
-    back: Floats
-    own: Floats
-
-    def gain(self, which: list[int]) -> float:
-        """By how much these errors decrease the cost."""
-        at = np.ix_(which, which)
-        return float(self.vector[which] @ np.linalg.lstsq(self.matrix[at], self.vector[which], rcond=1e-9)[0])
-
-    def step(self, which: list[int]) -> tuple[Floats, Floats]:
-        """The step of these errors, and that of the points (N, 3)."""
-        step = np.linalg.lstsq(self.matrix[np.ix_(which, which)], -self.vector[which], rcond=1e-9)[0]
-        return np.asarray(step), np.asarray(self.own + self.back[:, :, which] @ step)
+def _gain(system: PointSystem, which: list[int]) -> float:
+    """By how much these errors decrease the cost."""
+    if not which:
+        return 0.0
+    at = np.ix_(which, which)
+    return float(system.vector[which] @ np.linalg.lstsq(system.matrix[at], system.vector[which], rcond=1e-9)[0])
 
 
-def _linearise(
-    errors: SharedErrors, theta: Floats, points: Floats, owner: Ints, held: Bools, noise: tuple[float, float]
-) -> _System:
-    """Return the normal equations at errors (P,) and points (N, 3). owner: (n,) the point of each of the held rays."""
-    yaw, place = noise
-    target = points[owner]
-
-    def residual(values: Floats) -> tuple[Floats, Floats, Floats]:
-        keyframes, rays, _ = errors.at(values, drift=False)
-        origins, directions = rays.in_map(keyframes.map_T_camera)
-        return _across(origins[held], directions[held], target)
-
-    e, basis, distance = residual(theta)
-    sigma = np.sqrt(errors.rays.sigma[held] ** 2 + yaw**2 + (place / distance) ** 2)
-    weight = 1 / (1 + (np.linalg.norm(e, axis=1) / sigma / _CAUCHY) ** 2) / sigma**2
-    by_error = np.stack([_slope(residual, theta, i, errors.steps[i] / 5) for i in range(len(theta))], axis=2)
-    by_point = basis / distance[:, None, None]  # (n, 2, 3)
-    n, p = len(points), len(theta)
-    h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
-    weighted = weight[:, None, None] * by_point
-    np.add.at(h_pp, owner, np.einsum("nki,nkj->nij", weighted, by_point))
-    np.add.at(h_pt, owner, np.einsum("nki,nkp->nip", weighted, by_error))
-    np.add.at(g_p, owner, np.einsum("nki,nk->ni", weighted, e))
-    h_pp += 1e-6 * np.eye(3)
-    solved, own = np.linalg.solve(h_pp, h_pt), np.linalg.solve(h_pp, g_p[..., None])[..., 0]
-    whole = weight[:, None, None] * by_error
-    matrix = np.einsum("nkp,nkq->pq", whole, by_error) - np.einsum("nip,niq->pq", h_pt, solved)
-    vector = np.einsum("nkp,nk->p", whole, e) - np.einsum("nip,ni->p", h_pt, own)
-    cost = float((weight[:, None] * e**2).sum() - (g_p * own).sum())
-    variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
-    return _System(matrix, vector, cost, variance, np.asarray(-solved), np.asarray(-own))
-
-
-def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
-    move = step * np.eye(len(theta))[i]
-    return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
-
-
-def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the angles (n, 2) between rays and points, the axes across the rays (n, 2, 3), and the distances (n,)."""
-    to = target - origins
-    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
-    level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
-    basis = np.stack([level, np.cross(directions, level)], axis=1)
-    return np.einsum("nki,ni->nk", basis, to / distance[:, None]), basis, distance
+def _step(system: PointSystem, which: list[int]) -> tuple[Floats, Floats]:
+    """The step of these errors, and that of the points (N, 3)."""
+    step = np.linalg.lstsq(system.matrix[np.ix_(which, which)], -system.vector[which], rcond=1e-9)[0]
+    return np.asarray(step), np.asarray(system.own + system.back[:, :, which] @ step)

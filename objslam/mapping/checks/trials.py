@@ -1,6 +1,5 @@
 """Try hypotheses about wrong input on a bounded part of a log, and name the one that explains the log much better."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from objslam.config import Settings
@@ -9,6 +8,7 @@ from objslam.mapping.checks.agreement import Agreement, Part, agreement
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses import Hypothesis, hypotheses
 from objslam.mapping.checks.path import straightness
+from objslam.mapping.progress import Progress
 
 _TIMES, _MORE = 1.2, 0.06
 """By what factor, and by how much, the score must grow for a hypothesis to hold. Larger values name fewer causes."""
@@ -25,8 +25,6 @@ _NOT_WORSE = 0.8
 """The share of the score that a hypothesis about the axes of a path must keep. Boxes of sparse logs tell little of axes."""
 _EQUAL = 0.95
 """The share of the best score from which on another hypothesis is as good. A larger share names fewer alternatives."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,177 @@
+"""Estimate the errors that all measurements share at known poses, where the objects are the only other unknowns.
+
+A Gauss-Newton step moves the errors and the objects together. Each object is eliminated by its own Schur complement.
+`self_calibration` does the same in joint mode, where poses move too.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.calibration import CalibratedMeasurements, Calibration
+from objslam.core.types import Association
+from objslam.errors import SolveError
+
+_ROUNDS = 12
+"""The most Gauss-Newton steps. More are more exact, and a step is cheap."""
+_CONVERGED = 0.01
+"""The step, in posterior standard deviations, below which an error has converged; larger ends sooner."""
+_CAUCHY = 3.0
+"""The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
+_STRETCHES = 50
+"""The number of stretches of the drive that count as independent. Fewer, longer stretches allow for errors that last
+longer, and tell the size of these errors less exactly."""
+_FREE = 1e-6
+"""The information (m^-2) that keeps an object determined that no ray places. A larger value moves other objects."""
+
+Noise = tuple[Floats, float]
+"""The standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins."""
+
+
+@dataclass(frozen=True)
+class FixedCalibration:
+    """The shared errors at known poses. sensitivity: (N, 3, P) of the objects, m per unit of each error, 0 for an
+    object that was not placed."""
+
+    calibration: Calibration
+    sensitivity: Floats
+
+
+@dataclass(frozen=True)
+class PointSystem:
+    """The normal equations of the shared errors with the points eliminated. The robust weights are held.
+
+    matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
+    by what factor (at least 1) they exceed their expectation. curvature: the mean curvature of Cauchy's loss as a share of
+    that of the weighted squares, which is 0 to 1. scores: (n, P) what each ray adds to the vector. back: (N, 3, P) how the
+    points follow the errors. own: (N, 3) m, how they move by themselves.
+    """
+
+    matrix: Floats
+    vector: Floats
+    cost: float
+    variance: float
+    curvature: float
+    scores: Floats
+    back: Floats
+    own: Floats
+
+
+def calibrate_at_poses(
+    errors: CalibratedMeasurements, association: Association, positions: Floats, theta: Floats, noise: Noise
+) -> FixedCalibration:
+    """Estimate the shared errors from theta (P,) on. What the rays do not tell stays at its prior.
+
+    positions: (N, 3) m, the start, NaN for an object that no ray places. Its rays do not count. noise: with that of the
+    poses. SolveError if the linear system has no single solution.
+    """
+    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # -1, no object, indexes the last
+    number, owner = np.unique(association.object[held], return_inverse=True)
+    points = positions[number]
+    if not held.any():
+        raise SolveError("no object is placed, so that nothing is calibrated against the poses")
+    keyframe = errors.rays.keyframe[held]
+    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
+    for _ in range(_ROUNDS):
+        system = linearise_points(errors, theta, points, owner, held, noise)
+        worse = max(system.variance, _dependence(system, keyframe, prior) / system.curvature**2)
+        try:
+            covariance = np.asarray(np.linalg.inv(system.matrix / worse + prior), dtype=np.float64)
+        except np.linalg.LinAlgError as error:
+            raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
+        other = theta - covariance @ (system.vector / worse + prior @ (theta - errors.mean))
+        other = np.clip(other, -errors.bounds, errors.bounds)
+        step, theta = other - theta, other
+        points = points + system.own + system.back @ step
+        if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
+            break
+    sensitivity = np.zeros((association.count, 3, len(theta)))
+    sensitivity[number] = system.back
+    found = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
+    return FixedCalibration(found, sensitivity)
+
+
+def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:
+    """Return the standard deviations (R,), rad, of ray directions in map that the covariance of shared errors causes."""
+    size, axes = np.linalg.eigh(calibration.covariance)
+    variance = np.zeros(len(errors.rays))
+    for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
+        ends = []
+        for sign in (1, -1):
+            keyframes, rays, _ = errors.at(calibration.values + sign * step, drift=False)
+            ends.append(rays.in_map(keyframes.map_T_camera)[1])
+        variance += ((ends[0] - ends[1]) ** 2).sum(axis=1) / 4
+    return np.sqrt(variance)
+
+
+def linearise_points(
+    errors: CalibratedMeasurements, theta: Floats, points: Floats, owner: Ints, held: Bools, noise: Noise
+) -> PointSystem:
+    """Return the normal equations at errors (P,) and points (N, 3).
+
+    owner: (n,) the point of each of the held (R,) rays. noise: with that of the poses.
+    """
+    angle, place = noise
+    target = points[owner]
+
+    def residual(values: Floats) -> tuple[Floats, Floats, Floats]:
+        keyframes, rays, _ = errors.at(values, drift=False)
+        origins, directions = rays.in_map(keyframes.map_T_camera)
+        return _across(origins[held], directions[held], target)
+
+    e, basis, distance = residual(theta)
+    sigma = np.hypot(angle[held], place / distance)
+    robust = 1 / (1 + (np.linalg.norm(e, axis=1) / sigma / _CAUCHY) ** 2)
+    weight = robust / sigma**2
+    by_error = np.stack([_slope(residual, theta, i, step) for i, step in enumerate(errors.steps)], axis=2)
+    by_point = basis / distance[:, None, None]  # (n, 2, 3)
+    n, p = len(points), len(theta)
+    h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
+    weighted = weight[:, None, None] * by_point
+    np.add.at(h_pp, owner, np.einsum("nki,nkj->nij", weighted, by_point))
+    np.add.at(h_pt, owner, np.einsum("nki,nkp->nip", weighted, by_error))
+    np.add.at(g_p, owner, np.einsum("nki,nk->ni", weighted, e))
+    h_pp += _FREE * np.eye(3)
+    back, own = -np.linalg.solve(h_pp, h_pt), -np.linalg.solve(h_pp, g_p[..., None])[..., 0]
+    reduced = by_error + np.einsum("nki,nip->nkp", by_point, back[owner])
+    left = e + np.einsum("nki,ni->nk", by_point, own[owner])
+    scores = weight[:, None] * np.einsum("nkp,nk->np", reduced, e)
+    matrix = np.einsum("n,nkp,nkq->pq", weight, reduced, reduced)
+    cost = float((weight[:, None] * left**2).sum())
+    variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
+    # For the weight w, the curvature in the direction of a deviation and across it is 2 w^2 - w and w: on average w^2.
+    curvature = float((robust * weight).sum() / max(weight.sum(), 1e-300))
+    return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, np.asarray(back), np.asarray(own))
+
+
+def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
+    """Return by what factor (at least 1) the vector varies more than it would if all rays erred independently.
+
+    Rays of one frame share the error of its pose, and those of some seconds that of the localisation, or of a detector. The
+    sum over such a stretch of the drive shows it (cluster-robust covariance; Liang and Zeger 1986). The error where this is
+    worst counts for all. prior: (P, P) information. Errors about which it says more than the rays do not count.
+    """
+    told = np.diagonal(system.matrix) > np.diagonal(prior)
+    if not told.any():
+        return 1.0
+    stretch = keyframe * _STRETCHES // (int(keyframe.max()) + 1)
+    sums = np.zeros((_STRETCHES, system.scores.shape[1]))
+    np.add.at(sums, stretch, system.scores)
+    return max(1.0, float(((sums**2).sum(axis=0)[told] / np.diagonal(system.matrix)[told]).max()))
+
+
+def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
+    move = step * np.eye(len(theta))[i]
+    return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
+
+
+def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the angles (n, 2) between rays and points, the axes across the rays (n, 2, 3), and the distances (n,)."""
+    to = target - origins
+    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
+    level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
+    basis = np.stack([level, np.cross(directions, level)], axis=1)
+    return np.einsum("nki,ni->nk", basis, to / distance[:, None]), basis, distance

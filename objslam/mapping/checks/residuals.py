@@ -1,0 +1,60 @@
+"""A check of a map at fixed poses: whether rays miss their objects by more than the settings promise."""
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.object_map import ObjectMap
+from objslam.core.statistics import RAYLEIGH_MEDIAN
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.mapping.checks.finding import Finding
+
+_MOST = np.sqrt(2.0)
+"""The residuals, as a multiple of the noise that the settings promise, above which a run warns. From this value on, half of
+their variance or more comes from what the settings do not know. A larger value warns less often."""
+_SIGMAS = 3.0
+"""How many standard deviations the multiple must be above `_MOST`. A larger number asks for longer logs."""
+_MEDIAN_SIGMA = 0.72
+"""The standard deviation of the multiple from one ray, 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
+median m. That from n independent rays is smaller by the root of n."""
+
+
+def check_residuals(
+    objects: ObjectMap,
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    residual: Floats,
+    settings: Settings,
+    *,
+    calibrated: bool,
+) -> Finding | None:
+    """Return whether the rays miss the objects that are ok by far more than the noise of boxes and of the localisation.
+
+    residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
+    All rays of an object count, also rejected ones. Rays of one keyframe share the error of its pose, so they count as one.
+    """
+    ok = np.array([one.status == "ok" for one in objects.objects] + [False])
+    held = ok[association.object]  # -1, no object, indexes the last
+    if not held.any():
+        return None
+    angle, place = pose_noise(rays, keyframes, settings)
+    origins, _ = rays.in_map(keyframes.map_T_camera)
+    positions = np.array([one.position for one in objects.objects])
+    distance = np.linalg.norm(positions[association.object[held]] - origins[held], axis=1)
+    promised = np.hypot(angle[held], place / np.maximum(distance, 1e-9))
+    times = float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
+    independent = len(np.unique(rays.keyframe[held]))
+    if times - _SIGMAS * _MEDIAN_SIGMA / np.sqrt(independent) < _MOST:
+        return None
+    worse = "the poses or the boxes are" if calibrated else "the poses, the clock, the calibration or the boxes are"
+    if settings.association.method == "by_label":
+        worse = f"a label is several things, or {worse}"
+    remedy = "--mode joint" if calibrated else "--set calibration.use=true, or --mode joint"
+    return Finding(
+        "rays miss",
+        f"the rays miss their objects by {np.degrees(np.median(residual[held])):.2f} deg, {times:.1f} times what "
+        f"rays.pixel_sigma, rays.box_sigma and localization.* promise: {worse} worse than that; try {remedy}",
+        spoils=False,
+    )

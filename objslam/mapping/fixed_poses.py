@@ -1,0 +1,141 @@
+"""Find and place objects at given poses. A calibration of the cameras against these poses alternates with that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.association.nearest_neighbour import associate_by_label
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.trace import Parameters, Trace
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.errors import SolveError
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.progress import Progress
+
+if TYPE_CHECKING:
+    from objslam.core.estimate import Estimate
+    from objslam.graph.fixed_pose_calibration import FixedCalibration
+
+_ROUNDS = 8
+"""The most rounds of association and calibration. More rounds are slower. Two or three are usual."""
+_SAME = 0.2
+"""The change of the shared errors, in standard deviations, below which they have converged. A larger one ends sooner."""
+
+
+@dataclass(frozen=True)
+class FixedPoses:
+    """What objects at given poses are found from.
+
+    frames, rays: all keyframes with a pose, also without rays. seen, rays_seen: the keyframes that have a ray, and the rays
+    with indices into them.
+    """
+
+    frames: Keyframes
+    rays: Rays
+    seen: Keyframes
+    rays_seen: Rays
+    cameras: tuple[Camera, ...]
+    settings: Settings
+
+    def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
+        """Return the same with shared errors (P,) taken out."""
+        frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
+        seen, rays_seen, _ = errors.at(theta, drift=False)
+        return replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
+
+    def associate(self, more: Floats | float = 0.0) -> Association:
+        """Associate the rays. more: (R,) rad, the noise of their directions beside that of boxes and poses."""
+        from objslam.association.global_association import associate_globally
+        from objslam.graph.fixed_pose_triangulation import pose_noise
+
+        settings = self.settings
+        if settings.association.method == "by_label":
+            return associate_by_label(self.rays_seen)
+        sigma, place = pose_noise(self.rays, self.frames, settings)
+        return associate_globally(
+            self.rays,
+            self.frames,
+            self.cameras,
+            settings,
+            map_T_camera=self.frames.map_T_camera,
+            sigma=np.hypot(sigma, more),
+            position_sigma=place,
+            seed=settings.seed,
+        )
+
+    def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
+        """Place the objects of an association, and record a round. parameters: the shared errors that are taken out."""
+        from objslam.graph import batch_solver
+        from objslam.graph.fixed_pose_triangulation import triangulate_at
+
+        map_T_camera = self.seen.map_T_camera
+        placed = triangulate_at(map_T_camera, self.seen, self.rays_seen, association, self.settings)
+        if trace is not None:
+            trace.base_T_camera = self.seen.base_T_camera
+        estimate = batch_solver.solve_fixed(self.seen, self.rays_seen, association, placed, self.settings, trace)
+        if trace is not None:
+            if parameters is not None:
+                trace.iteration("solve", estimate.cost_after, map_T_camera, estimate.positions, parameters)
+            trace.end_round("fixed", association, estimate)
+        return estimate
+
+
+def calibrate_fixed(
+    at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
+) -> tuple[FixedPoses, Association, Estimate, list[dict[str, int]]]:
+    """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
+
+    The association allows for what the errors can still be: at first their prior, then what the last fit left of it. The
+    covariance of the errors enters that of the objects. Returns what was solved, without the errors, the association, the
+    estimate, and the number of objects in each round.
+    """
+    from objslam.graph.fixed_pose_calibration import calibrate_at_poses, noise_of_errors
+    from objslam.graph.fixed_pose_triangulation import pose_noise
+
+    calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+    every = errors.take(at.frames, at.rays)
+    noise = pose_noise(errors.rays, errors.keyframes, at.settings)
+    rounds: list[dict[str, int]] = []
+    for number in range(_ROUNDS):
+        progress(f"association, round {number + 1}", 0, 0)
+        now = at.without(errors, calibration.values)
+        association = now.associate(noise_of_errors(every, calibration))
+        rounds.append({"objects": association.count})
+        progress("solve", 0, 0)
+        estimate = now.solve(association, trace, _parameters(calibration))
+        placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)
+        try:
+            found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+        except SolveError as error:
+            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+            return now, association, replace(estimate, calibration=calibration), rounds
+        moved = np.abs(found.calibration.values - calibration.values)
+        calibration = found.calibration
+        if (moved < _SAME * calibration.sigma).all():
+            break
+    else:
+        ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")
+    now = at.without(errors, calibration.values)
+    estimate = now.solve(association, trace, _parameters(calibration))
+    return now, association, _with_covariance(estimate, found), rounds
+
+
+def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
+    """Return an estimate with the covariance that the shared errors leave in its objects."""
+    from objslam.graph.marginals import largest_sigma
+
+    told = found.calibration
+    covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
+    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+    return replace(estimate, covariance=covariance, seen_sigma=largest_sigma(covariance), calibration=told)
+
+
+def _parameters(calibration: Calibration) -> Parameters:
+    return Parameters(calibration.names, calibration.values, calibration.sigma)

@@ -1,0 +1,146 @@
+"""Fixed mode with calibration: the cameras against the localisation, on simulated drives whose errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.core.types import Log
+from objslam.io.calibration_yaml import dump_calibration
+from objslam.mapping import pipeline
+from objslam.simulation import make_camera, preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
+
+SEEDS = range(3)
+CALIBRATE = ("calibration.use=true",)
+
+
+@cache
+def drive(seed: int, wrong: bool) -> tuple[Log, dict[str, float]]:
+    """A drive of 400 frames with localisation, and the errors drawn for it."""
+    rng = np.random.default_rng(seed)
+    sigmas = {"clock": 0.1, "yaw": np.radians(2), "tilt": np.radians(1)}
+    errors = {f"front.{kind}": float(sigma * rng.standard_normal()) for kind, sigma in sigmas.items()}
+    log = simulate(preset("demo", odometry=None), seed)
+    return (add_shared_errors(log, errors), errors) if wrong else (log, {})
+
+
+def run(log: Log, *overrides: str, ledger: Ledger | None = None) -> RunResult:
+    settings = load_settings(None, ("mode=fixed", "output.recording=false", *overrides))
+    return pipeline.run(log, settings, ledger or Ledger())
+
+
+def off(log: Log, result: RunResult) -> list[tuple[float, float]]:
+    """For each true object the distance (m) of the nearest object of its label, and its squared Mahalanobis distance."""
+    found = []
+    assert log.truth is not None
+    for true in log.truth.objects:
+        mine = [o for o in result.map.resolved() if o.label == true.label]
+        near = min(mine, key=lambda o: float(np.linalg.norm(o.position - true.position)))
+        miss = near.position - true.position
+        found.append((float(np.linalg.norm(miss)), float(miss @ np.linalg.solve(near.covariance, miss))))
+    return found
+
+
+def rms(distances: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(distances))))
+
+
+@cache
+def estimated(seed: int, wrong: bool) -> RunResult:
+    return run(drive(seed, wrong)[0], *CALIBRATE)
+
+
+def test_the_errors_that_were_put_in_are_found():
+    for seed in SEEDS:
+        found = estimated(seed, True).calibration
+        true = np.array([drive(seed, True)[1].get(name, 0.0) for name in found.names])
+        assert (np.abs(found.values - true) < 3 * found.sigma).all(), (seed, found.values - true, found.sigma)
+        assert (found.sigma < 0.2 * found.prior).all()
+
+
+def test_the_objects_are_as_good_as_with_known_errors():
+    known, found, left = [], [], []
+    inside = []
+    for seed in SEEDS:
+        clean, wrong = drive(seed, False)[0], drive(seed, True)[0]
+        known += [d for d, _ in off(clean, run(clean))]
+        found += [d for d, _ in off(clean, estimated(seed, True))]
+        inside += [m < 7.815 for _, m in off(clean, estimated(seed, True))]  # 95 % of chi-squared with 3 degrees of freedom
+        left += [d for d, _ in off(clean, run(wrong))]
+    assert rms(found) < 1.3 * rms(known)
+    assert rms(found) < 0.2 * rms(left)
+    assert np.mean(inside) > 0.9
+
+
+def test_without_errors_the_objects_are_not_worse():
+    ratios = []
+    for seed in SEEDS:
+        clean = drive(seed, False)[0]
+        ratios.append(rms([d for d, _ in off(clean, estimated(seed, False))]) / rms([d for d, _ in off(clean, run(clean))]))
+    assert np.median(ratios) < 1.05
+
+
+def test_the_result_is_that_of_the_corrected_log():
+    """What a run finds is in its summary and its recording, and a run that is given it maps the same without estimating."""
+    log, _ = drive(1, True)
+    result = run(log, *CALIBRATE, "output.recording=true")
+    found = result.calibration
+    parameters = result.summary["calibration"]["parameters"]
+    assert [parameters[name]["value"] for name in found.names] == found.values.tolist()
+    assert result.keyframes.stamps[0] == pytest.approx(
+        log.cameras[0].detections.frame_stamps[result.keyframes.frame[0]] + found.values[0]
+    )
+    assert result.residual_before is not None
+    assert np.nanmedian(result.residual_before) > 1.5 * np.nanmedian(result.residual)
+    steps = [step.parameters for one in result.trace for step in one.iterations if step.parameters is not None]
+    assert_allclose(steps[0].values, 0.0)
+    assert_allclose(steps[-1].values, found.values)
+    assert len(result.trace) == len(result.summary["rounds"]) + 1
+
+
+def test_a_run_that_is_given_the_calibration_maps_the_same(tmp_path):
+    log, _ = drive(1, True)
+    first = estimated(1, True)
+    (tmp_path / "robot.yaml").write_text(dump_calibration(first.calibration))
+    known = run(log, f"calibration.file={tmp_path}/robot.yaml")
+    assert known.calibration is None
+    clean = drive(1, False)[0]
+    assert rms([d for d, _ in off(clean, known)]) < 1.1 * rms([d for d, _ in off(clean, first)]) + 1e-3
+    again = run(log, *CALIBRATE, f"calibration.file={tmp_path}/robot.yaml").calibration
+    assert_allclose(again.expected, first.calibration.values)
+    assert (again.sigma < first.calibration.sigma).all()
+
+
+def test_plain_odometry_calibrates_nothing_and_says_so():
+    log = simulate(preset("demo", localization=None, odometry=Odometry(), frames=150), 1)
+    ledger = Ledger()
+    assert run(log, *CALIBRATE, ledger=ledger).calibration is None
+    assert any("plain odometry and tell no calibration" in warning for warning in ledger.warnings)
+
+
+def test_each_of_two_cameras_has_its_own_errors():
+    cameras = (make_camera("front"), make_camera("left", yaw=np.pi / 2))
+    log = simulate(preset("demo", odometry=None, frames=200, cameras=cameras), 3)
+    errors = {"front.yaw": 0.03, "left.yaw": -0.02, "left.clock": -0.08}
+    found = run(add_shared_errors(log, errors), *CALIBRATE).calibration
+    true = np.array([errors.get(name, 0.0) for name in found.names])
+    assert (np.abs(found.values - true) < 3 * found.sigma).all()
+    assert len(found.names) == 8
+
+
+def test_where_no_object_is_placed_the_errors_stay_at_their_prior():
+    log, _ = drive(0, False)
+    one = log.cameras[0]
+    few = replace(log, cameras=(replace(one, detections=one.detections.take(np.arange(4))),))
+    ledger = Ledger()
+    result = run(few, *CALIBRATE, "checks.use=false", ledger=ledger)
+    assert_allclose(result.calibration.values, 0.0)
+    assert any("shared errors could not be estimated" in warning for warning in ledger.warnings)
