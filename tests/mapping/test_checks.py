@@ -229,7 +229,8 @@ def test_small_errors_widen_the_covariances_to_the_true_errors(name):
         off = [np.linalg.norm(item.position - place[item.label]) / item.sigma for item in objects]
         return np.array(off)
 
-    widened, plain = sigmas_off(), sigmas_off("checks.use=false")
+    # The offsets of boxes would take in a part of these errors, because the rays of different sides disagree.
+    widened, plain = sigmas_off(), sigmas_off("checks.use=false", "rays.box_sigma=0")
     assert np.median(plain) > 5
     assert np.median(widened) < 1.5
     assert (widened < 3).mean() > 0.85
