@@ -175,6 +175,15 @@ def after(graph, i, values):
     return -graph.at(i).linearize(values).jacobian()[1]
 
 
+def test_images_of_one_stamp_share_one_measurement_of_the_pose():
+    made, _ = rig_drive(None, frames=60, localization=PoseNoise(xy=0.05, yaw=0.01), localization_rate=1.0)
+    joined = Multiframes.of(made.keyframes)
+    shared = joined.keyframes(made.keyframes)
+    assert shared.localized_every * len(made.keyframes) == pytest.approx(made.keyframes.localized_every * len(shared))
+    assert shared.localized_every > 2
+    assert np.nanmax(made.object_errors(made.joint().positions)) < 0.3
+
+
 def test_a_rig_has_one_pose_for_each_stamp_and_a_better_map():
     made, _ = rig_drive(None)
     estimate = made.joint()
