@@ -93,7 +93,8 @@ class AssociationSettings(Section):
 
     method: Literal["auto", "global", "by_label"] = "auto"
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
-    if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global."""
+    if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
+    joint mode, many missing rays are judged again with the noise of the log instead of that in the settings."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects but is slow."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999

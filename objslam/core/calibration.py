@@ -136,6 +136,10 @@ class CalibratedMeasurements(Protocol):
         """The settings of the run, with the nominal noise."""
 
     @property
+    def keyframes(self) -> Keyframes:
+        """The keyframes as they were logged."""
+
+    @property
     def rays(self) -> Rays:
         """The rays as they were measured, with the nominal noise."""
 

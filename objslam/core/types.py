@@ -214,7 +214,7 @@ class Rays:
     keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, in the camera frame. sigma: (R,) rad, the
     nominal noise: the standard deviation of the angle along each of the two axes across the ray. range: (R,) m along the
     ray, NaN if unknown. range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id:
-    (R,) -1 if unknown.
+    (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the origin.
     """
 
     keyframe: Ints
@@ -227,6 +227,7 @@ class Rays:
     box: Floats
     track_id: Ints
     label_names: tuple[str, ...]
+    offset: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -234,7 +235,10 @@ class Rays:
     def in_map(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
         """Return origins (R, 3) and unit directions (R, 3) in map for camera poses (K, 4, 4)."""
         poses = map_T_camera[self.keyframe]
-        return poses[:, :3, 3], np.einsum("rij,rj->ri", poses[:, :3, :3], self.direction)
+        origins, rotations = poses[:, :3, 3], poses[:, :3, :3]
+        if self.offset is not None:
+            origins = origins + np.einsum("rij,rj->ri", rotations, self.offset)
+        return origins, np.einsum("rij,rj->ri", rotations, self.direction)
 
     def take(self, rays: Bools | Ints) -> Self:
         """Select rays by a mask or increasing indices."""

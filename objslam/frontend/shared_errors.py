@@ -83,6 +83,11 @@ class SharedErrors:
         """Return the same with other noise."""
         return replace(self, noise=noise)
 
+    def with_unknown_noise(self) -> Self:
+        """Return the same with all kinds of noise unknown, whatever the settings say."""
+        noise = self.settings.noise.model_copy(update={"rays": True, "ranges": True, "odometry": True})
+        return replace(self, settings=self.settings.model_copy(update={"noise": noise}))
+
     @property
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.

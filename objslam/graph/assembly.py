@@ -17,15 +17,20 @@ from objslam.graph.factors.odometry import betweens, motions
 from objslam.graph.factors.priors import anchor, landmark_priors
 from objslam.graph.factors.range import along_ray
 from objslam.graph.factors.rays import ray_factors
+from objslam.graph.multiframes import Multiframes
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """The measurements of a log.
+    """The measurements of a log, as P multiframes.
 
-    motion, covariance: (K-1, 4, 4), (K-1, 6, 6) the camera motions by odometry, None without odometry.
+    images: the keyframes before they were joined. keyframes: (P,) the first keyframe of each multiframe, of which the graph
+    has the poses. rays: in the frames of these keyframes. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions by
+    odometry, None without odometry.
     """
 
+    multiframes: Multiframes
+    images: Keyframes
     keyframes: Keyframes
     rays: Rays
     settings: Settings
@@ -33,13 +38,19 @@ class Measurements:
     covariance: Floats | None
 
     @classmethod
-    def of(cls, keyframes: Keyframes, rays: Rays, settings: Settings) -> Self:
-        """Collect the measurements of keyframes and their rays."""
+    def of(cls, images: Keyframes, rays: Rays, settings: Settings, multiframes: Multiframes | None = None) -> Self:
+        """Collect the measurements of keyframes and their rays. Without multiframes, each keyframe has a pose of its own."""
+        joined = Multiframes.single(len(images)) if multiframes is None else multiframes
+        keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
         moved = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
-        return cls(keyframes, rays, settings, *moved)
+        return cls(joined, images, keyframes, rays, settings, *moved)
+
+    def map_T_base(self, map_T_camera: Floats) -> Floats:
+        """Return the base poses (K, 4, 4) at all images, from the poses (P, 4, 4) of the graph."""
+        return self.multiframes.map_T_base(self.images, map_T_camera)
 
     def odometry(self) -> tuple[Floats, Floats]:
-        """Return the motions (K-1, 4, 4) and their covariances (K-1, 6, 6). ValueError without odometry."""
+        """Return the motions (P-1, 4, 4) and their covariances (P-1, 6, 6). ValueError without odometry."""
         if self.motion is None or self.covariance is None:
             raise ValueError("the log has no odometry, which motions need")
         return self.motion, self.covariance

@@ -10,7 +10,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
-from objslam.core.geometry import angles_off, inverse
+from objslam.core.geometry import angles_off
 from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
@@ -19,6 +19,7 @@ from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
@@ -96,13 +97,16 @@ def solve_joint(
     Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
     return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes.
     If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
-    solution counts. SolveError if the linear system is indeterminate, or if the cost is not finite.
+    solution counts. Images of one stamp share one pose. SolveError if the linear system is indeterminate, or if the cost is
+    not finite.
     start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors,
     which are then estimated from theta (P,) on, or from their mean. Their covariance enters the covariance of the objects.
     """
 
+    multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
+
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings)
+        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings, multiframes)
 
     if errors is None:
         measured = measure(keyframes, rays, settings)
@@ -112,8 +116,10 @@ def solve_joint(
     keyframes, rays = measured.keyframes, measured.rays
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera
+    if trace is not None:
+        trace.base_T_camera = keyframes.base_T_camera
     if start is not None:
-        map_T_camera = start
+        map_T_camera = start[multiframes.first]
     elif not keyframes.localized_every:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
@@ -163,7 +169,7 @@ def solve_joint(
         covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
         covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     return Estimate(
-        map_T_base=map_T_camera @ inverse(keyframes.base_T_camera),
+        map_T_base=measured.map_T_base(map_T_camera),
         positions=positions,
         covariance=covariance,
         seen_sigma=seen_sigma,

@@ -37,6 +37,9 @@ _HALVINGS = 3
 """How often a step that does not lower the cost is halved before the parameters are left as they are."""
 _LEAST_SIGNAL = 0.05
 """The least share of signal in the information about a clock. A smaller share lets a noisy clock move farther in a step."""
+_RIDGE = 1e-9
+"""The share of the information about the clocks that is added to its diagonal. It keeps clocks that a log cannot tell apart
+from a division by zero, and a larger share blurs them."""
 _MEMORY = 3
 """The steps that Anderson's acceleration looks back on; more extrapolates farther, and less safely."""
 
@@ -83,7 +86,7 @@ def calibrate(
     """
     fit = _Fit(errors, measure, trace)
     state = _State.of(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
-    theta, state, signal, steps = fit.shared_errors(state, theta)
+    theta, state, noisy, steps = fit.shared_errors(state, theta)
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
         system = linearise(state, fit.errors, theta)
         noise = estimate_noise(state, system, fit.errors, theta, fit.prior_residuals)
@@ -92,13 +95,13 @@ def calibrate(
         state = fit.remeasured(state, theta).settled()
         if same:
             break
-        theta, state, signal, more = fit.shared_errors(state, theta)
+        theta, state, noisy, more = fit.shared_errors(state, theta)
         steps += more
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
     reduced = linearise(state, fit.errors, theta).reduce()
-    _, covariance = _curvature(reduced.information, signal, np.asarray(np.linalg.inv(errors.prior), dtype=np.float64))
+    _, covariance = _curvature(reduced.information, noisy, np.asarray(np.linalg.inv(errors.prior), dtype=np.float64))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     by_landmark = (len(state.landmarks), 3, len(theta))
     sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
@@ -121,12 +124,12 @@ class _Fit:
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: _State, theta: Floats) -> tuple[Floats, _State, Floats, int]:
-        """Return the parameters (P,) that fit best, the solution at them, the shares of signal (P,) and the steps."""
+        """Return the parameters (P,) that fit best, the solution at them, the shares of noise (P, P) and the steps."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
-        signal = np.ones(len(theta))
+        noisy = np.zeros((len(theta), len(theta)))
         if len(theta) == 0:
-            return theta, state, signal, 0
+            return theta, state, noisy, 0
         sigma = np.sqrt(np.diagonal(errors.prior))
 
         def deviation(values: Floats) -> float:
@@ -138,8 +141,8 @@ class _Fit:
             linear = linearise(state, errors, theta)
             system = linear.reduce()
             if steps == 0:
-                signal = self.signal_shares(state, system, theta)
-            curvature, covariance = _curvature(system.information, signal, prior)
+                noisy = self.noise_shares(state, system, theta)
+            curvature, covariance = _curvature(system.information, noisy, prior)
             gradient = system.gradient + _without_shrinking(state, system, linear.told)
             step = np.asarray(np.linalg.solve(curvature, gradient - prior @ (theta - errors.mean)), dtype=np.float64)
             pull = gradient - system.descent
@@ -161,24 +164,38 @@ class _Fit:
                 self.trace.base_T_camera = state.measured.keyframes.base_T_camera
                 moved = Parameters(errors.names, theta, np.sqrt(np.diagonal(covariance)))
                 self.trace.iteration("solve", state.cost, state.map_T_camera, state.positions, moved)
-        return theta, state, signal, steps
+        return theta, state, noisy, steps
 
-    def signal_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
-        """Return the shares (P,) of the diagonal of the information that are signal; 1 but for clocks and odometry scales.
+    def noise_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
+        """Return what noise adds to the information (P, P), as shares of its diagonal: to clocks and odometry scales.
 
         The derivative of a motion by a clock is a difference of measured velocities. Their noise enters the Jacobian, and
-        makes its square too large. It does not enter the change of the gradient between two values of the clock.
+        makes its square too large. It does not enter the change of the gradient between two values of the clock. The clocks
+        of several cameras share this noise.
         """
-        shares = np.maximum(system.signal, _LEAST_SIGNAL)
-        for k in np.flatnonzero([kind(name) == "clock" for name in self.errors.names]).tolist():
+        noisy = np.diag(1 - np.maximum(system.signal, _LEAST_SIGNAL))
+        clocks = np.flatnonzero([kind(name) == "clock" for name in self.errors.names])
+        if not len(clocks):
+            return noisy
+        change = np.zeros((len(clocks), len(clocks)))
+        for i, k in enumerate(clocks.tolist()):
             step = self.errors.steps[k] * np.eye(len(theta))[k]
-            gradients = []
-            for at in (step, -step):
-                side = state.moved(system, at, self.measure(*self.errors.at(theta + at)))
-                gradients.append(linearise(side, self.errors, theta + at).reduce().gradient[k])
-            change = (gradients[1] - gradients[0]) / (2 * self.errors.steps[k])
-            shares[k] = np.clip(change / max(system.information[k, k], 1e-300), _LEAST_SIGNAL, 1.0)
-        return shares
+            ahead, behind = (self.gradient(state, system, theta, at)[clocks] for at in (step, -step))
+            change[:, i] = (behind - ahead) / (2 * self.errors.steps[k])
+        scale = np.sqrt(np.maximum(np.diagonal(system.information)[clocks], 1e-300))
+        block = np.ix_(clocks, clocks)
+        whole = system.information[block] / np.outer(scale, scale) + _RIDGE * np.eye(len(clocks))
+        root = np.linalg.cholesky(whole)
+        told = np.linalg.solve(root, np.linalg.solve(root, change / np.outer(scale, scale)).T)
+        size, axes = np.linalg.eigh((told + told.T) / 2)
+        lost = root @ (axes * (1 - np.clip(size, _LEAST_SIGNAL, 1.0)))
+        noisy[block] = lost @ (root @ axes).T
+        return noisy
+
+    def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats) -> Floats:
+        """The gradient (P,) at the optimum for a step (P,) from the parameters."""
+        side = state.moved(system, step, self.measure(*self.errors.at(theta + step)))
+        return linearise(side, self.errors, theta + step).reduce().gradient
 
     def remeasured(self, state: _State, theta: Floats) -> _State:
         """The optimum for the measurements with the noise as it is now."""
@@ -188,15 +205,17 @@ class _Fit:
         )
 
 
-def _curvature(information: Floats, signal: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Floats, Floats]:
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
-    The gradient varies as the whole information says, also by the noise in it, while the curvature is that of the signal
-    alone. Hence the covariance is a sandwich (Huber 1967). SolveError if the information is not finite.
+    noisy: (P, P) the noise in the information, as shares of its diagonal. The gradient varies as the whole information says,
+    also by this noise, while the curvature is that of the signal alone. Hence the covariance is a sandwich (Huber 1967).
+    SolveError if the information is not finite.
     """
     if not np.isfinite(information).all():
         raise SolveError("the information about the shared errors is not finite")
-    noise = np.diag((1 - signal) * np.diagonal(information))
+    scale = np.sqrt(np.maximum(np.diagonal(information), 0.0))
+    noise = noisy * np.outer(scale, scale)
     curvature = information - noise + prior
     for _ in range(_SHRINKINGS):
         if (np.linalg.eigvalsh(curvature) > 0).all():

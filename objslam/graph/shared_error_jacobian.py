@@ -11,16 +11,15 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements, kind
+from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.types import Association, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
+from objslam.graph.factors.bearing import EQ1_SIGMA, ray_residuals, residual_axes
 from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.priors import ANCHOR
-from objslam.graph.factors.rays import ray_factors
-from objslam.graph.optimizers import build_graph
 
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """The parameters whose derivatives are the measured motions themselves, with their noise."""
@@ -152,20 +151,30 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
     measured, map_T_camera = of.measured, of.map_T_camera
     keyframes, rays, landmark = measured.keyframes, measured.rays.take(of.which), of.association.object[of.which]
     steps, ranged = np.flatnonzero(keyframes.measured), np.flatnonzero(np.isfinite(rays.range))
-    rays_of_range = rays.take(ranged)
-    distance = np.linalg.norm(of.positions[landmark[ranged]] - map_T_camera[rays_of_range.keyframe, :3, 3], axis=1)
-    deviation = (distance - rays_of_range.range) / rays_of_range.range_sigma
-    range_root = 1 / rays_of_range.range_sigma / np.sqrt(1 + (deviation / CAUCHY_K) ** 2)
+    seen = _seen(map_T_camera[rays.keyframe], of.positions[landmark])
+    metric = measured.settings.joint.factor != "bearing"
+    axes = residual_axes(rays.direction, _from(rays, seen), rays.offset, metric)
+    bearing_root = _bearing_roots(rays, ray_residuals(rays.direction, _from(rays, seen), axes, metric), metric)
+    range_, range_sigma = rays.range[ranged], rays.range_sigma[ranged]
+    deviation = (np.linalg.norm(_from(rays, seen)[ranged], axis=1) - range_) / range_sigma
+    range_root = 1 / range_sigma / np.sqrt(1 + (deviation / CAUCHY_K) ** 2)
     has_odometry = measured.motion is not None and len(steps) > 0
     motion_root = whitening(measured.odometry()[1][steps]) if has_odometry else np.zeros((0, 6, 6))
     moved = inverse(map_T_camera[:-1]) @ map_T_camera[1:]
     absolute = map_T_camera if keyframes.localized_every else map_T_camera[:1]
     absolute_root = _absolute_roots(measured, absolute)
 
-    def residuals(parameters: Floats, refocused: bool) -> list[Floats]:
-        other, other_rays, settings = errors.at(parameters, drift=False)
-        longer = other_rays.range[of.which[ranged]] / rays_of_range.range
-        parts = [range_root * (distance - longer * rays_of_range.range) / longer]
+    def residuals(parameters: Floats) -> tuple[Floats, Floats, Floats]:
+        images, other_rays, settings = errors.at(parameters, drift=False)
+        other, other_rays = (
+            measured.multiframes.keyframes(images),
+            measured.multiframes.rays(images, other_rays.take(of.which)),
+        )
+        to_landmark = _from(other_rays, seen)
+        bearings = (bearing_root * ray_residuals(other_rays.direction, to_landmark, axes, metric)).ravel()
+        longer = other_rays.range[ranged] / range_
+        distances = range_root * (np.linalg.norm(to_landmark[ranged], axis=1) - longer * range_) / longer
+        parts = []
         if has_odometry and other.odom_T_base is not None:
             odom_T_camera = other.odom_T_base @ other.base_T_camera
             said = inverse(odom_T_camera[:-1]) @ odom_T_camera[1:]
@@ -174,19 +183,16 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
             parts.append(np.einsum("kij,kj->ki", motion_root, off).ravel())
         off = log_se3(inverse(other.map_T_camera[: len(absolute)]) @ absolute)
         parts.append(np.einsum("kij,kj->ki", absolute_root, off).ravel())
-        if refocused:
-            parts.append(_bearing_residuals(of, other_rays.take(of.which), rows[1]))
-        return parts
+        return bearings, distances, np.concatenate(parts)
 
     total, first_range, first_motion = rows
     result = np.zeros((total, len(theta)))
     for k, step in enumerate(errors.steps):
-        refocused = kind(errors.names[k]) == "focal"
-        (up, *ups), (down, *downs) = (residuals(theta + sign * step * np.eye(len(theta))[k], refocused) for sign in (1, -1))
-        if refocused:
-            result[:first_range, k] = (ups.pop() - downs.pop()) / (2 * step)
-        result[first_range : first_range + len(ranged), k] = (up - down) / (2 * step)
-        result[first_motion:, k] = (np.concatenate(ups) - np.concatenate(downs)) / (2 * step)
+        up, down = (residuals(theta + sign * step * np.eye(len(theta))[k]) for sign in (1, -1))
+        bearings, distances, others = ((more - less) / (2 * step) for more, less in zip(up, down, strict=True))
+        result[:first_range, k] = bearings
+        result[first_range : first_range + len(ranged), k] = distances
+        result[first_motion:, k] = others
     return result
 
 
@@ -224,14 +230,21 @@ def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
     return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
 
 
-def _bearing_residuals(of: Linearised, rays: Rays, rows: int) -> Floats:
-    """The whitened residuals (rows,) of the graph's rays in other directions, with Huber's loss."""
-    factors = ray_factors(rays, of.association.object[of.which], "huber", of.measured.settings)[0][1]
-    row, column, value = build_graph(factors).linearize(of.values).sparseJacobian_()
-    side = column == column.max()  # the right-hand side
-    residual = np.zeros(rows)
-    residual[row[side].astype(np.int64) - 1] = -value[side]
-    return residual
+def _seen(map_T_camera: Floats, positions: Floats) -> Floats:
+    """Positions (n, 3), m, in the frames of poses (n, 4, 4)."""
+    return np.asarray(np.einsum("nji,nj->ni", map_T_camera[:, :3, :3], positions - map_T_camera[:, :3, 3]))
+
+
+def _from(rays: Rays, seen: Floats) -> Floats:
+    """Positions (n, 3), m, from where their rays begin."""
+    return seen if rays.offset is None else seen - rays.offset
+
+
+def _bearing_roots(rays: Rays, residuals: Floats, metric: bool) -> Floats:
+    """What (n, 1) whitens the residuals (n, 2) of rays, with the weights of Huber's loss."""
+    sigma = np.full(len(rays), EQ1_SIGMA) if metric else rays.sigma
+    off = np.linalg.norm(residuals, axis=1) / sigma
+    return np.asarray((np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12))) / sigma)[:, None])
 
 
 def whitening(covariance: Floats) -> Floats:

@@ -14,6 +14,7 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
 from objslam.graph.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
 
@@ -94,7 +95,10 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     ranged = np.isfinite(rays.range)
     steps = np.flatnonzero(keyframes.measured)
-    parts = [motions(*one)[1][steps] for one in errors.drift_components(theta)] if len(steps) else [np.zeros((0, 6, 6))] * 4
+    parts = [np.zeros((0, 6, 6))] * 4
+    if len(steps):
+        kinds = errors.drift_components(theta)
+        parts = [motions(of.measured.multiframes.keyframes(one), settings)[1][steps] for one, settings in kinds]
     origins, directions = rays.in_map(of.map_T_camera)
     to_landmark = of.positions[of.association.object[of.which]] - origins
     off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
@@ -266,16 +270,11 @@ def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
 
 
 def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:
-    """(n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation above the base's plane.
-
-    GTSAM's basis of a direction (`Unit3::basis`) begins with the cross product with the axis that it has least of.
-    """
-    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    basis = np.stack([first, np.cross(directions, first)], axis=2)
+    """(n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation above the base's plane."""
+    basis = tangent_basis(directions)
     up = base_T_camera[:, 2, :3]
     elevation = up - (up * directions).sum(axis=1, keepdims=True) * directions
     length = np.linalg.norm(elevation, axis=1, keepdims=True)
-    elevation = np.where(length > 1e-6, elevation / np.maximum(length, 1e-12), first)
+    elevation = np.where(length > 1e-6, elevation / np.maximum(length, 1e-12), basis[:, :, 0])
     axes = np.stack([np.cross(directions, elevation), elevation], axis=1)
     return np.asarray(axes @ basis)

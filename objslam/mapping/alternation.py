@@ -23,6 +23,7 @@ from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
+from objslam.mapping.labels import labels_tell, may_be_by_label, noise_explains, warn_of_noise
 from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
@@ -33,9 +34,6 @@ _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
 """The noise (m, rad) of solved poses that an association expects. Larger values let it tolerate larger residuals."""
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
-MANY, SECOND = 5, 0.25
-"""The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
-values accept fewer second objects."""
 
 
 @dataclass(frozen=True)
@@ -144,11 +142,16 @@ def _joint(
     theta: Floats | None = None
     measured = frames, all_rays
 
-    def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
-        nonlocal theta, errors, keyframes, rays
-        solved = batch_solver.solve_joint(
+    def solve_once(
+        association: Association, errors: SharedErrors | None, start: Floats | None = None, trace: Trace | None = None
+    ) -> Estimate:
+        return batch_solver.solve_joint(
             keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, theta
         )
+
+    def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
+        nonlocal theta, errors, keyframes, rays
+        solved = solve_once(association, errors, start, trace)
         if errors is not None and solved.noise is not None:
             errors = errors.with_noise(solved.noise)
             theta = solved.calibration.values if solved.calibration is not None else errors.mean
@@ -157,11 +160,15 @@ def _joint(
             trace.end_round(why, association, solved)
         return solved
 
-    if start is None and _may_be_by_label(settings, all_rays):
+    if start is None and may_be_by_label(settings, all_rays):
         by_label = associate_by_label(rays)
         solved = solve_round("labels", by_label)
-        if _labels_tell(settings, by_label, solved.weight):
+        if settings.association.method == "by_label" or labels_tell(by_label, solved.weight):
             return by_label, solved, []
+        noisier = None if errors is None else noise_explains(by_label, solved, errors, partial(solve_once, by_label))
+        if errors is not None and noisier is not None:
+            warn_of_noise(errors, noisier, ledger)
+            return by_label, solve_round("labels", by_label, noisier.map_T_base @ keyframes.base_T_camera), []
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
@@ -275,24 +282,3 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
         label_weights=None if weights is None else weights[kept],
         existence=None if existence is None else existence[kept],
     )
-
-
-def _may_be_by_label(settings: Settings, rays: Rays) -> bool:
-    """Return whether to try one object for each label.
-
-    association.method decides. If it is auto, this is tried if no keyframe has two rays of one label.
-    """
-    if settings.association.method != "auto":
-        return settings.association.method == "by_label"
-    pairs = np.stack([rays.keyframe, rays.label])
-    return np.unique(pairs, axis=1).shape[1] == pairs.shape[1]
-
-
-def _labels_tell(settings: Settings, association: Association, weight: Floats) -> bool:
-    """Return whether every label is one object: by the settings, or because no label has many rejected rays (weight 0)."""
-    if settings.association.method == "by_label":
-        return True
-    held = association.object >= 0
-    number = np.bincount(association.object[held], minlength=association.count)
-    rejected = np.bincount(association.object[held & (weight == 0)], minlength=association.count)
-    return not ((rejected >= MANY) & (rejected > SECOND * number)).any()

@@ -39,7 +39,7 @@ def simulate(settings: DriveSettings, seed: int) -> Log:
         )
         logs.append(CameraLog(camera, detections(settings, boxes, stamps, scene.classes)))
     labelled = zip(scene.label, scene.position, strict=True)
-    stamps = fired.ravel()
+    stamps = np.unique(fired)
     return Log(
         name=settings.name,
         cameras=tuple(logs),

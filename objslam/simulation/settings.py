@@ -65,7 +65,9 @@ class CourseSettings(Section):
     """The swings of a Lissajous curve along x and along y in a lap. They have no common divisor. (1, 1) is an ellipse."""
     margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
-    """The number of images of each camera. Several cameras take their images one after the other."""
+    """The number of images of each camera."""
+    together: bool = False
+    """Whether several cameras take their images at the same time. If not, they take them one after the other."""
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()

@@ -68,9 +68,10 @@ def _integral(values: Floats, over: Floats) -> Floats:
 
 
 def frame_stamps(settings: DriveSettings) -> Floats:
-    """Return the stamps (F, C), s, of the images of each camera. The cameras take their images one after the other."""
+    """Return the stamps (F, C), s, of the images of each camera. Without `together`, they follow each other evenly."""
     cameras = len(settings.cameras)
-    return START + (np.arange(settings.frames)[:, None] + np.arange(cameras) / cameras) / settings.frame_rate
+    later = np.zeros(cameras) if settings.together else np.arange(cameras) / cameras
+    return START + (np.arange(settings.frames)[:, None] + later) / settings.frame_rate
 
 
 def odometry(settings: DriveSettings, path: Path, stamps: Floats, rng: np.random.Generator) -> Trajectory | None:

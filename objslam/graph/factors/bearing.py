@@ -18,24 +18,42 @@ EQ1_SIGMA = 0.05
 """The standard deviation (m) of the point-to-line distance in the joint solve. A larger value trusts the odometry more.
 Eq. 1 has no noise model, so this value weighs its distances against the odometry."""
 _ORTHOGRAPHIC = gtsam.Cal3DS2(STANDOFF, STANDOFF, 0, 0, 0, 0, 0, 0, 0)
+_EQUIDISTANT = gtsam.Cal3Fisheye(1, 1, 0, 0, 0, 0, 0, 0, 0)
 _CENTRE = np.zeros(2)
 
 
-def bearings(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe)."""
-    make, unit = gtsam.BearingFactor3D, gtsam.Unit3
-    return [
-        make(X0 + k, L0 + j, unit(direction), model)
-        for direction, model, k, j in zip(directions, noise, keyframe.tolist(), landmark.tolist(), strict=True)
-    ]
+def bearings(
+    keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
+) -> list[gtsam.NonlinearFactor]:
+    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
 
-
-def point_to_line(keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray, which starts at X(keyframe).
-
-    The directions (R, 3) are in the camera frame. The pose is a variable.
+    offset: (R, 3) m, where each ray begins in this frame. None means at the origin. GTSAM has no bearing factor with an
+    offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray: the landmark's
+    distance from the image's centre is the angle. Behind this camera the error is constant, and larger than in front of it.
     """
-    make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(np.zeros_like(directions), directions)
+    unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
+    cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
+
+    def make(k: int, j: int, direction: Floats, model: gtsam.noiseModel.Base, aside: bool) -> gtsam.NonlinearFactor:
+        if not aside:
+            return gtsam.BearingFactor3D(X0 + k, L0 + j, unit(direction), model)
+        at = next(cameras)
+        return gtsam.GenericProjectionFactorCal3Fisheye(_CENTRE, model, X0 + k, L0 + j, _EQUIDISTANT, False, False, at)
+
+    columns = (keyframe.tolist(), landmark.tolist(), directions, noise, away.tolist())
+    return [make(*row) for row in zip(*columns, strict=True)]
+
+
+def point_to_line(
+    keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
+) -> list[gtsam.NonlinearFactor]:
+    """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray.
+
+    The directions (R, 3), and the offsets (R, 3), m, where the rays begin, are in the frame of X(keyframe), which is a
+    variable. None means that all rays begin at the origin.
+    """
+    origins = np.zeros_like(directions) if offset is None else offset
+    make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(origins, directions)
     return [
         make(_CENTRE, model, X0 + k, L0 + j, _ORTHOGRAPHIC, False, False, body)
         for body, model, k, j in zip(bodies, noise, keyframe.tolist(), landmark.tolist(), strict=True)
@@ -60,8 +78,46 @@ def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
     The camera images a point at the point's offset (m) across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(helper, n)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    poses = make_pose(np.stack([x, np.cross(n, x), n], axis=2), origins - STANDOFF * n)
-    return [gtsam.Pose3(pose) for pose in poses]
+    return _poses(origins - STANDOFF * n, n)
+
+
+def tangent_basis(directions: Floats) -> Floats:
+    """Return two unit vectors (R, 3, 2) across unit directions (R, 3), as GTSAM chooses them (`Unit3::basis`).
+
+    The first is the cross product with the axis that the direction has least of.
+    """
+    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(directions, first)], axis=2)
+
+
+def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:
+    """Return the axes (R, 3, 2) of the residuals of the factors of rays, as `ray_residuals` takes them.
+
+    GTSAM's bearing factor has its axes across the way to the landmark. The cameras of the other factors have them across the
+    ray.
+    """
+    if metric:
+        return tangent_basis(directions)
+    to = to_landmark / np.linalg.norm(to_landmark, axis=1, keepdims=True)
+    return tangent_basis(to if offset is None else np.where((offset != 0).any(axis=1)[:, None], directions, to))
+
+
+def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric: bool) -> Floats:
+    """Return the residuals (R, 2) that the factors of rays have, along axes (R, 3, 2).
+
+    directions: (R, 3) unit. to_landmark: (R, 3) m, from where the ray begins, in the same frame. metric: whether they are
+    distances from the ray (m, Eq. 1), or angles (rad).
+    """
+    along = np.einsum("ri,ri->r", directions, to_landmark)
+    across = to_landmark - along[:, None] * directions
+    if not metric:
+        length = np.linalg.norm(across, axis=1)
+        across *= (np.arctan2(length, along) / np.maximum(length, 1e-300))[:, None]
+    return np.asarray(np.einsum("rij,ri->rj", axes, across))
+
+
+def _poses(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
+    """Return a camera for each ray, at its origin (R, 3), m, which looks along its unit direction (R, 3)."""
+    axes = np.concatenate([tangent_basis(directions), directions[:, :, None]], axis=2)
+    return [gtsam.Pose3(pose) for pose in make_pose(axes, origins)]

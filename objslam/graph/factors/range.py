@@ -8,11 +8,20 @@ from objslam.graph.factors.noise import Noise, huber
 from objslam.graph.variables import L0, X0
 
 
-def ranges(keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return one factor for each of the distances `measured` (R,), m, between X(keyframe) and L(landmark)."""
+def ranges(
+    keyframe: Ints, measured: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
+) -> list[gtsam.NonlinearFactor]:
+    """Return one factor for each of the distances `measured` (R,), m, between X(keyframe) and L(landmark).
+
+    offset: (R, 3) m, from where each distance was measured, in the frame of X(keyframe). None means from its origin.
+    """
+    columns = (keyframe.tolist(), landmark.tolist(), measured.tolist(), noise)
+    if offset is None:
+        return [gtsam.RangeFactor3D(X0 + k, L0 + j, r, model) for k, j, r, model in zip(*columns, strict=True)]
+    level = gtsam.Rot3()
     return [
-        gtsam.RangeFactor3D(X0 + k, L0 + j, r, model)
-        for k, j, r, model in zip(keyframe.tolist(), landmark.tolist(), measured.tolist(), noise, strict=True)
+        gtsam.RangeFactorWithTransform3D(X0 + k, L0 + j, r, model, gtsam.Pose3(level, at))
+        for k, j, r, model, at in zip(*columns, offset, strict=True)
     ]
 
 

@@ -18,7 +18,7 @@ class Bearings:
     """Rays of a live session, in the form that its graph takes.
 
     number: (n,) the number of each ray. keyframe: (n,) the k of X(k). landmark: (n,) the j of L(j). direction: (n, 3) in the
-    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m.
+    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. offset: as in `Rays`.
     """
 
     number: Ints
@@ -28,6 +28,7 @@ class Bearings:
     sigma: Floats
     range: Floats
     range_sigma: Floats
+    offset: Floats | None = None
 
 
 def ray_factors(
@@ -43,13 +44,15 @@ def ray_factors(
         loss: the loss of the first kind. Ranges have Cauchy's loss.
     """
     if settings.joint.factor == "bearing":
-        made = bearings(rays.keyframe, rays.direction, landmark, robust(loss, rays.sigma, 2, L1_RADIANS))
+        noise = robust(loss, rays.sigma, 2, L1_RADIANS)
+        made = bearings(rays.keyframe, rays.direction, landmark, noise, rays.offset)
     else:
         noise = robust(loss, np.full(len(landmark), EQ1_SIGMA), 2)
-        made = point_to_line(rays.keyframe, rays.direction, landmark, noise)
+        made = point_to_line(rays.keyframe, rays.direction, landmark, noise, rays.offset)
     ranged = np.flatnonzero(np.isfinite(rays.range))
     noise = robust("cauchy", rays.range_sigma[ranged], 1)
+    at = None if rays.offset is None else rays.offset[ranged]
     return [
         (np.arange(len(landmark)), made),
-        (ranged, ranges(rays.keyframe[ranged], rays.range[ranged], landmark[ranged], noise)),
+        (ranged, ranges(rays.keyframe[ranged], rays.range[ranged], landmark[ranged], noise, at)),
     ]

@@ -38,7 +38,7 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
     """Yield each hypothesis that a log allows."""
     yield from _mounts(log)
     yield from _paths(log)
-    yield from _boxes()
+    yield from _boxes(any(one.camera.sees_size for one in log.cameras))
     yield from _clocks()
 
 
@@ -91,7 +91,9 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
         yield Hypothesis(name, what, cause, partial(with_poses, change=change))
 
 
-def _boxes() -> Iterator[Hypothesis]:
+def _boxes(sized: bool) -> Iterator[Hypothesis]:
+    """Yield the hypotheses about boxes. sized: whether the boxes have a size, which some of them take for something else."""
+
     def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
         def put_right(log: Log) -> Log:
             return _with_cameras(log, lambda one: _with_boxes(one, change))
@@ -113,7 +115,8 @@ def _boxes() -> Iterator[Hypothesis]:
         ),
     )
     for name, what, cause, change in known:
-        yield Hypothesis(name, what, cause, boxed(change))
+        if sized or change not in (_xywh, _cxcywh):
+            yield Hypothesis(name, what, cause, boxed(change))
     for size in _SIZES:
         yield Hypothesis(
             f"boxes of size {size:.3g}",

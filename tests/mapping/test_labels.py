@@ -1,0 +1,86 @@
+"""Whether labels tell objects apart, on drives whose noise is three times that of the settings."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log
+from objslam.mapping import pipeline
+from objslam.simulation import preset, simulate
+
+THIRD = (
+    "rays.pixel_sigma=1",
+    "rays.box_sigma=0",
+    *(
+        f"odometry.{n}={getattr(Odometry(), n) / 3}"
+        for n in ("x_per_m", "y_per_m", "xy_per_rad", "yaw_per_m", "yaw_per_rad")
+    ),
+)
+"""A third of the noise of the simulated drives."""
+
+
+def drive(seed: int, **changes) -> Log:
+    """Twelve objects with names of their own, and only odometry."""
+    noise = {"pixel_sigma": 3.0, "odometry": Odometry(), "localization": None, "false": 0.0}
+    shape = {"objects": 12, "classes": 12, "frames": 400, "laps": 4, "room": (12.0, 9.0)}
+    return simulate(preset("demo", **{**noise, **shape, **changes}), seed)
+
+
+def mapped(log: Log, *overrides: str):
+    ledger = Ledger()
+    return pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false", *overrides)), ledger), ledger
+
+
+def never_together(log: Log) -> tuple[int, int]:
+    """The two most distant objects that no frame shows together, as indices of labels."""
+    found = log.cameras[0].detections
+    seen = np.zeros((len(found.frame_stamps), len(found.label_names)), dtype=bool)
+    seen[found.frame, found.label] = True
+    place = {o.label: o.position for o in log.truth.objects}
+    at = np.array([place[name] for name in found.label_names])
+    apart = np.linalg.norm(at[:, None] - at, axis=2)
+    apart[(seen.T.astype(int) @ seen) > 0] = 0
+    i, j = np.unravel_index(np.argmax(apart), apart.shape)
+    assert apart[i, j] > 2
+    return int(i), int(j)
+
+
+@pytest.mark.parametrize(("seed", "changes"), [(2, {}), (1, {"laps": 2, "room": (8.0, 6.0)})])
+def test_too_little_noise_in_the_settings_makes_no_second_object(seed, changes):
+    log = drive(seed, **changes)
+    result, ledger = mapped(log, *THIRD)
+    assert result.summary["rounds"] == []  # one object for each label
+    assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
+    (said,) = [warning for warning in ledger.warnings if "the settings say too little noise" in warning]
+    assert "noise.odometry=true, noise.rays=true" in said
+
+
+def test_noise_that_the_settings_leave_open_makes_no_second_object():
+    noise = Odometry()
+    noise = noise.model_copy(
+        update={n: 3 * getattr(noise, n) for n in type(noise).model_fields if not n.startswith("floor")}
+    )
+    log = drive(2, odometry=noise, pixel_sigma=9.0)
+    result, ledger = mapped(log)
+    assert result.summary["rounds"] == []
+    assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
+    assert not any("too little noise" in warning for warning in ledger.warnings)
+
+
+def test_a_label_of_two_objects_is_two_objects():
+    log = drive(4, frames=200, laps=2)
+    keep, other = never_together(log)
+    found = log.cameras[0].detections
+    names = found.label_names
+    label = np.where(found.label == other, keep, found.label)
+    camera = replace(log.cameras[0], detections=replace(found, label=label))
+    result, _ = mapped(replace(log, cameras=(camera,)), *THIRD)
+    twins = [o.position for o in result.map.resolved() if o.label == names[keep]]
+    true = [o.position for o in log.truth.objects if o.label in (names[keep], names[other])]
+    assert result.summary["rounds"] != []
+    for position in true:
+        assert min(np.linalg.norm(position - twin) for twin in twins) < 0.5
