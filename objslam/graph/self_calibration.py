@@ -20,7 +20,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.outlier_rejection import JointSolution, reject_outliers, second_opinion
+from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
 from objslam.graph.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.graph.variance_components import estimate_noise, shrinking_force
@@ -29,7 +29,7 @@ _ROUNDS = 8
 """The most outer steps; more is slower. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6."""
 _CONVERGED = 0.2
 """The step, in posterior standard deviations, below which a parameter has converged; larger ends sooner."""
-_INNER = 5
+_INNER = 3
 """The iterations of an inner solve. Few are enough, because each begins at a linear prediction of its optimum."""
 _TOLERANCE = 1e-4
 """The relative decrease of the cost in an iteration below which an inner solve ends. A larger value ends it sooner."""
@@ -175,7 +175,7 @@ class _Fit:
             gradients = []
             for at in (step, -step):
                 side = state.moved(system, at, self.measure(*self.errors.at(theta + at)))
-                gradients.append(linearise(side, self.errors, theta + at).reduce().gradient[k])
+                gradients.append(linearise(side, self.errors, theta + at, [k]).reduce().gradient[0])
             change = (gradients[1] - gradients[0]) / (2 * self.errors.steps[k])
             shares[k] = np.clip(change / max(system.information[k, k], 1e-300), _LEAST_SIGNAL, 1.0)
         return shares
@@ -271,7 +271,7 @@ class _State(Linearised):
 
     def settled(self) -> Self:
         """The same with the rays that agree with their objects now."""
-        positions, used = second_opinion(self.measured, self.map_T_camera, self.association, self.positions, self.used)
+        used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
         if np.array_equal(used, self.used):
             return self
-        return type(self).of(self.measured, self.association, self.map_T_camera, positions, used)
+        return type(self).of(self.measured, self.association, self.map_T_camera, self.positions, used)
