@@ -52,9 +52,12 @@ def corrected_odometry(odometry: Trajectory, turn: Floats, error: Mapping[str, f
     cos, sin = np.cos(middle), np.sin(middle)
     x, y, z = ways.T
     ways = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
-    turned = Rotation.from_rotvec(np.outer(more, [0.0, 0.0, 1.0])).as_matrix() @ odometry.poses[:, :3, :3]
-    places = odometry.poses[0, :3, 3] + np.vstack([np.zeros(3), np.cumsum(ways, axis=0)])
-    return Trajectory(odometry.stamps, make_pose(turned, places))
+    poses = odometry.poses.copy()
+    cos, sin = np.cos(more)[:, None], np.sin(more)[:, None]
+    poses[:, 0, :3] = cos * odometry.poses[:, 0, :3] - sin * odometry.poses[:, 1, :3]
+    poses[:, 1, :3] = sin * odometry.poses[:, 0, :3] + cos * odometry.poses[:, 1, :3]
+    poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(ways, axis=0)
+    return Trajectory(odometry.stamps, poses)
 
 
 class OdometryCorrection:

@@ -16,9 +16,10 @@ from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
-from objslam.frontend.corrected_log import corrected_mount, corrected_odometry, later, refocused, take_out, turns
+from objslam.frontend.corrected_log import ODOMETRY, corrected_mount, corrected_odometry, later, refocused, take_out, turns
 from objslam.frontend.known_errors import error_names, estimates, known_errors, prior_sigma
-from objslam.frontend.odometry_drift import gathered_drift, scaled_noise
+from objslam.frontend.odometry_drift import DriftPath, scaled_noise
+from objslam.frontend.recent_values import RecentValues
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -30,8 +31,9 @@ _MOST_SIGMAS = 6.0
 lets a parameter move farther from its prior."""
 
 
-_KEPT = 8
-"""The number of corrected paths that are kept; more take more memory, and a round of derivatives needs seven."""
+_KEPT = 9
+"""The number of corrected paths, and of poses on them, that are kept. A larger number takes more memory. A round of
+derivatives needs seven."""
 
 
 @dataclass(frozen=True)
@@ -121,37 +123,22 @@ class SharedErrors:
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
-        settings, max_gap = self._scaled_noise(error), self.settings.poses.max_gap
-        path = self.log.robot_path
-        assert path is not None
-        stamps, base_T_camera, direction = keyframes.stamps.copy(), keyframes.base_T_camera.copy(), rays.direction
-        known = stamps.copy()  # those of the poses, which end with the path
+        settings, poses = self._scaled_noise(error), self._poses(error)
+        base_T_camera, direction = poses.base_T_camera.copy(), rays.direction
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
-            clock = error.get(f"{one.camera.name}.clock", 0.0)
-            known[mine] = np.clip(stamps[mine] + clock, path.stamps[0], path.stamps[-1])
-            stamps[mine] = later(stamps[mine], clock, path)
-            if one.mount is not None:
-                base_T_camera[mine] = _at_stamps(one.mount, known[mine], max_gap)
             base_T_camera[mine] = corrected_mount(base_T_camera[mine], error, one.camera.name)
             direction = refocused(direction, mine[rays.keyframe], error.get(f"{one.camera.name}.focal", 0.0))
-        odometry, localization = self._odometry(error), self.log.localization
-        odom_T_base, gathered = keyframes.odom_T_base, keyframes.drift
-        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, known, max_gap)
-        if odometry is not None:
-            at = _at_stamps(odometry, known, max_gap)
-            map_T_base = at if localization is None else map_T_base
-            if odom_T_base is not None:
-                odom_T_base = inverse(odometry.poses[0]) @ at
-                if drift:
-                    # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
-                    gathered = gathered_drift(odometry, np.maximum.accumulate(known), settings.odometry)
+        gathered = keyframes.drift
+        if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
+            # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
+            gathered = self._drift(error).gathered(np.maximum.accumulate(poses.known), settings.odometry)
         moved = replace(
             keyframes,
-            stamps=stamps,
+            stamps=poses.stamps,
             base_T_camera=base_T_camera,
-            map_T_base=map_T_base,
-            odom_T_base=odom_T_base,
+            map_T_base=poses.map_T_base,
+            odom_T_base=poses.odom_T_base,
             drift=gathered,
         )
         longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
@@ -169,10 +156,10 @@ class SharedErrors:
         a drift that grows in this order. What sorts keyframes by time needs a drift that grows with time.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
-        odometry = self._odometry(error)
-        if odometry is None or keyframes.drift is None:
+        if self.log.odometry is None or keyframes.drift is None:
             return keyframes
-        return replace(keyframes, drift=gathered_drift(odometry, keyframes.stamps, self._scaled_noise(error).odometry))
+        drift = self._drift(error).gathered(keyframes.stamps, self._scaled_noise(error).odometry)
+        return replace(keyframes, drift=drift)
 
     def with_prior(self, found: Calibration) -> Calibration:
         """Return what was found together with what was expected of these errors before."""
@@ -194,8 +181,7 @@ class SharedErrors:
         The last ones have the noise that is not the odometry's. values: (P,) the errors taken out.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
-        odometry = self._odometry(error)
-        assert odometry is not None
+        path = self._drift(error)
         keyframes, _, _ = self.at(values, drift=False)
         stamps, none = np.maximum.accumulate(keyframes.stamps), {"along": 0.0, "across": 0.0, "turning": 0.0}
         found = []
@@ -205,30 +191,81 @@ class SharedErrors:
             if only is not None:
                 flat = settings.planar.model_copy(update={"z": 0.0, "tilt": 0.0})
                 settings = settings.model_copy(update={"planar": flat})
-            found.append((replace(keyframes, drift=gathered_drift(odometry, stamps, settings.odometry)), settings))
+            found.append((replace(keyframes, drift=path.gathered(stamps, settings.odometry)), settings))
         return found
 
     def _scaled_noise(self, error: Mapping[str, float]) -> Settings:
         """The settings with the estimated noise, scaled as the ways are."""
         return scaled_noise(self.noise.settings(self.settings), error)
 
-    @cached_property
-    def _corrected(self) -> dict[tuple[float, ...], Trajectory]:
-        """The last corrected odometry by its errors: most derivatives leave it as it is, and 60,000 poses take 30 ms."""
-        return {}
+    def _poses(self, error: Mapping[str, float]) -> "_Poses":
+        """The poses of the keyframes. Rotations of cameras and scales of ranges do not change them, so they are kept."""
+        key = *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
+        return self._kept_poses.get(key, lambda: self._computed_poses(error))
 
-    def _odometry(self, error: dict[str, float]) -> Trajectory | None:
+    def _computed_poses(self, error: Mapping[str, float]) -> "_Poses":
+        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
+        assert path is not None
+        stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
+        known = stamps.copy()  # those of the poses, which end with the path
+        for index, one in enumerate(self.log.cameras):
+            mine = keyframes.camera == index
+            clock = error.get(f"{one.camera.name}.clock", 0.0)
+            known[mine] = np.clip(stamps[mine] + clock, path.stamps[0], path.stamps[-1])
+            stamps[mine] = later(stamps[mine], clock, path)
+            if one.mount is not None:
+                base_T_camera[mine] = _at_stamps(one.mount, known[mine], max_gap)
+        localization, odom_T_base = self.log.localization, keyframes.odom_T_base
+        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, known, max_gap)
+        if self.log.odometry is not None:
+            odometry = self._odometry(error)
+            at = _at_stamps(odometry, known, max_gap)
+            map_T_base = at if localization is None else map_T_base
+            odom_T_base = None if odom_T_base is None else inverse(odometry.poses[0]) @ at
+        return _Poses(stamps, known, base_T_camera, map_T_base, odom_T_base)
+
+    @cached_property
+    def _kept_poses(self) -> RecentValues["_Poses"]:
+        return RecentValues(_KEPT)
+
+    @cached_property
+    def _kept_odometry(self) -> RecentValues[Trajectory]:
+        return RecentValues(_KEPT)
+
+    @cached_property
+    def _kept_drift(self) -> RecentValues[DriftPath]:
+        return RecentValues(1)
+
+    def _odometry(self, error: Mapping[str, float]) -> Trajectory:
         """The odometry without its errors, with ways that make up for the shrinkage of the map, as the ranges do."""
         odometry = self.log.odometry
-        if odometry is None:
-            return None
-        stretched = (1 + error.get("odometry.scale", 0.0)) * (1 + self.noise.shrinkage) - 1
-        key = (stretched, *(error.get(f"odometry.{name}", 0.0) for name in ("turn_scale", "turn_bias")))
-        if key not in self._corrected:
-            if len(self._corrected) >= _KEPT:
-                self._corrected.pop(next(iter(self._corrected)))
-            self._corrected[key] = corrected_odometry(odometry, self._turns, {**error, "odometry.scale": stretched})
-        return self._corrected[key]
+        assert odometry is not None
+        key = self._odometry_key(error)
+        named = dict(zip(ODOMETRY, key, strict=True))
+        return self._kept_odometry.get(key, lambda: corrected_odometry(odometry, self._turns, named))
+
+    def _drift(self, error: Mapping[str, float]) -> DriftPath:
+        """What the drift of the odometry without its errors depends on."""
+        return self._kept_drift.get(self._odometry_key(error), lambda: DriftPath(self._odometry(error)))
+
+    def _odometry_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
+        """The errors of the odometry, its scale with what makes up for the shrinkage of the map."""
+        scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
+        return (1 + scale) * (1 + self.noise.shrinkage) - 1, *others
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """The poses (K, 4, 4) of K keyframes. stamps: (K,) s of the images. known: (K,) s of the poses, which end with the path.
+
+    base_T_camera: without the errors of the camera's rotation and place.
+    """
+
+    stamps: Floats
+    known: Floats
+    base_T_camera: Floats
+    map_T_base: Floats
+    odom_T_base: Floats | None
 
 
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:

@@ -27,6 +27,10 @@ from objslam.graph.self_calibration import calibrate
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
+_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
+"""The relative decreases of the cost below which a joint solve ends: the last one, and one before the shared errors and the
+noise are estimated, which moves everything again. Larger values end it sooner."""
+
 
 def solve_fixed(
     keyframes: Keyframes,
@@ -123,12 +127,15 @@ def solve_joint(
     elif not keyframes.localized_every:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
-    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace)
+    tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
+    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        other = reject_outliers(measured, association, found.map_T_camera, found.positions, found.used, back, attempt)
+        other = reject_outliers(
+            measured, association, found.map_T_camera, found.positions, found.used, back, attempt, tolerance
+        )
         before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
         if after < before:
             found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)

@@ -1,7 +1,8 @@
 """Initialise poses and landmarks with a known association, by growing the graph along the path.
 
 From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes enter a few at a time, at poses that
-continue the solved path by odometry. A landmark enters when its rays so far determine its position.
+continue the solved path by odometry, and a sliding window is solved. A landmark enters when its rays so far determine its
+position.
 """
 
 from collections.abc import Callable
@@ -9,14 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import angles_off, inverse
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
-from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
 """The number of iterations of each solve during growth. A larger number is slower. Few are enough, because each solve starts
@@ -24,7 +24,7 @@ close to its optimum, and the next solve continues from its result."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
 doubles. Above the second, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3 to 5
-and 15 degrees converge to the same map. iSAM2 in place of full solves took half the time, but it lost robot 1 or 5."""
+and 15 degrees converge to the same map. iSAM2 in place of these solves lost robot 1 or 5."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
 median angle of the step. Larger values let more false boxes in. Both are well above the odometry's drift in one step."""
@@ -33,6 +33,12 @@ _MORE_RAYS = 1
 later. With fewer, false boxes agree by chance too often."""
 _SHORTEST = 4
 """The divisor of joint.grow_step that gives the shortest step. A larger divisor allows shorter steps and slower growth."""
+_AGAIN = 1.05
+"""The growth of the number of a landmark's rays since its last triangulation at which it is triangulated again. A larger
+factor is faster, and landmarks enter later. With a factor of 1 the time would grow with the square of the rays."""
+_RECORDED = 1.02
+"""The growth of the graph from one step in the trace to the next. A larger factor records fewer steps. With a factor of 1,
+the trace of a long drive would take gigabytes, because each step records the whole path."""
 
 
 def initialize_known(
@@ -42,27 +48,30 @@ def initialize_known(
 
     The map frame is the odometry's frame, in which the first keyframe is fixed. progress(done, total) counts keyframes.
     """
-    keyframes, rays, settings = measured.keyframes, measured.rays, measured.settings
-    map_T_camera = keyframes.map_T_camera.copy()
-    positions = np.full((association.count, 3), np.nan)
+    keyframes, rays, settings, owner = measured.keyframes, measured.rays, measured.settings, association.object
+    window = SlidingWindow(measured, owner, association.count, _ITERATIONS)
+    map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    nothing = np.zeros(0, dtype=np.int64)
-    graph = build_graph(measured.factors(association.object, nothing, nothing, positions, end=1))
-    begin, step = 1, settings.joint.grow_step
+    waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)  # rays without a landmark; how many had each
+    begin, step, recorded = 1, settings.joint.grow_step, 0
     shortest = max(2, step // _SHORTEST)
     while begin < len(keyframes):
         end = min(begin + step, len(keyframes))
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
-        known = np.append(np.isfinite(positions[:, 0]), False)  # object -1 is the last
-        so_far = association.object[: first_ray[end]]
+        known = np.append(np.isfinite(window.positions[:, 0]), False)  # object -1 is the last
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
-        fresh = new[known[so_far[new]]]
-        off = _off(rays, association, map_T_camera, positions, fresh)
-        waiting = np.flatnonzero((so_far >= 0) & ~known[so_far])
-        born, places, agreeing = _new_landmarks(rays, association, map_T_camera, waiting, settings)
-        expected = positions.copy()
+        fresh, unknown = new[known[owner[new]]], new[(owner[new] >= 0) & ~known[owner[new]]]
+        off = _off(rays, association, map_T_camera, window.positions, fresh)
+        before = np.concatenate([waiting[~known[owner[waiting]]], unknown])
+        number = np.bincount(owner[before], minlength=association.count)
+        again = np.maximum(_AGAIN * tried, settings.association.min_rays + _MORE_RAYS)
+        due = (number >= again) | (end == len(keyframes))
+        born, places, covariance, agreeing = _new_landmarks(
+            rays, association, map_T_camera, before[due[owner[before]]], settings
+        )
+        expected = window.positions.copy()
         expected[born] = places
         off_all = np.concatenate([off, _off(rays, association, map_T_camera, expected, agreeing)])
         surprise = np.median(off_all) if len(off_all) else _HOLDS
@@ -70,21 +79,19 @@ def initialize_known(
             step = max(step // 4, shortest)
             continue
         fresh = np.concatenate([fresh[off <= max(_GATE, _GATE_SHARE * np.median(off))], agreeing]) if len(off) else agreeing
-        positions = expected
-        graph.push_back(build_graph(measured.factors(association.object, fresh, born, positions, begin=begin, end=end)))
-        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
-        if len(landmarks):
-            values = make_values(map_T_camera[:end], positions, landmarks)
-            optimum = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4)
-            map_T_camera[:end] = read_poses(optimum.values)
-            positions = with_points(positions, landmarks, optimum.values)
-            if trace is not None:
-                trace.iteration("grow", optimum.cost_after, map_T_camera[:end], positions)
+        waiting, tried = before, np.where(due, number, tried)
+        window.positions = expected
+        window.extend(end, fresh, born, covariance)
+        if np.isfinite(window.positions[:, 0]).any():
+            optimum = window.solve()
+            if trace is not None and (end >= _RECORDED * recorded or end == len(keyframes)):
+                recorded = end
+                trace.iteration("grow", optimum.cost_after, map_T_camera[:end], window.positions)
         progress(end, len(keyframes))
         begin = end
         if surprise < _HOLDS:
             step *= 2
-    return map_T_camera, positions
+    return map_T_camera, window.positions
 
 
 def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, which: Ints) -> Floats:
@@ -94,12 +101,31 @@ def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: 
 
 def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
-) -> tuple[Ints, Floats, Ints]:
-    """Return the landmarks (n,) that the rays `waiting` determine now, their positions (n, 3), and the rays that agree."""
+) -> tuple[Ints, Floats, Floats, Ints]:
+    """Return the landmarks (n,) that the rays `waiting` determine now, and the rays (m,) that agree with them.
+
+    Between the two are the positions (n, 3) of these landmarks, and their covariances (n, 3, 3) at the present poses.
+    """
+    waiting = waiting[_may_have_parallax(rays.take(waiting), association.object[waiting], map_T_camera, settings)]
     if len(waiting) == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), waiting
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), waiting
     landmarks, index = np.unique(association.object[waiting], return_inverse=True)
     some = Association(index, association.label[landmarks])
     fewest = settings.association.min_rays + _MORE_RAYS
     found, ready = triangulate_landmarks(map_T_camera, rays.take(waiting), some, fewest, settings)
-    return landmarks[ready], found.positions[ready], waiting[ready[index] & (found.weight > 0)]
+    agreeing = waiting[ready[index] & (found.weight > 0)]
+    return landmarks[ready], found.positions[ready], found.covariance[ready], agreeing
+
+
+def _may_have_parallax(rays: Rays, owner: Ints, map_T_camera: Floats, settings: Settings) -> Bools:
+    """Return which rays (R,) have a landmark whose rays can have enough parallax, or one of whose rays has a range.
+
+    A triangulation takes much longer than this test. Two rays differ by at most twice the largest angle from their mean.
+    """
+    _, directions = rays.in_map(map_T_camera)
+    mean = np.zeros((owner.max(initial=-1) + 1, 3))
+    np.add.at(mean, owner, directions)
+    widest, ranged = np.zeros(len(mean)), np.zeros(len(mean), dtype=bool)
+    np.maximum.at(widest, owner, 2 * angles_off(np.zeros(3), directions, mean[owner]))
+    ranged[owner[np.isfinite(rays.range)]] = True
+    return ((widest >= np.radians(settings.joint.min_parallax_deg)) | ranged)[owner]

@@ -48,26 +48,28 @@ def reject_outliers(
     used: Bools,
     back: Bools,
     trace: Trace | None,
+    tolerance: float = 1e-6,
 ) -> JointSolution:
     """Solve, and test which rays agree with their objects, until the set of inliers is stable.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
-    solve, or all False. back: (R,) rays that count as inliers in the first solve.
+    solve, or all False. back: (R,) rays that count as inliers in the first solve. tolerance: the relative decrease
+    of the cost below which a solve ends.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
     for _ in range(_ROUNDS):
-        moved, supported = second_opinion(measured, map_T_camera, association, positions, used)
+        moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
-            supported = supported | back
-        elif (supported == used).all():
+            agreeing = agreeing | back
+        elif (agreeing == used).all():
             break  # the positions stay those of the last solve
-        positions, used = moved, supported
+        positions, used = moved, agreeing
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         graph = build_graph(measured.factors(association.object, which, landmarks, positions, loss))
         values, others = make_values(map_T_camera, positions, landmarks), range(len(which), graph.size())
         traced = trace_solve(trace, positions, landmarks)
-        optimum = optimize(graph, values, loss, measured.settings, others, on_iteration=traced)
+        optimum = optimize(graph, values, loss, measured.settings, others, tolerance, traced)
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
@@ -108,12 +110,12 @@ def second_opinion(
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
-    supported = _supported(rays, association, map_T_camera, positions, used)
-    support = np.bincount(association.object[supported], minlength=association.count)
+    agreeing = supported(rays, association, map_T_camera, positions, used)
+    support = np.bincount(association.object[agreeing], minlength=association.count)
     doubtful = support < _SURE * number
     which = np.isin(association.object, np.flatnonzero(doubtful))
     if not which.any():
-        return positions, supported
+        return positions, agreeing
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
     if used.any():  # solved poses do not have the noise of the localisation
@@ -121,13 +123,13 @@ def second_opinion(
     placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, measured.settings)
     other = positions.copy()
     other[objects[placed.ok]] = placed.positions[placed.ok]
-    agreeing = _supported(rays, association, map_T_camera, other, used)
+    agreeing = supported(rays, association, map_T_camera, other, used)
     gained = np.bincount(association.object[agreeing], minlength=len(support))
     positions = np.where((gained > support)[:, None], other, positions)
-    return positions, _supported(rays, association, map_T_camera, positions, used)
+    return positions, supported(rays, association, map_T_camera, positions, used)
 
 
-def _supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
+def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
     """Return which rays (R,) agree with their object, given the noise of its inliers (at first, of all its rays)."""
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
@@ -135,9 +137,9 @@ def _supported(rays: Rays, association: Association, map_T_camera: Floats, posit
     miss = angles_off(origins, directions, positions[landmark]) / rays.sigma[placed]
     before = used[placed] if used.any() else np.ones(len(miss), dtype=bool)
     noise = np.minimum(noise_factors(miss[before], landmark[before], association.count, _FEWEST), MOST_NOISE_FACTOR)
-    supported = np.zeros(len(rays), dtype=bool)
-    supported[placed] = miss <= OUTLIER_RAY * noise[landmark]
-    return supported
+    agreeing = np.zeros(len(rays), dtype=bool)
+    agreeing[placed] = miss <= OUTLIER_RAY * noise[landmark]
+    return agreeing
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:

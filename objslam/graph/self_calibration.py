@@ -20,7 +20,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.outlier_rejection import JointSolution, reject_outliers, second_opinion
+from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
 from objslam.graph.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.graph.variance_components import estimate_noise, shrinking_force
@@ -29,7 +29,7 @@ _ROUNDS = 8
 """The most outer steps; more is slower. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6."""
 _CONVERGED = 0.2
 """The step, in posterior standard deviations, below which a parameter has converged; larger ends sooner."""
-_INNER = 5
+_INNER = 3
 """The iterations of an inner solve. Few are enough, because each begins at a linear prediction of its optimum."""
 _TOLERANCE = 1e-4
 """The relative decrease of the cost in an iteration below which an inner solve ends. A larger value ends it sooner."""
@@ -180,7 +180,7 @@ class _Fit:
         change = np.zeros((len(clocks), len(clocks)))
         for i, k in enumerate(clocks.tolist()):
             step = self.errors.steps[k] * np.eye(len(theta))[k]
-            ahead, behind = (self.gradient(state, system, theta, at)[clocks] for at in (step, -step))
+            ahead, behind = (self.gradient(state, system, theta, at, clocks.tolist()) for at in (step, -step))
             change[:, i] = (behind - ahead) / (2 * self.errors.steps[k])
         scale = np.sqrt(np.maximum(np.diagonal(system.information)[clocks], 1e-300))
         block = np.ix_(clocks, clocks)
@@ -192,10 +192,10 @@ class _Fit:
         noisy[block] = lost @ (root @ axes).T
         return noisy
 
-    def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats) -> Floats:
-        """The gradient (P,) at the optimum for a step (P,) from the parameters."""
+    def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
+        """The gradient by some parameters at the optimum for a step (P,) from the parameters."""
         side = state.moved(system, step, self.measure(*self.errors.at(theta + step)))
-        return linearise(side, self.errors, theta + step).reduce().gradient
+        return linearise(side, self.errors, theta + step, which).reduce().gradient
 
     def remeasured(self, state: _State, theta: Floats) -> _State:
         """The optimum for the measurements with the noise as it is now."""
@@ -290,7 +290,7 @@ class _State(Linearised):
 
     def settled(self) -> Self:
         """The same with the rays that agree with their objects now."""
-        positions, used = second_opinion(self.measured, self.map_T_camera, self.association, self.positions, self.used)
+        used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
         if np.array_equal(used, self.used):
             return self
-        return type(self).of(self.measured, self.association, self.map_T_camera, positions, used)
+        return type(self).of(self.measured, self.association, self.map_T_camera, self.positions, used)

@@ -3,6 +3,7 @@
 The parameters are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -102,8 +103,15 @@ class ReducedSystem:
     newton: Floats
 
 
-def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> LinearSystem:
-    """Return the linear system of a graph at its values, and at the shared errors theta (P,)."""
+def linearise(
+    of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int] | None = None
+) -> LinearSystem:
+    """Return the linear system of a graph at its values, and at the shared errors theta (P,).
+
+    which: the numbers of the parameters that the system shall have. None means all of them.
+    """
+    which = range(len(theta)) if which is None else which
+    names = [errors.names[k] for k in which]
     columns = 3 * len(of.landmarks) + 6 * len(of.map_T_camera)
     jacobian, residual = _whitened(of.graph, of.values, columns)
     keyframes = of.measured.keyframes
@@ -112,9 +120,9 @@ def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
     first_motion = len(residual) - absolute - motions
     ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
     first_range = first_motion - 3 * len(of.landmarks) - ranged
-    sides = _parameter_columns(of, errors, theta, (len(residual), first_range, first_motion))
-    told = np.array([errors.size_told if name == "odometry.scale" else 1.0 for name in errors.names])
-    instruments = _instruments(of, errors, sides, slice(first_motion, first_motion + motions))
+    sides = _parameter_columns(of, errors, theta, which, (len(residual), first_range, first_motion))
+    told = np.array([errors.size_told if name == "odometry.scale" else 1.0 for name in names])
+    instruments = _instruments(of, names, sides, slice(first_motion, first_motion + motions))
     return LinearSystem(jacobian, sides, instruments, told, residual, first_range, first_motion)
 
 
@@ -143,8 +151,10 @@ def _whitened(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, columns: 
     return sparse.csc_matrix((value[~side], (row[~side], column[~side])), shape=(rows, columns)), residual
 
 
-def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats, rows: tuple[int, int, int]) -> Floats:
-    """(M, P) derivatives of the whitened residuals by the parameters: central differences, robust weights held.
+def _parameter_columns(
+    of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int], rows: tuple[int, int, int]
+) -> Floats:
+    """(M, p) derivatives of the whitened residuals by some of the parameters: central differences, robust weights held.
 
     rows: the number of rows, and where the ranges and the motions begin.
     """
@@ -186,24 +196,25 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
         return bearings, distances, np.concatenate(parts)
 
     total, first_range, first_motion = rows
-    result = np.zeros((total, len(theta)))
-    for k, step in enumerate(errors.steps):
+    result = np.zeros((total, len(which)))
+    for column, k in enumerate(which):
+        step = errors.steps[k]
         up, down = (residuals(theta + sign * step * np.eye(len(theta))[k]) for sign in (1, -1))
         bearings, distances, others = ((more - less) / (2 * step) for more, less in zip(up, down, strict=True))
-        result[:first_range, k] = bearings
-        result[first_range : first_range + len(ranged), k] = distances
-        result[first_motion:, k] = others
+        result[:first_range, column] = bearings
+        result[first_range : first_range + len(ranged), column] = distances
+        result[first_motion:, column] = others
     return result
 
 
-def _instruments(of: Linearised, errors: CalibratedMeasurements, sides: Floats, motions: slice) -> Floats:
-    """The sides (M, P) with the motions of the odometry's scales as their neighbours predict them.
+def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: slice) -> Floats:
+    """The sides (M, p) of parameters with the motions of the odometry's scales as their neighbours predict them.
 
     A motion's own noise is in its derivative by the scale and in its residual. Their product would pull the scale away: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is another
     (instrumental variables; Fuller 1987, 1.4).
     """
-    which = [k for k, name in enumerate(errors.names) if name in _ODOMETRY_SCALES]
+    which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
         return sides
     keyframes = of.measured.keyframes

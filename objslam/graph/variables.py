@@ -34,12 +34,27 @@ def make_values(map_T_camera: Floats, positions: Floats, landmarks: Ints) -> gts
 
 def read_poses(values: gtsam.Values) -> Floats:
     """Return the poses X (K, 4, 4) of the values, in the order of their numbers."""
-    return _read(values)[1]
+    return keyframes_in(values)[1]
 
 
 def read_points(values: gtsam.Values) -> Floats:
     """Return the points L (n, 3) of the values, in the order of their numbers."""
-    return _points(values, _keys(values, L0))
+    return landmarks_in(values)[1]
+
+
+def keyframes_in(values: gtsam.Values) -> tuple[Ints, Floats]:
+    """Return the numbers (K,) and the poses (K, 4, 4) of the variables X, in the order of their numbers."""
+    keys = _keys(values, X0)
+    flat = gtsam.utilities.extractPose3(values)
+    if len(flat) != len(keys):  # some poses are not keyframes
+        flat = gtsam.utilities.extractPose3(values.extract(keys.tolist()))
+    return keys - X0, make_pose(flat[:, :9].reshape(-1, 3, 3), flat[:, 9:])
+
+
+def landmarks_in(values: gtsam.Values) -> tuple[Ints, Floats]:
+    """Return the numbers (n,) and the points (n, 3) of the variables L, in the order of their numbers."""
+    keys = _keys(values, L0)
+    return keys - L0, _points(values, keys)
 
 
 def with_points(positions: Floats, landmarks: Ints, values: gtsam.Values) -> Floats:
@@ -78,10 +93,9 @@ class Variables:
 
     def read(self, values: gtsam.Values) -> None:
         """Set the variables from the values. Variables that the values lack stay, and unknown values are ignored."""
-        keys, found = _read(values)
-        poses = dict(zip((keys - X0).tolist(), found, strict=True))
-        keys = _keys(values, L0)
-        points = dict(zip((keys - L0).tolist(), _points(values, keys), strict=True))
+        poses, points = (
+            dict(zip(number.tolist(), found, strict=True)) for number, found in (keyframes_in(values), landmarks_in(values))
+        )
         self.poses = {k: poses.get(k, pose) for k, pose in self.poses.items()}
         self.points = {j: points.get(j, point) for j, point in self.points.items()}
         self.others = {key: _at(values, key, old) if values.exists(key) else old for key, old in self.others.items()}
@@ -91,15 +105,6 @@ def _keys(values: gtsam.Values, first: int) -> Ints:
     """Return the keys (n,) that have the same letter as the key `first`, in ascending order."""
     keys = np.array(values.keys(), dtype=np.int64)
     return keys[keys >> LETTER == first >> LETTER]
-
-
-def _read(values: gtsam.Values) -> tuple[Ints, Floats]:
-    """Return the keys (K,) and the poses (K, 4, 4) of the variables X."""
-    keys = _keys(values, X0)
-    flat = gtsam.utilities.extractPose3(values)
-    if len(flat) != len(keys):  # some poses are not keyframes
-        flat = gtsam.utilities.extractPose3(values.extract(keys.tolist()))
-    return keys, make_pose(flat[:, :9].reshape(-1, 3, 3), flat[:, 9:])
 
 
 def _points(values: gtsam.Values, keys: Ints) -> Floats:

@@ -1,0 +1,115 @@
+"""Solve a graph that grows along the path, over a window of its last keyframes. The rest is held by its marginals.
+
+If each step solved the whole graph, the time would grow with the square of the path. Here, a step solves only the window.
+The whole graph is solved each time that it has doubled. All these solves together take twice the time of the last one.
+"""
+
+import gtsam
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.graph.assembly import Measurements
+from objslam.graph.optimizers import Optimum, build_graph, indeterminate, levenberg_marquardt
+from objslam.graph.variables import L0, LETTER, X0, keyframes_in, landmarks_in
+
+_WINDOW = 60
+"""The number of keyframes before a step that are solved again with it. A larger number is slower and corrects older poses.
+On the MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps."""
+_GROWTH = 2.0
+"""The growth of the graph since its last whole solve at which it is solved as a whole again. A larger factor is faster. A
+smaller one corrects earlier what windows neglect: errors of what they hold are correlated, and a loop bends old poses."""
+
+
+class SlidingWindow:
+    """Camera poses map_T_camera (K, 4, 4) and landmark positions (N, 3), in map, of a graph that grows along the path.
+
+    A landmark that is not in the graph yet has the position NaN. The graph has the keyframes before `end`.
+    """
+
+    def __init__(self, measured: Measurements, owner: Ints, landmarks: int, iterations: int) -> None:
+        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: those of a solve."""
+        self.map_T_camera = measured.keyframes.map_T_camera.copy()
+        self.positions = np.full((landmarks, 3), np.nan)
+        self._measured, self._owner, self._iterations = measured, owner, iterations
+        self._factors: list[list[gtsam.NonlinearFactor]] = [[] for _ in self.map_T_camera]  # by their last keyframe
+        self._weak: dict[int, gtsam.NonlinearFactor] = {}  # the weak prior of each landmark, by its key
+        self._held: dict[int, gtsam.NonlinearFactor] = {}  # the prior of each variable by what left the window
+        self._values = gtsam.Values()
+        self._begin, self.end, self._solved = 0, 0, 0  # the window, and the keyframes of the last whole solve
+        nothing = np.zeros(0, dtype=np.int64)
+        self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
+
+    def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
+        """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
+
+        covariance: (m, 3, 3) of the landmarks by their rays. It stands for the rays of keyframes that have left the window.
+        """
+        keyframe = self._measured.rays.keyframe
+        for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
+            last = max(factor.keys())  # the keys of keyframes are above those of landmarks
+            if _is_landmark(last):
+                self._weak[last] = factor
+            else:
+                self._factors[last - X0].append(factor)
+        for k in range(self.end, end):
+            self._values.insert(X0 + k, gtsam.Pose3(self.map_T_camera[k]))
+        left = np.isin(born, self._owner[rays[keyframe[rays] < self._begin]])
+        for j, spread, older in zip(born.tolist(), covariance, left.tolist(), strict=True):
+            self._values.insert(L0 + j, self.positions[j])
+            if older:
+                self._held[L0 + j] = _prior(L0 + j, self._values, spread)
+        self.end = end
+
+    def solve(self) -> Optimum:
+        """Solve the window, or the whole graph if it has grown enough or is complete. Then move the window on.
+
+        SolveError if the linear system is indeterminate, or if the cost is not finite.
+        """
+        if self.end >= _GROWTH * self._solved or self.end == len(self.map_T_camera):
+            self._begin, self._solved, self._held = 0, self.end, {}
+        graph = self._graph(self._begin, self.end)
+        optimum = levenberg_marquardt(graph, self._values.extract(graph.keyVector()), self._iterations, 1e-4)
+        self._values.update(optimum.values)
+        keyframes, poses = keyframes_in(optimum.values)
+        landmarks, points = landmarks_in(optimum.values)
+        self.map_T_camera[keyframes], self.positions[landmarks] = poses, points
+        self._move(max(self.end - _WINDOW, self._begin))
+        return optimum
+
+    def _graph(self, begin: int, end: int) -> gtsam.NonlinearFactorGraph:
+        """Return the graph of the keyframes from `begin` to `end` - 1, with the priors of its variables."""
+        graph = build_graph(*self._factors[begin:end])
+        keys = graph.keyVector()
+        priors = [self._held.get(key, self._weak.get(key)) for key in keys]
+        graph.push_back(build_graph([prior for prior in priors if prior is not None]))
+        return graph
+
+    def _move(self, begin: int) -> None:
+        """Let the window begin at another keyframe. The marginals of what leaves become the priors of what stays.
+
+        Landmarks that leave keep their marginal until they are seen again. SolveError if a marginal is indeterminate.
+        """
+        if begin == self._begin:
+            return
+        leaving = self._graph(self._begin, begin)
+        keys = leaving.keyVector()
+        staying = set(self._graph(begin, self.end).keyVector())
+        kept = [key for key in keys if _is_landmark(key) or key in staying]
+        try:
+            marginals = gtsam.Marginals(leaving, self._values.extract(keys))
+            self._held |= {key: _prior(key, self._values, marginals.marginalCovariance(key)) for key in kept}
+        except RuntimeError as error:
+            raise indeterminate(error) from error
+        self._begin = begin
+
+
+def _is_landmark(key: int) -> bool:
+    return key >> LETTER == L0 >> LETTER
+
+
+def _prior(key: int, values: gtsam.Values, covariance: Floats) -> gtsam.NonlinearFactor:
+    """Return the factor that holds a variable at its value, with a covariance (3, 3) or (6, 6)."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    if _is_landmark(key):
+        return gtsam.PriorFactorPoint3(key, values.atPoint3(key), noise)
+    return gtsam.PriorFactorPose3(key, values.atPose3(key), noise)

@@ -1,0 +1,107 @@
+"""A graph that is solved over a window of its last keyframes."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from drives import ODOMETRY_ALONE, Drive, make_drive
+
+from objslam.graph import sliding_window
+from objslam.graph.assembly import Measurements
+from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.sliding_window import SlidingWindow
+from objslam.graph.variables import make_values, read_poses
+
+STEP = 10
+
+
+def at_truth(seed: int = 0, **changes) -> tuple[Drive, SlidingWindow]:
+    """A drive in the frame of the truth, and its window, which begins with the true poses and points."""
+    drive = make_drive(seed, "mode=joint", false=0.0, missed=0.0, **{**ODOMETRY_ALONE, **changes})
+    keyframes = replace(drive.keyframes, map_T_base=drive.map_T_base)
+    drive = replace(drive, keyframes=keyframes)
+    measured = Measurements.of(keyframes, drive.rays, drive.settings)
+    return drive, SlidingWindow(measured, drive.association.object, drive.association.count, 20)
+
+
+def extended(drive: Drive, window: SlidingWindow, end: int) -> None:
+    """Add the keyframes before `end` with all their rays, and the landmarks that they see first, at the truth."""
+    begin = window.end
+    rays = np.flatnonzero((drive.rays.keyframe >= begin) & (drive.rays.keyframe < end))
+    seen = np.unique(drive.association.object[rays])
+    born = seen[np.isnan(window.positions[seen, 0])]
+    window.positions[born] = drive.points[born]
+    window.extend(end, rays, born, np.tile(np.eye(3), (len(born), 1, 1)))
+
+
+def whole_solution(drive: Drive, end: int) -> np.ndarray:
+    """The camera poses (end, 4, 4) of a batch solve of the first keyframes, from the truth."""
+    measured = Measurements.of(drive.keyframes, drive.rays, drive.settings)
+    rays = np.flatnonzero((drive.rays.keyframe > 0) & (drive.rays.keyframe < end))
+    landmarks = np.unique(drive.association.object[rays])
+    graph = build_graph(measured.factors(drive.association.object, rays, landmarks, drive.points, end=end))
+    values = make_values(drive.keyframes.map_T_camera[:end], drive.points, landmarks)
+    return read_poses(levenberg_marquardt(graph, values, 100).values)
+
+
+def grow(drive: Drive, window: SlidingWindow) -> list[np.ndarray]:
+    """Grow to the end. Return the poses after each step."""
+    paths = []
+    for end in [*range(1 + STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
+        extended(drive, window, end)
+        window.solve()
+        paths.append(window.map_T_camera[:end].copy())
+    return paths
+
+
+def apart(one: np.ndarray, other: np.ndarray) -> float:
+    """The largest distance (m) between the places of two paths."""
+    return float(np.linalg.norm(one[:, :3, 3] - other[:, :3, 3], axis=1).max())
+
+
+def test_the_complete_graph_is_solved_as_a_whole():
+    drive, window = at_truth()
+    paths = grow(drive, window)
+    assert apart(paths[-1], whole_solution(drive, len(drive.keyframes))) < 1e-3
+
+
+def test_a_window_is_near_the_solution_of_the_whole_graph(monkeypatch):
+    """What left the window keeps its poses, and as a prior it tells about as much as its measurements."""
+    monkeypatch.setattr(sliding_window, "_GROWTH", np.inf)  # no whole solve but the last
+    monkeypatch.setattr(sliding_window, "_WINDOW", 30)
+    drive, window = at_truth()
+    paths = grow(drive, window)
+    for path in paths[6:-1:3]:
+        reference = whole_solution(drive, len(path))
+        moved = apart(reference, drive.keyframes.map_T_camera[: len(path)])
+        assert apart(path[-STEP:], reference[-STEP:]) < 0.5 * moved
+
+
+def test_keyframes_before_the_window_stay(monkeypatch):
+    monkeypatch.setattr(sliding_window, "_GROWTH", np.inf)
+    monkeypatch.setattr(sliding_window, "_WINDOW", 30)
+    drive, window = at_truth()
+    paths = grow(drive, window)[:-1]
+    for before, after in pairwise(paths[5:]):
+        begin = len(before) - 30
+        np.testing.assert_array_equal(after[: begin - 1], before[: begin - 1])
+        assert apart(after[begin:-STEP], before[begin:]) > 0
+
+
+@pytest.mark.parametrize("growth", [2.0, np.inf])
+def test_the_graph_of_a_step_does_not_grow_with_the_path(monkeypatch, growth):
+    monkeypatch.setattr(sliding_window, "_GROWTH", growth)
+    monkeypatch.setattr(sliding_window, "_WINDOW", 30)
+    sizes: list[int] = []
+
+    def counted(graph, *rest):
+        sizes.append(len([key for key in graph.keyVector() if key >= sliding_window.X0]))
+        return levenberg_marquardt(graph, *rest)
+
+    monkeypatch.setattr(sliding_window, "levenberg_marquardt", counted)
+    drive, window = at_truth()
+    grow(drive, window)
+    whole = [size for size in sizes if size > 30 + STEP + 1]
+    assert len(whole) <= 1 + np.log2(len(drive.keyframes) / (30 + STEP)) if growth == 2.0 else len(whole) == 1
+    assert sizes[-1] == len(drive.keyframes)
