@@ -66,7 +66,10 @@ def test_the_reduced_system_is_that_of_solving_anew(localization):
     start = (made.keyframes.map_T_camera[0] @ inverse(true[0])) @ true, made.points
     poses, places, _, graph, values, measured = optimum(errors, theta, made, start)
     every = np.ones(len(made.rays), dtype=bool)
-    system = linearise(Linearised(graph, values, measured, made.association, poses, places, every), errors, theta).reduce()
+    solved = Linearised(graph, values, measured, made.association, poses, places, every)
+    system = linearise(solved, errors, theta).reduce()
+    for k in range(len(theta)):
+        assert_allclose(linearise(solved, errors, theta, [k]).reduce().gradient, system.gradient[[k]], atol=1e-9)
     told = system.sensitivity[: 3 * len(places)].reshape(-1, 3, len(theta))
     for k, step in enumerate(0.1 * errors.steps):
         ahead, behind = (optimum(errors, theta + s * step * np.eye(len(theta))[k], made, (poses, places)) for s in (1, -1))
