@@ -16,6 +16,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
+from objslam.graph.calibration.self_calibration import calibrate
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
@@ -23,7 +24,6 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
-from objslam.graph.self_calibration import calibrate
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 

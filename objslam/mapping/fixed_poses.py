@@ -21,7 +21,7 @@ from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
-    from objslam.graph.fixed_pose_calibration import FixedCalibration
+    from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _ROUNDS = 8
 """The most rounds of association and calibration. More rounds are slower. Two or three are usual."""
@@ -96,7 +96,7 @@ def calibrate_fixed(
     covariance of the errors enters that of the objects. Returns what was solved, without the errors, the association, the
     estimate, and the number of objects in each round.
     """
-    from objslam.graph.fixed_pose_calibration import calibrate_at_poses, noise_of_errors
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))

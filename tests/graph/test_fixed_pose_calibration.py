@@ -19,7 +19,7 @@ from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
-from objslam.graph.fixed_pose_calibration import calibrate_at_poses, linearise_points, noise_of_errors
+from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, linearise_points, noise_of_errors
 from objslam.graph.fixed_pose_triangulation import pose_noise, triangulate_at
 from objslam.simulation import PoseNoise, make_camera, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors

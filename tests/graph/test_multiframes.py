@@ -16,11 +16,11 @@ from objslam.core.types import Keyframes
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
+from objslam.graph.calibration.shared_error_jacobian import Linearised, linearise
 from objslam.graph.factors.bearing import bearings, ray_residuals, tangent_basis
 from objslam.graph.factors.range import ranges
 from objslam.graph.multiframes import TOGETHER, Multiframes
 from objslam.graph.optimizers import build_graph
-from objslam.graph.shared_error_jacobian import Linearised, linearise
 from objslam.graph.variables import L0, X0, make_values
 from objslam.simulation import DepthNoise, PoseNoise, make_camera, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors

@@ -11,8 +11,8 @@ from objslam.core.geometry import inverse
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
+from objslam.graph.calibration.shared_error_jacobian import Linearised, linearise
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.shared_error_jacobian import Linearised, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate

@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.batch_solver import solve_joint
-from objslam.graph.variance_components import _azimuth_elevation
+from objslam.graph.calibration.variance_components import _azimuth_elevation
 from objslam.simulation import DepthNoise, preset, simulate
 
 HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "clock", "range_scale"))

@@ -13,7 +13,7 @@ from objslam.core.calibration import UNITS, kind
 from objslam.core.types import Keyframes, Log, Rays
 from objslam.frontend.known_errors import prior_sigma
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
-from objslam.graph.fixed_pose_calibration import PointSystem, linearise_points
+from objslam.graph.calibration.fixed_pose_calibration import PointSystem, linearise_points
 from objslam.mapping.checks.agreement import Agreement
 
 _PRIORS = {"clock": 0.3, "yaw": 0.2, "tilt": 0.2, "roll": 0.2, "focal": 0.2, "translation": 0.3}

@@ -14,9 +14,9 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
-from objslam.graph.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
 
 _PROBES = 12
 """The number of random probes. More are slower, and tell the redundancy of n residuals to sqrt(2 / (n * probes)) of it."""

@@ -19,11 +19,11 @@ from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
+from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem, linearise
+from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
-from objslam.graph.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.variables import make_values, read_poses, with_points
-from objslam.graph.variance_components import estimate_noise, shrinking_force
 
 _ROUNDS = 8
 """The most outer steps; more is slower. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6."""
