@@ -168,8 +168,8 @@ class CalibratedMeasurements(Protocol):
         """The kinds of noise that are estimated, of `rays`, `ranges` and `odometry`."""
 
     @property
-    def size_told(self) -> float:
-        """From 0 to 1, how far ranges or absolute poses tell the size of the map, and not the odometry."""
+    def unknown_scales(self) -> frozenset[str]:
+        """The scales that all lengths have, so that nothing tells a common scale of them; empty if a length has none."""
 
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same with other noise."""

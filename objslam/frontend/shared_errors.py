@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from objslam.config import CalibrationSettings, Settings
+from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import interpolate, inverse
@@ -68,18 +68,12 @@ class SharedErrors:
         return frozenset(k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use))
 
     @cached_property
-    def size_told(self) -> float:
-        """From 0 to 1, how far ranges or absolute poses tell the size of the map, and not the odometry.
-
-        Bearings leave the size to the odometry, so that any scale of it fits equally. What seems to tell the scale then is
-        noise: a smaller map has less of it.
-        """
+    def unknown_scales(self) -> frozenset[str]:
+        """The scales that all lengths have, so that nothing tells a common scale of them; empty if a length has none."""
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
-            return 1.0
-        known, variance = np.isfinite(self.rays.range), dict(zip(self.names, np.diagonal(self.prior).tolist(), strict=True))
-        information = float(np.sum((self.rays.range[known] / self.rays.range_sigma[known]) ** 2))
-        odometry = variance.get("odometry.scale", CalibrationSettings().scale ** 2)
-        return odometry / (odometry + variance.get("range_scale", 0.0) + 1 / max(information, 1e-12))
+            return frozenset()
+        scales = {"odometry.scale"} | ({"range_scale"} if np.isfinite(self.rays.range).any() else set())
+        return frozenset(scales) if scales <= set(self.names) else frozenset()
 
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same with other noise."""

@@ -48,6 +48,9 @@ _NOISE_ROUNDS = 3
 _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
 
+_LEAST_GROWTH = 0.5
+"""The least growth of the map by which a projection is trusted, if all scales grow by 1. It is 1 but for errors of
+linearisation. A larger value trusts it more rarely."""
 _SHRINKINGS = 30
 """How often the noise in the information is made smaller to keep the curvature positive; more keep less of it."""
 
@@ -100,7 +103,7 @@ def calibrate(
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
-    reduced = linearise(state, fit.errors, theta).reduce()
+    reduced = _without_shrinking(state, linearise(state, fit.errors, theta).reduce(), fit.errors, theta)
     _, covariance = _curvature(reduced.information, noisy, np.asarray(np.linalg.inv(errors.prior), dtype=np.float64))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     by_landmark = (len(state.landmarks), 3, len(theta))
@@ -138,14 +141,12 @@ class _Fit:
 
         history: list[tuple[Floats, Floats]] = []
         for steps in range(_ROUNDS):
-            linear = linearise(state, errors, theta)
-            system = linear.reduce()
+            system = _without_shrinking(state, linearise(state, errors, theta).reduce(), errors, theta)
             if steps == 0:
                 noisy = self.noise_shares(state, system, theta)
             curvature, covariance = _curvature(system.information, noisy, prior)
-            gradient = system.gradient + _without_shrinking(state, system, linear.told)
-            step = np.asarray(np.linalg.solve(curvature, gradient - prior @ (theta - errors.mean)), dtype=np.float64)
-            pull = gradient - system.descent
+            step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
+            pull = system.gradient - system.descent
             if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
                 break
             history = [*history[-_MEMORY:], (theta, step)]
@@ -228,16 +229,24 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Float
     return curvature, np.asarray(inverse @ (information + prior) @ inverse)
 
 
-def _without_shrinking(state: _State, system: ReducedSystem, told: Floats) -> Floats:
-    """What (P,) the gradient lacks: without the force that makes a solution too small, it would not pull at the parameters.
+def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
+    """Return the system without the force that makes a solution too small, which would pull at the parameters.
 
-    A parameter feels the force as far as the size of the map follows it.
+    A parameter feels the force as far as the size of the map follows it. If all lengths have an unknown scale, everything
+    can grow in proportion at no cost. So what seems to tell a common scale is this force, and it is projected out (the gauge
+    of a free network; Meissl 1969). Else the force is measured.
     """
     landmarks = state.positions[state.landmarks]
+    if not len(landmarks):
+        return system
     around = landmarks - landmarks.mean(axis=0)
     moved = system.sensitivity[: around.size].reshape(*around.shape, system.sensitivity.shape[1])
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    return told * shrinking_force(state)[0] * size
+    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
+    if not growing @ size > _LEAST_GROWTH:
+        return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
+    project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
+    return replace(system, gradient=project @ system.gradient, information=project @ system.information @ project.T)
 
 
 def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:

@@ -60,14 +60,12 @@ class LinearSystem:
     jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. sides: (M, P) by the
     shared errors. residual: (M,). first_range, first_motion: the rows where the ranges and the motions begin.
     instruments: (M, P) what the residuals must not correlate with at the optimum. They are the sides, but for the scales of
-    the odometry: their sides hold the odometry's own noise, which is in the residuals as well. told: (P,)
-    how far the measurements tell each parameter at all.
+    the odometry: their sides hold the odometry's own noise, which is in the residuals as well.
     """
 
     jacobian: sparse.csc_matrix
     sides: Floats
     instruments: Floats
-    told: Floats
     residual: Floats
     first_range: int
     first_motion: int
@@ -80,9 +78,8 @@ class LinearSystem:
         reduced, left = self.sides + self.jacobian @ sensitivity, self.residual + self.jacobian @ newton
         across, diagonal = np.einsum("mp,mp->p", self.instruments, reduced), np.einsum("mp,mp->p", reduced, reduced)
         signal = np.clip(across / np.maximum(diagonal, 1e-300), 0.0, 1.0)
-        gradient, descent = -self.told * (self.instruments.T @ left), -reduced.T @ left
-        information = np.outer(self.told, self.told) * (reduced.T @ reduced)
-        return ReducedSystem(information, gradient, descent, signal, sensitivity, newton)
+        gradient, descent = -self.instruments.T @ left, -reduced.T @ left
+        return ReducedSystem(reduced.T @ reduced, gradient, descent, signal, sensitivity, newton)
 
 
 @dataclass(frozen=True)
@@ -121,9 +118,8 @@ def linearise(
     ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
     first_range = first_motion - 3 * len(of.landmarks) - ranged
     sides = _parameter_columns(of, errors, theta, which, (len(residual), first_range, first_motion))
-    told = np.array([errors.size_told if name == "odometry.scale" else 1.0 for name in names])
     instruments = _instruments(of, names, sides, slice(first_motion, first_motion + motions))
-    return LinearSystem(jacobian, sides, instruments, told, residual, first_range, first_motion)
+    return LinearSystem(jacobian, sides, instruments, residual, first_range, first_motion)
 
 
 def factor(jacobian: sparse.csc_matrix) -> SuperLU:
