@@ -51,6 +51,9 @@ _SAME_NOISE = 0.1
 _LEAST_GROWTH = 0.5
 """The least growth of the map by which a projection is trusted, if all scales grow by 1. It is 1 but for errors of
 linearisation. A larger value trusts it more rarely."""
+_FAR = 3.0
+"""The distance from the middle of the map, as a multiple of the median, up to which landmarks tell its size. A larger
+value counts more of those that hardly anything places."""
 _SHRINKINGS = 30
 """How often the noise in the information is made smaller to keep the curvature positive; more keep less of it."""
 
@@ -210,7 +213,8 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Float
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
     noisy: (P, P) the noise in the information, as shares of its diagonal. The gradient varies as the whole information says,
-    also by this noise, while the curvature is that of the signal alone. Hence the covariance is a sandwich (Huber 1967).
+    also by this noise, while the curvature is that of the signal alone. Hence the covariance is a sandwich (Huber 1967). In
+    no direction is it larger than that of the prior.
     SolveError if the information is not finite.
     """
     if not np.isfinite(information).all():
@@ -226,7 +230,10 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Float
     else:
         curvature = information + prior
     inverse = np.linalg.inv(curvature)
-    return curvature, np.asarray(inverse @ (information + prior) @ inverse)
+    root = np.linalg.cholesky(prior)
+    size, axes = np.linalg.eigh(root.T @ inverse @ (information + prior) @ inverse @ root)
+    axes = np.linalg.solve(root.T, axes)
+    return curvature, np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
 
 
 def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
@@ -239,9 +246,11 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
     landmarks = state.positions[state.landmarks]
     if not len(landmarks):
         return system
-    around = landmarks - landmarks.mean(axis=0)
+    around = landmarks - np.median(landmarks, axis=0)
+    away = np.linalg.norm(around, axis=1)
     moved = system.sensitivity[: around.size].reshape(*around.shape, system.sensitivity.shape[1])
-    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
+    near = away <= _FAR * np.median(away)  # A landmark that hardly anything places is far off, and does not grow along.
+    size = np.einsum("ni,nip->p", around[near], moved[near]) / max(float((away[near] ** 2).sum()), 1e-12)
     growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
     if not growing @ size > _LEAST_GROWTH:
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
