@@ -246,11 +246,11 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
     landmarks = state.positions[state.landmarks]
     if not len(landmarks):
         return system
-    around = landmarks - np.median(landmarks, axis=0)
-    away = np.linalg.norm(around, axis=1)
-    moved = system.sensitivity[: around.size].reshape(*around.shape, system.sensitivity.shape[1])
+    away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
     near = away <= _FAR * np.median(away)  # A landmark that hardly anything places is far off, and does not grow along.
-    size = np.einsum("ni,nip->p", around[near], moved[near]) / max(float((away[near] ** 2).sum()), 1e-12)
+    around = landmarks[near] - landmarks[near].mean(axis=0)  # With the mean, a shift of the whole map is no growth.
+    moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
+    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
     growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
     if not growing @ size > _LEAST_GROWTH:
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
