@@ -12,7 +12,10 @@ from objslam.cli.options import Config, Mode, Set, settings_of, with_options
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
+    from objslam.config import Settings
+    from objslam.core.types import Log
     from objslam.mapping.checks.diagnosis import Diagnosis
+    from objslam.mapping.progress import Progress
 
 _ROWS = 8  # The number of hypotheses in the table. The others explain less.
 
@@ -35,14 +38,33 @@ def doctor(
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
     with progress_bar() as show:
-        said = take_out_expected(chosen_poses(read(log, ledger, options), settings), settings)
+        given = read(log, ledger, options)
+        said = take_out_expected(chosen_poses(given, settings), settings)
         found = diagnose(said, settings, show, thorough=True)
+        solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None
     report(ledger)
     _show_trials(found)
-    for finding in found.findings:
-        say(f"wrong: {finding.message}")
-    if not found.findings:
-        say("nothing wrong was found")
+    messages = [finding.message for finding in found.findings] if solved is None else solved
+    for message in messages:
+        say(f"wrong: {message}")
+    if not messages:
+        refuted = "; the joint solve explains the boxes that fit poorly above" if found.findings else ""
+        say(f"nothing wrong was found{refuted}")
+
+
+def _solved(log: Log, settings: Settings, show: Progress) -> list[str] | None:
+    """Return the messages of the findings that a solve leaves, None if the solve fails."""
+    from objslam.core.diagnostics import Ledger
+    from objslam.errors import SolveError
+    from objslam.mapping.pipeline import run
+
+    quiet: dict[str, object] = {"output": settings.output.model_copy(update={"recording": False})}
+    quiet["reconstruction"] = settings.reconstruction.model_copy(update={"use": False})
+    try:
+        result = run(log, settings.model_copy(update=quiet), Ledger(), show)
+    except SolveError:
+        return None
+    return [finding["message"] for finding in result.summary["wrong_input"]]
 
 
 def _show_trials(found: Diagnosis) -> None:

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from objslam.association.observations import extents, size_per_metre
+from objslam.association.observations import MIN_DEPTH, extents, size_per_metre
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
@@ -123,7 +123,7 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     which = which[placed[association.object[which]]]
     rays, landmark = solution.rays.take(which), association.object[which]
     origin, direction = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
-    distance = np.linalg.norm(estimate.positions[landmark] - origin, axis=1)
+    distance = np.maximum(np.linalg.norm(estimate.positions[landmark] - origin, axis=1), MIN_DEPTH)
     angle, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
     size = np.sqrt(np.maximum(size_per_metre(rays, keyframes, cameras), 0.0).prod(axis=1))
     along = np.where(np.isfinite(rays.range), 1 / rays.range_sigma, 0.0)

@@ -22,6 +22,7 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import seen_something, solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.refuted import without_refuted
 from objslam.mapping.checks.residuals import check_residuals
 from objslam.mapping.checks.shared_errors import uncorrected
 from objslam.mapping.checks.verdict import say, widened
@@ -46,17 +47,26 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings)
-            say(diagnosis, ledger)
+            if not diagnosis.refutable:
+                say(diagnosis, ledger)
         frames = build_keyframes(log, settings, ledger)
         rays = build_rays(log, frames, settings, ledger)
     if len(rays) == 0:
+        say(diagnosis, ledger)
         raise SolveError(
             "no box gives a usable ray", where=log.name, hint="; ".join(ledger.lines()) or "the detections are empty"
         )
     cameras = tuple(c.camera for c in log.cameras)
     with _stage("solve", seconds, progress):
         errors = shared_errors(log, *seen_something(frames, rays), settings)
-        solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
+        try:
+            solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
+        except SolveError:
+            say(diagnosis, ledger)
+            raise
+    if settings.mode == "joint":
+        diagnosis = without_refuted(diagnosis, solution)
+    say(diagnosis, ledger)
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(c.camera for c in log.cameras)

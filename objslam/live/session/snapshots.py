@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from objslam.association.observations import Observations, extents
+from objslam.association.observations import MIN_DEPTH, Observations, extents
 from objslam.association.refinement import normalised_residuals
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import inverse, widest_angle
@@ -183,7 +183,7 @@ def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent:
     share = m.settings.rays.box_sigma
     if share == 0:
         return np.zeros((3, 3))
-    distance = np.linalg.norm(position - obs.origin, axis=1)
+    distance = np.maximum(np.linalg.norm(position - obs.origin, axis=1), MIN_DEPTH)
     size = np.full(len(at), np.sqrt(extent.prod())) / distance
     along = np.where(np.isfinite(obs.range), 1 / obs.range_sigma, 0.0)
     one = np.zeros(len(at), dtype=np.int64)

@@ -65,6 +65,11 @@ class Diagnosis:
         """Whether no position of the map can be relied on."""
         return any(finding.spoils for finding in self.findings)
 
+    @property
+    def refutable(self) -> bool:
+        """Whether a solve that explains the boxes may refute a finding."""
+        return any(finding.by_boxes for finding in self.findings)
+
     def with_findings(self, more: Sequence[Finding]) -> Self:
         """Return the diagnosis with more findings."""
         return replace(self, findings=(*self.findings, *more))
@@ -155,6 +160,8 @@ def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
                 "halves differ",
                 f"{100 * shares[0]:.0f} % of the rays fit in the first half of the log, {100 * shares[1]:.0f} % in the "
                 "second: the poses, the camera or the boxes of one half belong to something else",
+                by_boxes=True,
+                by_halves=True,
             )
         ]
     windows: tuple[Ints, ...] = tuple(
@@ -203,6 +210,8 @@ def _turned_cameras(
                     "camera moved",
                     f"{name} changes by {np.degrees(change):.1f} deg between the halves of the log: "
                     "somebody moved the camera on the robot",
+                    by_boxes=True,
+                    by_halves=True,
                 )
             )
     return results

@@ -76,7 +76,8 @@ def verdict(trials: list[Trial], part: Part) -> Finding | None:
     fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
-    return Finding(best.hypothesis.name, f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}")
+    message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
+    return Finding(best.hypothesis.name, message, by_boxes=not _is_crooked(first))
 
 
 def crooked(log: Log) -> bool:
