@@ -64,8 +64,9 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         except SolveError:
             say(diagnosis, ledger)
             raise
-    if settings.mode == "joint":
-        diagnosis = without_refuted(diagnosis, solution)
+    if settings.mode == "joint" and diagnosis.refutable:
+        with _stage("checks", seconds, progress):
+            diagnosis = without_refuted(diagnosis, solution, log, settings, progress)
     say(diagnosis, ledger)
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
