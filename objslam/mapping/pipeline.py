@@ -22,7 +22,6 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import seen_something, solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
-from objslam.mapping.checks.refuted import without_refuted
 from objslam.mapping.checks.residuals import check_residuals
 from objslam.mapping.checks.shared_errors import uncorrected
 from objslam.mapping.checks.verdict import say, widened
@@ -30,6 +29,7 @@ from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
+from objslam.mapping.refuted import without_refuted
 from objslam.mapping.uncorrected import uncorrected_residual
 
 

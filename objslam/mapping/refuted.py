@@ -53,9 +53,11 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
 def _refuted(
     finding: Finding, diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress
 ) -> bool:
+    explained = _least_explained(solution) >= _EXPLAINED and _noise(solution, rays_only=True) <= _NOISE
     if finding.by_halves:
-        return _halves_agree(solution)
-    if _least_explained(solution) >= _EXPLAINED and _noise(solution, rays_only=True) <= _NOISE:
+        # Where labels do not name the objects, an object that is there twice would explain the boxes of both halves.
+        return (explained and not solution.rounds) or _halves_agree(solution)
+    if explained:
         return True
     named = [t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == finding.name]
     if not named:
