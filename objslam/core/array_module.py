@@ -1,7 +1,7 @@
 """One code for numpy arrays and torch tensors: the functions whose names or arguments differ between the two libraries.
 
-Code for both calls functions of `module_of(array)`, which is numpy or torch. Both take `axis=` and positional arguments. torch
-is imported only for tensors.
+Code for both calls functions of `module_of(array)`, which is numpy or torch. Both take `axis=` and positional arguments.
+This module imports torch only to make tensors.
 """
 
 from __future__ import annotations

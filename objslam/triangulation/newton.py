@@ -10,7 +10,7 @@ from objslam.core.array_module import Tensor, as_single, as_type, module_of, tak
 from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetric
 
 _WEIGHTED_STEPS = 3
-"""The number of weighted least-squares steps before Newton's. Fewer leave outliers more weight (2 to 4 take the same time)."""
+"""The number of weighted least-squares steps before Newton's. Fewer leave outliers more weight."""
 _SMOOTHING = 0.05
 """The smoothing (in mean distances) of the weighted steps. A larger one weakens outliers less."""
 _SINGLE_STEPS = 5
@@ -21,6 +21,8 @@ _LINE_STEPS = 6
 """The number of Newton steps along the nearest line."""
 _SHORTER = 0.3
 """The factor for a step that did not lower the cost enough."""
+_SINGLE, _DOUBLE = 2.0**-23, 2.0**-52
+"""The relative distance between neighbouring numbers near 1, in single and in double precision."""
 _TINY = 1e-30
 """The least divisor, so that 0 / 0 gives 0."""
 
@@ -47,12 +49,13 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
         unsolved object may have a line through or near its solution, or no curvature.
     """
     xp = module_of(start)
-    epsilon = xp.finfo(start.dtype).eps
+    epsilon = _SINGLE if start.dtype == xp.float32 else _DOUBLE
     trial, point = start, start
     step, value = xp.zeros_like(start), xp.full_like(start[0], xp.inf)
     slope = xp.zeros_like(value)
     result, rest, solved = xp.zeros_like(start), xp.zeros_like(value), xp.zeros_like(value, dtype=xp.bool)
     live, taken = xp.arange(len(value), device=value.device), 0
+    count = lines.weight.sum(axis=0)
     while len(live):
         taken += 1
         q = lines.offset(trial)
@@ -67,7 +70,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
         step = xp.where(better, move, _SHORTER * step)
         size = norm(pull)
         # Rounding limits the gradient: an offset is exact to epsilon, and its direction to epsilon divided by its length.
-        limit = (lines.weight.sum(axis=0) + inverse.sum(axis=0)).clip(max=1e6)
+        limit = (count + inverse.sum(axis=0)).clip(max=1e6)
         done = better & (size <= 2 * epsilon * limit)
         number, last = int(done.sum()), taken == steps
         if last or 2 * number > len(done):
@@ -75,7 +78,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
             if last:
                 break
             going = ~done
-            lines, live = lines.select(going), live[going]
+            lines, live, count = lines.select(going), live[going], count[going]
             point, step, value, slope = point[:, going], step[:, going], value[going], slope[going]
         trial = point + step
     return result, rest, solved, taken
@@ -104,7 +107,7 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
     slope = dot(pull, axis)
     across = pull - slope * axis
     strength = norm(across)
-    solved = (abs(slope) <= 2 * xp.finfo(start.dtype).eps * limit) & (strength <= 1)
+    solved = (abs(slope) <= 2 * _DOUBLE * limit) & (strength <= 1)
     beside = across / strength.clip(min=_TINY)
     _, curvature, _ = _slopes(others, point, beside)
     begin = point - (strength - 1).clip(min=0) / curvature.clip(min=_TINY) * beside

@@ -22,8 +22,8 @@ from objslam.triangulation.lines import Lines
 from objslam.triangulation.point_to_lines import least_squares, minimise_distances
 
 _LARGE = 200_000
-"""The least number of rays for torch, which runs on CUDA if there is a card. Below it, numpy on one core is as fast, and spares
-the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
+"""The least number of rays for torch, which runs on CUDA if there is a card. Below it, numpy on one core is as fast, and
+spares the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
 
 
 @dataclass(frozen=True)
@@ -204,10 +204,10 @@ def _rays(origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, co
         raise ValueError(f"rays need (R,3) origins, (R,3) directions, (R,) objects, not {m.shape}, {n.shape}, {index.shape}")
     if not np.issubdtype(index.dtype, np.integer) or (len(index) and not -1 <= index.min() <= index.max() < count):
         raise ValueError(f"object_index must hold integers from -1 to {count - 1}")
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    if not (np.isfinite(m).all() and np.isfinite(length).all() and (length > 0).all()):
+    norm = np.sqrt(np.einsum("ri,ri->r", n, n))[:, None]
+    if not (np.isfinite(m).all() and np.isfinite(norm).all() and (norm > 0).all()):
         raise ValueError("rays need finite origins and directions of a length above 0")
-    return m, n / length, index.astype(np.int64)
+    return m, n / norm, index.astype(np.int64)
 
 
 def _vector(values: ArrayLike, length: int, name: str) -> Floats:
@@ -230,10 +230,13 @@ def _bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, backend: Backend
 ) -> tuple[Ints, Tensor, Bundle]:
     """Return the indices of the rays with an object, the mean ray origin (N, 3) of each object, and their bundle."""
-    where = np.argsort(index, stable=True)
-    where = where[np.searchsorted(index[where], 0) :]
-    origin, direction, noise, objects = (as_tensor(v[where], backend) for v in (m, n, sigma, index))
-    number = as_tensor(np.bincount(index[where], minlength=count), backend)
+    where = np.arange(len(index))
+    if len(index) and (index[0] < 0 or (index[1:] < index[:-1]).any()):
+        where = np.argsort(index, stable=True)
+        where = where[np.searchsorted(index[where], 0) :]
+        m, n, sigma, index = m[where], n[where], sigma[where], index[where]
+    origin, direction, noise, objects = (as_tensor(v, backend) for v in (m, n, sigma, index))
+    number = as_tensor(np.bincount(index, minlength=count), backend)
     base = group_sum(origin, objects, count) / number[:, None]
     return where, base, Bundle(origin - base[objects], direction, noise, position_sigma, objects, number)
 

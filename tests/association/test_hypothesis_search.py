@@ -52,7 +52,9 @@ def test_points_are_found_among_three_times_as_many_strays():
     centre = rng.uniform([20, 20], [620, 460], (540, 2))
     box = np.column_stack([centre - 10, centre + 10])
     strays = rays_of_boxes(frame, box, np.zeros(540, dtype=np.int64), scene.cameras[0], ("cup",), 2.0)
-    both = {k: np.concatenate([v, vars(strays)[k]]) for k, v in vars(scene.rays).items() if k != "label_names"}
+    both = {
+        k: np.concatenate([v, vars(strays)[k]]) for k, v in vars(scene.rays).items() if k != "label_names" and v is not None
+    }
     rays = type(strays)(**both, label_names=("cup",))
     found = discover(observed(scene, rays), SEARCH, np.random.default_rng(0))
     gaps = np.linalg.norm(found[:3, None] - THREE, axis=2)
