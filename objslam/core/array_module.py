@@ -72,6 +72,16 @@ def take_along(array: Tensor, index: Tensor, axis: int) -> Tensor:
     return module_of(array).take_along_dim(array, index, axis)
 
 
+def contiguous(array: Tensor) -> Tensor:
+    """Return an array with the same elements that lie in memory in the order of its axes."""
+    return np.ascontiguousarray(array) if isinstance(array, np.ndarray) else array.contiguous()
+
+
+def rows(array: Tensor, index: Tensor) -> Tensor:
+    """Return the rows of an array (R, C) at indices (...), as (..., C)."""
+    return array.take(index, axis=0) if isinstance(array, np.ndarray) else array[index]  # numpy's take is twice as fast.
+
+
 def group_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Return the sum (N,) or (N, C) of the values (R,) or (R, C) of each group. index: (R,) group of each value."""
     if not isinstance(values, np.ndarray):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from objslam.core.array_module import Tensor, as_type, module_of
+from objslam.core.array_module import Tensor, as_type, contiguous, module_of, rows
 from objslam.triangulation.bundle import Bundle
 
 _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # Where the nine entries of a symmetric matrix lie among its six.
@@ -47,18 +47,13 @@ def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, 
 
     The longer one of the axes n and B is contiguous in memory, because a pass over a short one is slow.
     """
+    wide = rays.shape[0] >= rays.shape[1]
     weight = as_type(real, bundle.origin)
-    if rays.shape[0] >= rays.shape[1]:
-        rays, weight = rays.T, weight.T
-        parts = [module_of(rays).moveaxis(values[rays], 2, 0) for values in (bundle.origin, bundle.direction)]
-        return _contiguous(parts[0]), _contiguous(parts[1]), _contiguous(weight)
-    parts = [module_of(rays).moveaxis(values[rays], 2, 0) for values in (bundle.origin, bundle.direction)]
-    return _contiguous(parts[0]).mT, _contiguous(parts[1]).mT, weight.T
-
-
-def _contiguous(array: Tensor) -> Tensor:
-    xp = module_of(array)
-    return xp.ascontiguousarray(array) if hasattr(xp, "ascontiguousarray") else array.contiguous()
+    rays, weight = (rays.T, weight.T) if wide else (rays, weight)
+    parts = [contiguous(module_of(rays).moveaxis(rows(values, rays), 2, 0)) for values in (bundle.origin, bundle.direction)]
+    parts.append(contiguous(weight))
+    origin, direction, weight = parts if wide else [part.mT for part in parts]
+    return origin, direction, weight
 
 
 def through(origin: Tensor, direction: Tensor, weight: Tensor) -> LineBlock:

@@ -13,7 +13,7 @@ _WEIGHTED_STEPS = 3
 """The number of weighted least-squares steps before Newton's. Fewer leave outliers more weight."""
 _SMOOTHING = 0.05
 """The smoothing (in mean distances) of the weighted steps. A larger one weakens outliers less."""
-_SINGLE_STEPS = 5
+_SINGLE_STEPS = 3
 """The most Newton steps in single precision, which takes half of the time. More do not improve a single-precision point."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line near its solution."""
