@@ -2,8 +2,8 @@
 
     python tools/bench_triangulation.py [--objects 1000] [--rays 50] [--outliers 0.2] [--device cpu]
 
-prints CPU time and rays per second of Eq. 1 in one batch, of scipy (BFGS with the analytic gradient, from the same start) and
-of Adam (torch), their ratios and how far apart the solutions are; then of the whole triangulation (consensus, covariance).
+prints CPU time and rays per second of Eq. 1 in one batch, of scipy (BFGS with the analytic gradient, from the same start),
+and of Adam (torch), their ratios and how far apart the solutions are; then of the whole triangulation.
 """
 
 from __future__ import annotations

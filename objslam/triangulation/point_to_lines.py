@@ -24,7 +24,7 @@ from objslam.triangulation.newton import approach, newton, off_nearest_line
 from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most rays in one block. Fewer need more calls, and torch pays more for a call. More leave the cache of a CPU, or
+"""The most rays in one block. Fewer need more calls, and torch pays more for a call. More leave a CPU cache, or
 need more memory on CUDA: 1 kB a ray. Measured for the CPU: four times as many take 1.1 (numpy) and 1.2 times (torch) as
 long. The number for CUDA was not measured."""
 _ROUNDS = 3
