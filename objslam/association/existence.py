@@ -9,6 +9,7 @@ from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger ones mean more similar rates.
@@ -95,12 +96,11 @@ def chance_odds(state: State, gate: float) -> Floats:
     Any two stray rays of a class define a point. The number of further strays in the gate of the point is Poisson
     distributed. Strays are the rays without a landmark, and the rays of landmarks with no more rays than this one.
     """
-    from scipy.stats import poisson
-
     strays = _no_stronger(state.ray_count, state.label) + state.unassigned[state.label]
     expected = strays * stray_share(state, gate)
     points = np.log(np.maximum(strays * (strays - 1) / 2, 1.0))
-    return np.asarray(np.clip(-points - poisson.logsf(state.ray_count - 3, expected), -_MOST_ODDS, _MOST_ODDS))
+    chance = np.log(np.maximum(poisson_tail(state.ray_count - 2, expected), 1e-300))
+    return np.clip(-points - chance, -_MOST_ODDS, _MOST_ODDS)
 
 
 def prior_odds(state: State) -> Floats:

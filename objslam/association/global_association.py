@@ -11,6 +11,7 @@ import numpy as np
 from objslam import config
 from objslam.association.existence import chance_odds, existence
 from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
+from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
@@ -20,7 +21,6 @@ from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
-from objslam.core.torch_threads import torch_device
 from objslam.core.types import Association, Keyframes, Rays
 
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
@@ -38,8 +38,8 @@ _FAR = 1e6  # The distance (m) from the first camera beyond which only parallel 
 
 @dataclass(frozen=True)
 class _Task:
-    """Constants of one association. gate: the largest squared deviation of a match. device: the torch device. seed: the seed
-    of the random ray pairs."""
+    """Constants of one association. gate: the largest squared deviation of a match. device: the setting
+    of `triangulation`. seed: the seed of the random ray pairs."""
 
     gate: float
     settings: config.AssociationSettings
@@ -77,8 +77,7 @@ def associate_globally(
     view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
-    device = torch_device(settings.triangulation.device)
-    task = _Task(gate_limit(settings.association.gate), settings.association, device, seed)
+    task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
     if guess is not None:
         association, position = guess
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
@@ -105,8 +104,6 @@ def associate_globally(
 
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
     """Add landmarks where unassigned rays of one label agree."""
-    from objslam.association.hypothesis_search import Search, discover
-
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))

@@ -1,16 +1,16 @@
-"""Search for points on which many rays of one label agree, from pairs of rays, in torch."""
+"""Search for points on which many rays of one label agree, from pairs of rays."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
+from objslam.core.array_backend import array_backend
+from objslam.core.array_module import Backend, Tensor, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Floats, Ints
-from objslam.core.torch_threads import one_torch_thread
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
+_LARGE = 1 << 26  # The least number of pairs of a ray and a point for torch. numpy is as fast, but cannot use CUDA.
 _DRAWS_EACH = 8  # The ray pairs drawn for each hypothesis, because most pairs do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
 _MIN_LEFT = 0.6  # The share of its support that better points must leave to a point. Else it waits for the next search.
@@ -24,7 +24,8 @@ _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried a
 class Search:
     """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: largest squared
     deviation of a ray that supports a point. parallax: least angle (rad) between the rays of a pair, or 0 to also try
-    distances along single rays. device: the torch device."""
+    distances along single rays. device: the setting
+    `triangulation.device`."""
 
     hypotheses: int
     support: float
@@ -33,7 +34,6 @@ class Search:
     device: str
 
 
-@one_torch_thread()
 def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
     """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
@@ -43,22 +43,28 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
     points = _propose(obs, search, rng)
     if len(points) == 0:
         return points
-    scorer = _Scorer(obs, search)
+    with array_backend(search.device, len(points) * len(obs) >= _LARGE) as backend:
+        return _best(_Scorer(obs, search, backend), points, search)
+
+
+def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
+    """Return the refined points (N, 3) m, out of (H, 3), that have enough support without the rays of better ones."""
     moved = scorer.load(points)
+    xp = module_of(moved)
     for _ in range(_REFINEMENTS):
         moved = scorer.refine(moved, scorer.supports(moved))
     support = scorer.supports(moved)
     whole = scorer.per_frame(support)
-    left, found = whole.clone(), []
+    left, found = 1 * whole, []
     for _ in range(len(moved)):
-        best = int(torch.where(left >= _MIN_LEFT * whole, left, 0.0).argmax())
+        best = int(xp.where(left >= _MIN_LEFT * whole, left, 0.0).argmax())
         if float(left[best]) < max(search.support, _MIN_LEFT * float(whole[best])):
             break
         found.append(best)
         taken = support[best] > scorer.doubt
-        left -= support[:, taken].sum(dim=1)
+        left -= support[:, taken].sum(axis=1)
         support[:, taken] = 0.0
-    return np.asarray(moved[found].double().cpu().numpy() + scorer.centre)
+    return as_numpy(moved[found]).astype(np.float64) + scorer.centre
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
@@ -106,15 +112,15 @@ class _Scorer:
     best support in each frame.
     """
 
-    def __init__(self, obs: Observations, search: Search) -> None:
+    def __init__(self, obs: Observations, search: Search, backend: Backend) -> None:
         _, frame, number = np.unique(obs.frame, return_inverse=True, return_counts=True)
         rank = np.arange(len(obs)) - (np.cumsum(number) - number)[frame]  # The rays of a frame are adjacent.
         self.slices = np.bincount(rank).tolist()
         obs = obs.take(np.lexsort((frame, -number[frame], rank)))
         self.centre = obs.origin.mean(axis=0)
         origin = obs.origin - self.centre
-        self.device = search.device
-        self.dtype = torch.float32 if np.abs(origin).max() < _SINGLE_EXTENT else torch.float64
+        self.backend = backend
+        self.dtype = np.float32 if np.abs(origin).max() < _SINGLE_EXTENT else np.float64
         n, zero, one = obs.direction, np.zeros(len(obs)), np.ones(len(obs))
         self.ahead = self._tensor(np.stack([*n.T, zero, -(n * origin).sum(axis=1)]))
         self.apart2 = self._tensor(np.stack([*(-2 * origin.T), one, (origin**2).sum(axis=1)]))
@@ -130,39 +136,48 @@ class _Scorer:
             self.doubt = 1 - _RANGE_SHARE  # A ray with less support may have a wrong range, or see an object behind.
 
     def _tensor(self, values: Floats) -> Tensor:
-        return torch.as_tensor(values, dtype=self.dtype, device=self.device).contiguous()
+        return as_tensor(np.ascontiguousarray(values, dtype=self.dtype), self.backend)
 
     def load(self, points: Floats) -> Tensor:
-        """Convert points (H, 3) in map to a tensor relative to the mean camera position."""
+        """Convert points (H, 3) in map to an array of the backend, relative to the mean camera position."""
         return self._tensor(points - self.centre)
 
     def supports(self, points: Tensor) -> Tensor:
         """Return the support (H, R) of each point by each ray. It falls with the squared deviation, from 1 for a perfect fit
         to 0 at the gate. A wrong range also reduces it."""
-        p = torch.cat([points, points.square().sum(1, keepdim=True), torch.ones_like(points[:, :1])], 1)
-        out = torch.empty((len(p), self.ahead.shape[1]), dtype=self.dtype, device=self.device)
+        xp = module_of(points)
+        p = xp.concat([points, (points**2).sum(axis=1)[:, None], xp.ones_like(points[:, :1])], axis=1)
+        out = xp.empty((len(p), self.ahead.shape[1]), dtype=p.dtype, device=p.device)
         step = max(1, _PAIRS_AT_ONCE // self.ahead.shape[1])
         for i in range(0, len(p), step):
-            depth = torch.mm(p[i : i + step], self.ahead).clamp_(min=1e-3)  # No ray supports a point behind its camera.
-            depth2 = depth.square()
-            part = torch.mm(p[i : i + step], self.apart2, out=out[i : i + step])
-            part.sub_(depth2).div_(depth2.mul_(self.slope).add_(self.floor)).neg_().add_(1).clamp_(min=0, max=1)
+            depth = (p[i : i + step] @ self.ahead).clip(min=1e-3)  # No ray supports a point behind its camera.
+            depth2 = depth * depth
+            part = xp.matmul(p[i : i + step], self.apart2, out=out[i : i + step])
+            part -= depth2
+            depth2 *= self.slope
+            depth2 += self.floor
+            part /= depth2
+            xp.clip(1 - part, 0.0, 1.0, out=part)
             if self.range is not None:
-                wrong = (depth - self.range[0]).mul_(self.range[1] / _RANGE_LIMIT).square_()
-                part.mul_(1 - wrong.mul_(_RANGE_SHARE).clamp_(max=_RANGE_SHARE))
+                wrong = (depth - self.range[0]) * (self.range[1] / _RANGE_LIMIT)
+                wrong *= wrong
+                part *= 1 - (_RANGE_SHARE * wrong).clip(max=_RANGE_SHARE)
         return out
 
     def per_frame(self, support: Tensor) -> Tensor:
         """Return the best support (H, R) in each frame, summed over the frames (H,)."""
-        best, at = support[:, : self.slices[0]].clone(), self.slices[0]
+        xp = module_of(support)
+        best, at = 1 * support[:, : self.slices[0]], self.slices[0]
         for width in self.slices[1:]:
-            torch.maximum(best[:, :width], support[:, at : at + width], out=best[:, :width])
+            xp.maximum(best[:, :width], support[:, at : at + width], out=best[:, :width])
             at += width
-        return best.sum(dim=1)
+        return best.sum(axis=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
         """Move points (H, 3) to the least-squares solution of their rays, but not along directions that these do not fix."""
+        xp = module_of(points)
         information = (support @ self.across).reshape(-1, 3, 3)
-        damping = (1e-3 * information.diagonal(dim1=1, dim2=2).sum(dim=1) + 1e-6)[:, None]
-        information = information + damping[:, :, None] * torch.eye(3, dtype=self.dtype, device=self.device)
-        return torch.linalg.solve(information, support @ self.foot + damping * points)
+        trace = information[:, 0, 0] + information[:, 1, 1] + information[:, 2, 2]
+        damping = (1e-3 * trace + 1e-6)[:, None]
+        information = information + damping[:, :, None] * xp.eye(3, dtype=points.dtype, device=points.device)
+        return xp.linalg.solve(information, (support @ self.foot + damping * points)[:, :, None])[:, :, 0]

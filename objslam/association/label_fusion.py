@@ -8,7 +8,7 @@ from objslam.association.existence import stray_share
 from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
 from objslam.core.arrays import Bools
-from objslam.core.statistics import grouped_median
+from objslam.core.statistics import grouped_median, poisson_tail
 
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object."""
@@ -22,8 +22,6 @@ def fused_labels(state: State, gate: float) -> Bools:
     An explained box lies on the landmark, in a frame in which the landmark has no box of its own. The explained boxes of a
     label must have the landmark's size. They must be more than strays would be, and fewer than the landmark's own boxes.
     """
-    from scipy.stats import poisson
-
     obs, accepts = state.obs, state.landmarks.accepts
     count, labels = accepts.shape
     free = obs.take(state.matched < 0)
@@ -38,6 +36,6 @@ def fused_labels(state: State, gate: float) -> Bools:
     size = grouped_median(np.sqrt(free.size[ray].prod(axis=1)) * away, pair, count * labels).reshape(count, labels)
     ratio = size / np.maximum(state.size, 1e-9)[:, None]
     expected = stray_share(state, gate)[:, None] * state.unassigned
-    surprising = poisson.sf(number - 1, expected) * max(count * labels, 1) < _MOST_BY_CHANCE
+    surprising = poisson_tail(number, expected) * max(count * labels, 1) < _MOST_BY_CHANCE
     few = (number >= _MIN_BOXES) & (number < state.ray_count[:, None])
     return np.asarray(accepts | (surprising & few & (ratio < SIZE_RATIO) & (ratio > 1 / SIZE_RATIO)))

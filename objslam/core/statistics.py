@@ -93,3 +93,13 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
     for share, result in zip(shares, results, strict=True):
         result[some] = ordered[begin + np.minimum((share * number).astype(np.int64), number - 1)]
     return results
+
+
+def poisson_tail(least: Ints, mean: Floats) -> Floats:
+    """Return the probability (N,) that a Poisson variable of this mean (N,) is at least `least` (N,).
+
+    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). An import of scipy.stats would take 0.3 s.
+    """
+    from scipy.special import gammainc
+
+    return np.where(least > 0, gammainc(np.maximum(least, 1), mean), 1.0)

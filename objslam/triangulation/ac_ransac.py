@@ -1,4 +1,4 @@
-"""Find which rays of an object agree, for many objects at once, in torch, by a-contrario consensus (AC-RANSAC).
+"""Find which rays of an object agree, for many objects at once, by a-contrario consensus (AC-RANSAC).
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
@@ -6,13 +6,20 @@ consensus is the subset of rays whose agreement is the least likely by chance (M
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
-from objslam.triangulation.point_to_lines import least_squares, minimise_distances, object_sum
+from objslam.core.array_module import (
+    Tensor,
+    as_single,
+    as_type,
+    group_sum,
+    indices_of,
+    length,
+    module_of,
+    sorted_last,
+    take_along,
+)
+from objslam.triangulation.bundle import Bundle
+from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
 """The view in which wrong boxes are uniformly distributed: a cone with 45 degrees half angle. Unit: 2 pi sr."""
@@ -20,61 +27,6 @@ _NOISE_SIGMAS = 3.0  # The standard deviations of noise below which a smaller de
 _MOST_NOISE = 0.25  # The largest share of the view for noise. A larger one lets very noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most alternations of Eq. 1 and selection, which end earlier once the agreement stops growing.
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """Rays of many objects, sorted by object. origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit.
-    sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each
-    ray. number: (N,) number of rays of each object."""
-
-    origin: Tensor
-    direction: Tensor
-    sigma: Tensor
-    position_sigma: float
-    index: Tensor
-    number: Tensor
-
-    def chunks(self, objects: Tensor, hypotheses: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into chunks of objects with similar numbers of rays. A chunk holds the
-        objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill the rows of objects
-        with fewer rays. hypotheses: the number of points to score per object. It limits the chunks."""
-        first = torch.cumsum(self.number, 0) - self.number
-        objects = objects[torch.argsort(self.number[objects], stable=True)]
-        while len(objects):
-            size = self.number[objects]
-            fits = torch.arange(1, len(objects) + 1, device=size.device) * size * hypotheses <= _PAIRS_AT_ONCE
-            end = max(1, int(fits.sum()))  # The sizes increase, so the fitting objects come first.
-            slot = torch.arange(int(size[end - 1]), device=size.device)
-            real = slot < size[:end, None]
-            yield objects[:end], first[objects[:end], None] + torch.where(real, slot, 0), real
-            objects = objects[end:]
-
-
-@dataclass(frozen=True)
-class PointSolution:
-    """Solutions of Eq. 1. point: (N, 3) m. determined: (N,) whether the rays fix the point. gradient: (N,) norm of the
-    gradient, NaN if they do not. iterations: the number of solver iterations."""
-
-    point: Tensor
-    determined: Tensor
-    gradient: Tensor
-    iterations: int
-
-
-def solve_points(bundle: Bundle, use: Tensor) -> PointSolution:
-    """Solve Eq. 1 on the rays in `use` (R,), starting at the least-squares points.
-
-    An object whose rays fix no point keeps the point of `least_squares` and gets a NaN gradient.
-    """
-    origin, direction, index = bundle.origin[use], bundle.direction[use], bundle.index[use]
-    point, determined = least_squares(origin, direction, index, len(bundle.number))
-    gradient = torch.full_like(point[:, 0], torch.nan)
-    rays = determined[index]
-    number = (torch.cumsum(determined, 0) - 1)[index[rays]]
-    solved = minimise_distances(origin[rays], direction[rays], number, point[determined])
-    point[determined], iterations, gradient[determined] = solved
-    return PointSolution(point, determined, gradient, iterations)
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
@@ -85,31 +37,32 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
     grows: select the rays that agree with the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all
     its rays. `hypotheses` and `jitter` are as in `best_pair`.
     """
-    used = torch.ones(len(bundle.origin), dtype=torch.bool, device=bundle.origin.device)
-    result = solve_points(bundle, used)
+    xp = module_of(bundle.origin)
+    used = xp.ones_like(bundle.index, dtype=xp.bool)
+    result = minimise_distances(bundle)
     inlier, log_nfa = consensus_about(bundle, result.point)
 
     def improve(candidate: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
         agreeing, nfa = consensus_about(bundle, candidate)
         better = objects & (nfa < log_nfa)
-        return torch.where(better[bundle.index], agreeing, inlier), torch.where(better, nfa, log_nfa)
+        return xp.where(better[bundle.index], agreeing, inlier), xp.where(better, nfa, log_nfa)
 
-    searched = torch.nonzero((bundle.number > 2) & ~_within_noise(bundle, result.point))[:, 0]
-    pair_point = result.point.clone()
+    searched = indices_of((bundle.number > 2) & ~_within_noise(bundle, result.point))
+    pair_point = xp.asarray(result.point, copy=True)
     pair_point[searched] = best_pair(bundle, searched, hypotheses, jitter)
     for candidate in (pair_point, _far_ahead(bundle)):
-        inlier, log_nfa = improve(candidate, torch.ones_like(result.determined))
-    alone = object_sum(inlier.to(log_nfa.dtype), bundle.index, len(log_nfa)) < 2
+        inlier, log_nfa = improve(candidate, xp.ones_like(result.determined))
+    alone = group_sum(as_type(inlier, log_nfa), bundle.index, len(log_nfa)) < 2
     inlier |= alone[bundle.index]
     for _ in range(_MAX_ROUNDS):
-        changed = object_sum((inlier != used).to(log_nfa.dtype), bundle.index, len(log_nfa)) > 0
-        if not changed.any():
+        changed = group_sum(as_type(inlier != used, log_nfa), bundle.index, len(log_nfa)) > 0
+        if not bool(changed.any()):
             break
-        again = solve_points(bundle, inlier & changed[bundle.index])
+        again = minimise_distances(bundle.select(inlier & changed[bundle.index]))
         result = PointSolution(
-            torch.where(changed[:, None], again.point, result.point),
-            torch.where(changed, again.determined, result.determined),
-            torch.where(changed, again.gradient, result.gradient),
+            xp.where(changed[:, None], again.point, result.point),
+            xp.where(changed, again.determined, result.determined),
+            xp.where(changed, again.gradient, result.gradient),
             result.iterations + again.iterations,
         )
         used = inlier
@@ -120,28 +73,28 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
 def _within_noise(bundle: Bundle, points: Tensor) -> Tensor:
     """Return for which objects (N,) all rays agree with the object's point within noise. No other point can score better."""
     to_point = points[bundle.index] - bundle.origin
-    distance = to_point.norm(dim=1).clamp(min=1e-12)
-    cos = (to_point * bundle.direction).sum(1) / distance
-    noise2 = bundle.sigma.square() + (bundle.position_sigma / distance).square()
+    distance = length(to_point).clip(min=1e-12)
+    cos = (to_point * bundle.direction).sum(axis=1) / distance
+    noise2 = bundle.sigma**2 + (bundle.position_sigma / distance) ** 2
     outside = 1 - cos > 0.5 * _NOISE_SIGMAS**2 * noise2
-    return object_sum(outside.to(cos.dtype), bundle.index, len(points)) == 0
+    return group_sum(as_type(outside, cos), bundle.index, len(points)) == 0
 
 
 def _far_ahead(bundle: Bundle) -> Tensor:
     """Return a point (N, 3) along the mean ray direction of each object, so far that all rays see it in one direction."""
     count = len(bundle.number)
-    reach = torch.zeros_like(bundle.number, dtype=bundle.origin.dtype)
-    reach = reach.scatter_reduce(0, bundle.index, bundle.origin.norm(dim=1), "amax").clamp(min=1.0)
-    heading = object_sum(bundle.direction, bundle.index, count)
-    return heading / heading.norm(dim=1, keepdim=True).clamp(min=1e-12) * 1e6 * reach[:, None]
+    reach = length(group_sum(bundle.origin**2, bundle.index, count)).clip(min=1.0)
+    heading = group_sum(bundle.direction, bundle.index, count)
+    return heading / length(heading)[:, None].clip(min=1e-12) * 1e6 * reach[:, None]
 
 
 def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
     """Return which rays (R,) agree with the point (N, 3) of their object, and the log NFA (N,) of this agreement. A log NFA
     below 0 means that the agreement is not by chance."""
-    inlier = torch.zeros(len(bundle.origin), dtype=torch.bool, device=points.device)
-    log_nfa = torch.full_like(points[:, 0], torch.inf)
-    for objects, rays, real in bundle.chunks(torch.nonzero(bundle.number)[:, 0], 1):
+    xp = module_of(points)
+    inlier = xp.zeros_like(bundle.index, dtype=xp.bool)
+    log_nfa = xp.full_like(points[:, 0], xp.inf)
+    for objects, rays, real in bundle.blocks(bundle.with_rays(), _PAIRS_AT_ONCE):
         chance = _chance(bundle, rays, real, points[objects, None])
         log_nfa[objects, None], limit = _least_chance(chance, bundle.number[objects])
         inlier[rays[real]] = ((chance[:, 0] <= limit) & (chance[:, 0] < 1))[real]
@@ -155,53 +108,56 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
     that many equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of this
     pair in its part. The result of an object depends on its own rays alone.
     """
-    points = bundle.origin.new_full((len(bundle.number), 3), torch.nan)
-    log_nfa = torch.full_like(points[:, 0], torch.inf)
-    for chunk, rays, real in bundle.chunks(objects, hypotheses):
-        step = max(1, _PAIRS_AT_ONCE // max(1, rays.numel()))
+    xp = module_of(bundle.origin)
+    points = xp.full((len(bundle.number), 3), xp.nan, dtype=bundle.origin.dtype, device=bundle.origin.device)
+    log_nfa = xp.full_like(points[:, 0], xp.inf)
+    for chunk, rays, real in bundle.blocks(objects, _PAIRS_AT_ONCE // hypotheses):
+        step = max(1, _PAIRS_AT_ONCE // max(1, math.prod(rays.shape)))
         for begin in range(0, hypotheses, step):
-            which = torch.arange(begin, min(begin + step, hypotheses), device=rays.device)
+            which = xp.arange(begin, min(begin + step, hypotheses), device=rays.device)
             first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
-            candidates, valid = _midpoints(bundle, rays.gather(1, first), rays.gather(1, second))
-            chance = _chance(bundle, rays, real, candidates).float()  # Single precision is enough for ranking, and faster.
-            nfa = _least_chance(chance, bundle.number[chunk])[0].double()
-            nfa = torch.where(valid & exists, nfa, torch.inf)
-            best = nfa.argmin(dim=1, keepdim=True)
-            lowest = nfa.gather(1, best)[:, 0]
+            candidates, valid = _midpoints(bundle, take_along(rays, first, 1), take_along(rays, second, 1))
+            chance = as_single(_chance(bundle, rays, real, candidates))  # This is enough for ranking, and faster.
+            nfa = as_type(_least_chance(chance, bundle.number[chunk])[0], points)
+            nfa = xp.where(valid & exists, nfa, xp.inf)
+            row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
+            lowest = nfa[row, best]
             better = lowest < log_nfa[chunk]
-            winner = candidates.gather(1, best[:, :, None].expand(-1, 1, 3))[:, 0]
-            points[chunk] = torch.where(better[:, None], winner, points[chunk])
-            log_nfa[chunk] = torch.minimum(lowest, log_nfa[chunk])
+            winner = candidates[row, best]
+            points[chunk] = xp.where(better[:, None], winner, points[chunk])
+            log_nfa[chunk] = xp.minimum(lowest, log_nfa[chunk])
     return points[objects]
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the pairs (B, H) of rays `first` < `second` of objects with `number` (B,) rays, and whether each pair exists.
     which: (H,) indices of the hypotheses, with their jitter (H,)."""
-    n = number[:, None].to(jitter.dtype)
+    xp = module_of(number)
+    n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2
-    rank = torch.where(pairs <= hypotheses, which, torch.floor((which + jitter) * (pairs / hypotheses)))
+    rank = xp.where(pairs <= hypotheses, which, xp.floor((which + jitter) * (pairs / hypotheses)))
     exists = rank < pairs
-    rank = torch.where(exists, rank, 0.0)
-    first = torch.floor(((2 * n - 1) - ((2 * n - 1) ** 2 - 8 * rank).clamp(min=0).sqrt()) / 2)
-    first = first - (first * (2 * n - first - 1) / 2 > rank).to(n.dtype)  # The root may be rounded up.
-    first = first + ((first + 1) * (2 * n - first - 2) / 2 <= rank).to(n.dtype)  # The root may be rounded down.
+    rank = xp.where(exists, rank, 0.0)
+    first = xp.floor(((2 * n - 1) - xp.sqrt(((2 * n - 1) ** 2 - 8 * rank).clip(min=0))) / 2)
+    first = first - as_type(first * (2 * n - first - 1) / 2 > rank, n)  # The root may be rounded up.
+    first = first + as_type((first + 1) * (2 * n - first - 2) / 2 <= rank, n)  # The root may be rounded down.
     second = rank - first * (2 * n - first - 1) / 2 + first + 1
-    last = (number[:, None] - 1).clamp(min=0)
-    return torch.minimum(first.long(), last), torch.minimum(second.long(), last), exists
+    last = (number[:, None] - 1).clip(min=0)
+    return xp.minimum(as_type(first, last), last), xp.minimum(as_type(second, last), last), exists
 
 
 def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have
     no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in
     numpy."""
+    xp = module_of(first)
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
     cos = (n1 * n2).sum(-1)
     a, b = (between * n1).sum(-1), (between * n2).sum(-1)
-    sin2 = torch.linalg.cross(n1, n2, dim=-1).square().sum(-1)
+    sin2 = (xp.linalg.cross(n1, n2) ** 2).sum(axis=-1)
     valid = sin2 > 1e-12
-    sin2 = torch.where(valid, sin2, 1.0)
+    sin2 = xp.where(valid, sin2, 1.0)
     along1, along2 = (a - cos * b) / sin2, (cos * a - b) / sin2
     one = bundle.origin[first] + along1[..., None] * n1
     two = bundle.origin[second] + along2[..., None] * n2
@@ -211,16 +167,17 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
     """Return the probability (B, H, n) that the ray of a wrong box is as close to the points (B, H, 3) as each ray is. It is
     1 for a ray that points away from the point, and for a ray that is not `real`."""
+    xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
-    distance2 = points.square().sum(-1)[..., None] - 2 * points @ origin.mT + origin.square().sum(-1)[:, None]
-    distance2 = distance2.clamp(min=1e-12)
-    noise2 = sigma.square()[:, None]
+    distance2 = (points**2).sum(-1)[..., None] - 2 * points @ origin.mT + (origin**2).sum(-1)[:, None]
+    distance2 = distance2.clip(min=1e-12)
+    noise2 = sigma[:, None] ** 2
     if bundle.position_sigma > 0:
         noise2 = noise2 + bundle.position_sigma**2 / distance2
-    floor = (0.5 * _NOISE_SIGMAS**2 / _VIEW_CAP * noise2).clamp(max=_MOST_NOISE)
-    chance = torch.maximum((1 - along * distance2.rsqrt()) / _VIEW_CAP, floor).clamp(max=1)
-    return torch.where(real[:, None], chance, 1.0)
+    floor = (0.5 * _NOISE_SIGMAS**2 / _VIEW_CAP * noise2).clip(max=_MOST_NOISE)
+    chance = xp.maximum((1 - along / xp.sqrt(distance2)) / _VIEW_CAP, floor).clip(max=1)
+    return xp.where(real[:, None], chance, 1.0)
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
@@ -230,10 +187,15 @@ def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.
     """
-    chance = chance.sort(dim=-1).values
-    n = number.to(chance.dtype)[:, None]
-    k = torch.arange(1, chance.shape[-1] + 1, device=chance.device, dtype=chance.dtype)
-    count = torch.lgamma(n + 1) - torch.lgamma((k - 1).clamp(min=1)) - torch.lgamma((n - k + 1).clamp(min=1)) - math.log(2)
-    count = torch.where((k >= 2) & (k <= n), count + (n - 2).clamp(min=1).log(), torch.inf)
-    log_nfa, share = (count[:, None] + (k - 1.5) * chance.log()).min(dim=-1)
-    return log_nfa, chance.gather(-1, share[..., None])[..., 0]
+    xp = module_of(chance)
+    chance = sorted_last(chance)
+    most = chance.shape[-1]
+    k = xp.arange(1, most + 1, device=chance.device)
+    n = number[:, None]
+    log = xp.log(xp.arange(most + 1, dtype=xp.float64, device=chance.device).clip(min=1))
+    factorial = xp.cumsum(log, 0)  # The logarithm of k! at k.
+    count = factorial[n] - factorial[(k - 2).clip(min=0)] - factorial[(n - k).clip(min=0)] - math.log(2)
+    count = xp.where((k >= 2) & (k <= n), count + log[(n - 2).clip(min=1)], xp.inf)
+    log_nfa = as_type(count, chance)[:, None] + as_type(k - 1.5, chance) * xp.log(chance)
+    share = log_nfa.argmin(axis=-1)[..., None]
+    return take_along(log_nfa, share, -1)[..., 0], take_along(chance, share, -1)[..., 0]

@@ -1,14 +1,13 @@
-"""Compute covariance and parallax of triangulated objects, and fuse rays with ranges, for many objects at once, in torch."""
+"""Compute covariance and parallax of triangulated objects, and fuse rays with ranges, for many objects at once."""
 
-import torch
-from torch import Tensor
-
+from objslam.core.array_module import Tensor, as_tensor, as_type, backend_of, group_sum, indices_of, length, module_of
 from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
-from objslam.triangulation.ac_ransac import Bundle
-from objslam.triangulation.point_to_lines import Lines, object_sum
+from objslam.triangulation.bundle import Bundle
+from objslam.triangulation.lines import Lines
 
 _EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
+_PLACES = 1 << 13  # The most places for rays of the objects that `parallax` compares together. A larger number needs memory.
 _RANGE_ITERATIONS = 30  # The iterations of the range fit, which starts at the median range. All objects take as many.
 
 
@@ -23,18 +22,19 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, where r_i is the
     length of the ray. The result includes the square of this bias.
     """
-    rays = _used(bundle, use)
+    xp = module_of(point)
+    rays = bundle.select(use)
     lines, index = Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point)), rays.index
-    distance = (point[index] - rays.origin).norm(dim=1)
+    distance = length(point[index] - rays.origin)
     s = _offset_sigma(rays, distance)
     a = lines.spread(0.5 * RAYLEIGH_MEAN / s)
-    b = lines.spread(torch.full_like(s, 0.5))
-    tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma.square() * distance / s)[:, None] * rays.direction)
-    factor = _variance_factor(lines.foot.norm(dim=1) / s, rays, 3)[:, None, None]
+    b = lines.spread(xp.full_like(s, 0.5))
+    tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma**2 * distance / s)[:, None] * rays.direction)
+    factor = _variance_factor(length(lines.foot) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a)
     bias = factor * (inverse @ tilt[:, :, None])  # The tilt grows with the noise, and the Hessian falls with it.
     result = factor * inverse @ b @ inverse + bias @ bias.mT
-    return torch.where(regular[:, None, None], result, torch.nan)
+    return xp.where(regular[:, None, None], result, xp.nan)
 
 
 def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,116 +45,117 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
     rays, because a range may belong to the background. `association.refinement.refine` is robust in both directions and
     gives no covariance.
     """
-    rays, count = _used(bundle, use), len(bundle.number)
+    xp = module_of(ranges)
+    rays, count = bundle.select(use), len(bundle.number)
     ranges, range_sigma = ranges[use], range_sigma[use]
-    known = ranges.isfinite()
+    known = xp.isfinite(ranges)
     typical = object_median(ranges[known], rays.index[known], count)
-    usual = torch.where(known, ranges, typical[rays.index])
+    usual = xp.where(known, ranges, typical[rays.index])
     s = _offset_sigma(rays, usual)
-    has = typical.isfinite()
-    measured = torch.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
+    has = xp.isfinite(typical)
+    measured = xp.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
     informed = has[rays.index]
-    lines = Lines.through(torch.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count)
-    weight = torch.where(informed, 1 / s.square(), 0.0)
+    lines = Lines.through(xp.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count)
+    weight = xp.where(informed, 1 / s**2, 0.0)
     across_matrix = lines.spread(weight)
     across_vector = lines.sum(weight[:, None] * lines.foot)
     # The start is the median range along the mean direction, because the rays alone leave this direction free.
-    heading = object_sum(rays.direction, rays.index, count)
-    heading = heading / heading.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    heading = group_sum(rays.direction, rays.index, count)
+    heading = heading / length(heading)[:, None].clip(min=1e-12)
     depth = object_median((measured * heading[rays.index]).sum(1)[known], rays.index[known], count)
-    depth = torch.where(has, depth, 0.0)
-    eye = torch.eye(3, dtype=s.dtype, device=s.device)
-    strength = across_matrix.diagonal(dim1=1, dim2=2).sum(1).clamp(min=1.0)
+    depth = xp.where(has, depth, 0.0)
+    eye = xp.eye(3, dtype=s.dtype, device=s.device)
+    strength = (across_matrix[:, 0, 0] + across_matrix[:, 1, 1] + across_matrix[:, 2, 2]).clip(min=1.0)
     pin = (strength[:, None] * heading)[:, :, None] * heading[:, None, :]
-    empty = (~has).to(s.dtype)[:, None, None] * eye
+    empty = as_type(~has, s)[:, None, None] * eye
 
     def along(weight: Tensor) -> Tensor:
         return lines.outer(weight[:, None] * rays.direction, rays.direction)
 
-    point = torch.linalg.solve(across_matrix + pin + empty, across_vector + (strength * depth)[:, None] * heading)
+    def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
+        return xp.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]
+
+    point = solve(across_matrix + pin + empty, across_vector + (strength * depth)[:, None] * heading)
     ends = (measured * rays.direction).sum(1)
     for _ in range(_RANGE_ITERATIONS):
         residual = ((point[rays.index] * rays.direction).sum(1) - ends) / range_sigma
-        robust = torch.where(known, 1 / (1 + (residual / CAUCHY_K).square()) / range_sigma.square(), 0.0)
+        robust = xp.where(known, 1 / (1 + (residual / CAUCHY_K) ** 2) / range_sigma**2, 0.0)
         target = across_vector + lines.sum((robust * ends)[:, None] * rays.direction)
-        point = torch.linalg.solve(across_matrix + along(robust) + empty, target)
+        point = solve(across_matrix + along(robust) + empty, target)
     # Ranges that scatter by more than their sigma count less.
-    scatter = object_median(residual.abs()[known], rays.index[known], count) / NORMAL_MEDIAN
-    along_matrix = along(robust / scatter.square().clamp(min=1)[rays.index])
-    factor = _variance_factor(lines.offset(point).norm(dim=1) / s, rays, 2)
+    scatter = object_median(abs(residual)[known], rays.index[known], count) / NORMAL_MEDIAN
+    along_matrix = along(robust / (scatter**2).clip(min=1)[rays.index])
+    factor = _variance_factor(length(lines.offset(point)) / s, rays, 2)
     inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
     regular &= has
-    return torch.where(regular[:, None], point, torch.nan), torch.where(regular[:, None, None], inverse, torch.nan)
+    return xp.where(regular[:, None], point, xp.nan), xp.where(regular[:, None, None], inverse, xp.nan)
 
 
 def largest_sigma(covariances: Tensor) -> Tensor:
     """Return the standard deviation (N,) m of each covariance (N, 3, 3) m^2 in its most uncertain direction. inf for NaN."""
-    known = covariances.isfinite().all(dim=2).all(dim=1)
-    variance = torch.linalg.eigvalsh(torch.where(known[:, None, None], covariances, 0.0))[:, 2].clamp(min=0)
-    return torch.where(known, variance.sqrt(), torch.inf)
+    xp = module_of(covariances)
+    known = xp.isfinite(covariances).all(axis=2).all(axis=1)
+    variance = xp.linalg.eigvalsh(xp.where(known[:, None, None], covariances, 0.0))[:, 2].clip(min=0)
+    return xp.where(known, xp.sqrt(variance), xp.inf)
 
 
 def reach(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     """Return the median distance (N,) m of each point (N, 3) from the origins of its rays in `use` (R,), or NaN."""
     index = bundle.index[use]
-    return object_median((point[index] - bundle.origin[use]).norm(dim=1), index, len(point))
+    return object_median(length(point[index] - bundle.origin[use]), index, len(point))
 
 
 def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     """Return whether each point (N, 3) lies ahead of more than half of its rays in `use` (R,)."""
     index = bundle.index[use]
-    towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1).sign()
-    return object_sum(towards, index, len(point)) > 0
+    towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1)
+    return group_sum(module_of(point).sign(towards), index, len(point)) > 0
 
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
     For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
-    rays = _used(bundle, use)
-    widest = torch.zeros(len(bundle.number), dtype=rays.direction.dtype, device=use.device)
-    axes = torch.from_numpy(evenly_spread(64)).to(rays.direction)
-    few = torch.nonzero((rays.number > 1) & (rays.number <= _EVERY_PAIR))[:, 0]
-    many = torch.nonzero(rays.number > _EVERY_PAIR)[:, 0]
-    for objects, members, real in (*rays.chunks(few, _EVERY_PAIR), *rays.chunks(many, len(axes))):
+    xp = module_of(bundle.direction)
+    rays = bundle.select(use)
+    widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
+    axes = as_tensor(evenly_spread(64), backend_of(rays.direction))
+    few = indices_of((rays.number > 1) & (rays.number <= _EVERY_PAIR))
+    many = indices_of(rays.number > _EVERY_PAIR)
+    for objects, members, real in (*rays.blocks(few, _PLACES), *rays.blocks(many, _PLACES)):
         direction = rays.direction[members]
         if members.shape[1] > _EVERY_PAIR:
-            towards = torch.where(real[:, :, None], direction @ axes.T, -torch.inf).argmax(dim=1)
-            direction = direction.gather(1, towards[:, :, None].expand(-1, -1, 3))
-            real = torch.ones_like(towards, dtype=torch.bool)
-        cos = (direction @ direction.mT).abs()
-        cos = torch.where(real[:, :, None] & real[:, None, :], cos, 1.0).flatten(1)
-        pair = cos.argmin(dim=1)
+            towards = xp.where(real[:, :, None], direction @ axes.T, -xp.inf).argmax(axis=1)
+            direction = direction[xp.arange(len(objects), device=towards.device)[:, None], towards]
+            real = xp.ones_like(towards, dtype=xp.bool)
+        cos = abs(direction @ direction.mT)
+        cos = xp.where(real[:, :, None] & real[:, None, :], cos, 1.0).reshape(len(objects), -1)
+        pair = cos.argmin(axis=1)
         n = direction.shape[1]
-        row = torch.arange(len(pair), device=pair.device)
+        row = xp.arange(len(pair), device=pair.device)
         one, two = direction[row, pair // n], direction[row, pair % n]
         # The arccos of a value near 1 would lose half of the digits.
-        widest[objects] = torch.atan2(torch.linalg.cross(one, two, dim=1).norm(dim=1), (one * two).sum(1).abs())
+        widest[objects] = xp.atan2(length(xp.linalg.cross(one, two)), abs((one * two).sum(axis=1)))
     return widest
 
 
 def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
     """Return the median (N,) of the values (R,) of each object. NaN without values. index: (R,) the object of each value.
     `core.statistics.grouped_median` returns the upper median in numpy."""
+    xp = module_of(values)
     if len(values) == 0:
-        return values.new_full((count,), torch.nan)
-    order = torch.argsort(values)
-    order = order[torch.argsort(index[order], stable=True)]
-    number = torch.bincount(index, minlength=count)
-    first = torch.cumsum(number, 0) - number
-    lower = (first + (number - 1).clamp(min=0) // 2).clamp(max=len(values) - 1)
-    upper = (first + number // 2).clamp(max=len(values) - 1)
-    return torch.where(number > 0, 0.5 * (values[order[lower]] + values[order[upper]]), torch.nan)
-
-
-def _used(bundle: Bundle, use: Tensor) -> Bundle:
-    number = torch.bincount(bundle.index[use], minlength=len(bundle.number))
-    position_sigma = bundle.position_sigma
-    return Bundle(bundle.origin[use], bundle.direction[use], bundle.sigma[use], position_sigma, bundle.index[use], number)
+        return xp.full((count,), xp.nan, dtype=values.dtype, device=values.device)
+    order = xp.argsort(values)
+    order = order[xp.argsort(index[order], stable=True)]
+    number = xp.bincount(index, minlength=count)
+    first = xp.cumsum(number, 0) - number
+    lower = (first + (number - 1).clip(min=0) // 2).clip(max=len(values) - 1)
+    upper = (first + number // 2).clip(max=len(values) - 1)
+    return xp.where(number > 0, 0.5 * (values[order[lower]] + values[order[upper]]), xp.nan)
 
 
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
     """Return the standard deviation (R,) m, along each perpendicular axis, of the offset between each ray and its object."""
-    return ((rays.sigma * distance).square() + rays.position_sigma**2).sqrt().clamp(min=1e-12)
+    return module_of(distance).sqrt((rays.sigma * distance) ** 2 + rays.position_sigma**2).clip(min=1e-12)
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
@@ -163,17 +164,18 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain.
     The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
     exact to 3 % from 4 rays on."""
-    number = rays.number.to(miss.dtype)
-    mean = object_sum(miss, rays.index, len(number)) / number.clamp(min=1) / RAYLEIGH_MEAN
-    rest = (2 * number - taken).clamp(min=1)
-    excess = mean.square() * 2 * number / rest - 1
-    return 1 + excess.clamp(min=0) * (1 + 3.2 / (rest - 2).clamp(min=1))
+    number = as_type(rays.number, miss)
+    mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN
+    rest = (2 * number - taken).clip(min=1)
+    excess = mean**2 * 2 * number / rest - 1
+    return 1 + excess.clip(min=0) * (1 + 3.2 / (rest - 2).clip(min=1))
 
 
 def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
     """Return the inverses of symmetric matrices (N, 3, 3), and which matrices are regular."""
-    eye = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-    finite = matrices.isfinite().all(dim=2).all(dim=1)
-    eigenvalues = torch.linalg.eigvalsh(torch.where(finite[:, None, None], matrices, eye))
+    xp = module_of(matrices)
+    eye = xp.eye(3, dtype=matrices.dtype, device=matrices.device)
+    finite = xp.isfinite(matrices).all(axis=2).all(axis=1)
+    eigenvalues = xp.linalg.eigvalsh(xp.where(finite[:, None, None], matrices, eye))
     regular = finite & (eigenvalues[:, 0] > 1e-10 * eigenvalues[:, 2]) & (eigenvalues[:, 2] > 0)
-    return torch.linalg.inv(torch.where(regular[:, None, None], matrices, eye)), regular
+    return xp.linalg.inv(xp.where(regular[:, None, None], matrices, eye)), regular

@@ -1,29 +1,29 @@
 """Triangulate all objects of a log at once from rays with known poses, by Eq. 1 of Staszak & Belter on the rays that agree.
 
-Inputs and outputs are numpy float64 arrays. The first call imports torch and the modules that use it, which takes long.
+Inputs and outputs are numpy float64 arrays. The work itself is done in numpy or, for a large batch, in torch.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam import config
+from objslam.core.array_backend import array_backend
+from objslam.core.array_module import Backend, Tensor, as_numpy, as_tensor, group_sum, length, module_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.status import is_resolved
-from objslam.core.torch_threads import one_torch_thread, torch_device
+from objslam.triangulation import ac_ransac
+from objslam.triangulation import covariance as spread_of
+from objslam.triangulation.bundle import Bundle
+from objslam.triangulation.lines import Lines
+from objslam.triangulation.point_to_lines import least_squares, minimise_distances
 
-if TYPE_CHECKING:
-    import torch
-
-    from objslam.triangulation.ac_ransac import Bundle
-
-_CUDA_PAYS = 200_000
-"""The least number of rays for which the device "auto" is CUDA. One CPU core solves Eq. 1 for 50,000 rays in 0.12 s and
-triangulates them in 0.6 s. For much fewer rays the start of CUDA alone takes longer. The best limit depends on the card."""
+_LARGE = 200_000
+"""The least number of rays for torch, which runs on CUDA if there is a card. Below it, numpy on one core is as fast, and
+spares the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,6 @@ class Triangulation:
     gradient: Floats
 
 
-@one_torch_thread()
 def triangulate(
     origins: ArrayLike,
     directions: ArrayLike,
@@ -83,63 +82,81 @@ def triangulate(
         ValueError: the arrays do not fit together or are not finite.
         ConfigError: the device does not exist.
     """
-    import torch
-
-    from objslam.triangulation import ac_ransac
-    from objslam.triangulation import covariance as spread_of
-
     m, n, index = _rays(origins, directions, object_index, count)
     noise = _positive(sigma, len(m), "sigma")
-    where, base, bundle = _bundle(m, n, index, count, noise, position_sigma, settings.device)
+    known = spread = None
+    if ranges is not None:
+        if range_sigma is None:
+            raise ValueError("ranges need their range_sigma")
+        known = _vector(ranges, len(m), "ranges")
+        spread = _positive(range_sigma, len(m), "range_sigma", known)
+    with array_backend(settings.device, len(m) >= _LARGE) as backend:
+        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, known, spread, backend)
+
+
+def _triangulate(
+    m: Floats,
+    n: Floats,
+    index: Ints,
+    count: int,
+    noise: Floats,
+    position_sigma: float,
+    settings: config.Triangulation,
+    seed: int,
+    ranges: Floats | None,
+    range_sigma: Floats | None,
+    backend: Backend,
+) -> Triangulation:
+    """Triangulate checked rays, as `triangulate` does."""
+    where, base, bundle = _sorted_bundle(m, n, index, count, noise, position_sigma, backend)
+    xp = module_of(base)
     if settings.consensus:
-        jitter = torch.from_numpy(np.random.default_rng(seed).random(settings.hypotheses)).to(base.device)
+        jitter = as_tensor(np.random.default_rng(seed).random(settings.hypotheses), backend)
         result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter)
         by_chance = log_nfa >= 0
     else:
-        use = torch.ones(len(where), dtype=torch.bool, device=base.device)
-        result = ac_ransac.solve_points(bundle, use)
-        by_chance = torch.zeros_like(result.determined)
+        use = xp.ones_like(bundle.index, dtype=xp.bool)
+        result = minimise_distances(bundle)
+        by_chance = xp.zeros_like(result.determined)
     point, gradient = result.point, result.gradient
     covariance = spread_of.covariance(bundle, use, point)
-    covariance = torch.where(result.determined[:, None, None], covariance, torch.nan)
+    covariance = xp.where(result.determined[:, None, None], covariance, xp.nan)
     angle = spread_of.parallax(bundle, use)
-    counts = torch.bincount(bundle.index[use], minlength=count)
+    counts = xp.bincount(bundle.index[use], minlength=count)
 
-    def resolved(point: torch.Tensor, covariance: torch.Tensor, ranged: torch.Tensor) -> torch.Tensor:
+    def resolved(point: Tensor, covariance: Tensor, ranged: Tensor) -> Tensor:
         sigma, reach = spread_of.largest_sigma(covariance), spread_of.reach(bundle, use, point)
         return is_resolved(sigma, reach, counts, angle, ranged, settings) & spread_of.lies_ahead(bundle, use, point)
 
-    carried = resolved(point, covariance, torch.zeros_like(by_chance))
-    if ranges is not None:
-        known = _vector(ranges, len(m), "ranges")
-        if range_sigma is None:
-            raise ValueError("ranges need their range_sigma")
-        spread = torch.from_numpy(_positive(range_sigma, len(m), "range_sigma", known)[where]).to(base.device)
-        measured = torch.from_numpy(np.where(known > 0, known, np.nan)[where]).to(base.device)
+    carried = resolved(point, covariance, xp.zeros_like(by_chance))
+    if ranges is not None and range_sigma is not None:
+        spread = as_tensor(range_sigma[where], backend)
+        measured = as_tensor(np.where(ranges > 0, ranges, np.nan)[where], backend)
         fused, fused_covariance = spread_of.fuse_ranges(bundle, use, measured, spread)
-        one_range = spread_of.object_median(spread[measured.isfinite()], bundle.index[measured.isfinite()], count)
-        taken = fused[:, 0].isfinite() & ~(carried & (spread_of.largest_sigma(covariance) <= one_range))
-        point = torch.where(taken[:, None], fused, point)
-        covariance = torch.where(taken[:, None, None], fused_covariance, covariance)
-        gradient = torch.where(taken, torch.nan, gradient)
+        ranged = xp.isfinite(measured)
+        one_range = spread_of.object_median(spread[ranged], bundle.index[ranged], count)
+        taken = xp.isfinite(fused[:, 0]) & ~(carried & (spread_of.largest_sigma(covariance) <= one_range))
+        point = xp.where(taken[:, None], fused, point)
+        covariance = xp.where(taken[:, None, None], fused_covariance, covariance)
+        gradient = xp.where(taken, xp.nan, gradient)
         carried = resolved(point, covariance, taken)
     weight = np.zeros(len(m))
-    weight[where] = use.double().cpu().numpy()
-    positions = (base + point).cpu().numpy()
+    weight[where] = as_numpy(use)
+    positions = as_numpy(base + point)
     distance, off = _miss(m, n, index, positions)
     total = np.bincount(index[weight > 0], off[weight > 0] ** 2, minlength=count)
-    number = counts.cpu().numpy()
+    number = as_numpy(counts)
     return Triangulation(
         positions=positions,
-        covariance=covariance.cpu().numpy(),
-        ok=(carried & ~by_chance).cpu().numpy(),
-        parallax=angle.cpu().numpy(),
+        covariance=as_numpy(covariance),
+        ok=as_numpy(carried & ~by_chance),
+        parallax=as_numpy(angle),
         rms=np.sqrt(np.divide(total, number, out=np.full(count, np.nan), where=number > 0)),
         distance=distance,
         weight=weight,
         counts=number,
         iterations=result.iterations,
-        gradient=gradient.cpu().numpy(),
+        gradient=as_numpy(gradient),
     )
 
 
@@ -151,12 +168,11 @@ def closed_form(
     Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then the point of the mean
     ray that lies 1 m ahead of the mean origin. It is NaN without rays.
     """
-    from objslam.triangulation import point_to_lines
-
     m, n, index = _rays(origins, directions, object_index, count)
-    _, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, device)
-    points, determined = point_to_lines.least_squares(bundle.origin, bundle.direction, bundle.index, count)
-    return (base + points).cpu().numpy(), determined.cpu().numpy()
+    with array_backend(device, len(m) >= _LARGE) as backend:
+        _, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, backend)
+        points, determined = least_squares(bundle)
+        return as_numpy(base + points), as_numpy(determined)
 
 
 def solve_eq1(
@@ -171,14 +187,11 @@ def solve_eq1(
         The points (N, 3) m, the number of iterations, and the norm (N,) of the gradient. The norm is NaN if the rays fix no
         point. If rays pass through the solution, it is the norm of the smallest subgradient. So 0 always proves the optimum.
     """
-    import torch
-
-    from objslam.triangulation import ac_ransac
-
     m, n, index = _rays(origins, directions, object_index, count)
-    where, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, device)
-    result = ac_ransac.solve_points(bundle, torch.ones(len(where), dtype=torch.bool, device=base.device))
-    return (base + result.point).cpu().numpy(), result.iterations, result.gradient.cpu().numpy()
+    with array_backend(device, len(m) >= _LARGE) as backend:
+        _, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, backend)
+        result = minimise_distances(bundle)
+        return as_numpy(base + result.point), result.iterations, as_numpy(result.gradient)
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int) -> tuple[Floats, Floats, Ints]:
@@ -191,10 +204,10 @@ def _rays(origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, co
         raise ValueError(f"rays need (R,3) origins, (R,3) directions, (R,) objects, not {m.shape}, {n.shape}, {index.shape}")
     if not np.issubdtype(index.dtype, np.integer) or (len(index) and not -1 <= index.min() <= index.max() < count):
         raise ValueError(f"object_index must hold integers from -1 to {count - 1}")
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    if not (np.isfinite(m).all() and np.isfinite(length).all() and (length > 0).all()):
+    norm = np.sqrt(np.einsum("ri,ri->r", n, n))[:, None]
+    if not (np.isfinite(m).all() and np.isfinite(norm).all() and (norm > 0).all()):
         raise ValueError("rays need finite origins and directions of a length above 0")
-    return m, n / length, index.astype(np.int64)
+    return m, n / norm, index.astype(np.int64)
 
 
 def _vector(values: ArrayLike, length: int, name: str) -> Floats:
@@ -214,27 +227,33 @@ def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None =
 
 
 def _bundle(
-    m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, device: config.Device
-) -> tuple[Ints, torch.Tensor, Bundle]:
+    m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, backend: Backend
+) -> tuple[Ints, Tensor, Bundle]:
     """Return the indices of the rays with an object, the mean ray origin (N, 3) of each object, and their bundle."""
-    import torch
+    where = np.arange(len(index))
+    if len(index) and (index[0] < 0 or (index[1:] < index[:-1]).any()):
+        where = np.argsort(index, stable=True)
+        where = where[np.searchsorted(index[where], 0) :]
+        m, n, sigma, index = m[where], n[where], sigma[where], index[where]
+    origin, direction, noise, objects = (as_tensor(v, backend) for v in (m, n, sigma, index))
+    number = as_tensor(np.bincount(index, minlength=count), backend)
+    base = group_sum(origin, objects, count) / number[:, None]
+    return where, base, Bundle(origin - base[objects], direction, noise, position_sigma, objects, number)
 
-    from objslam.triangulation import point_to_lines
-    from objslam.triangulation.ac_ransac import Bundle
 
-    where = np.flatnonzero(index >= 0)
-    place = torch_device(device, len(where) >= _CUDA_PAYS)
-    origin, direction, noise = (torch.from_numpy(v[where]).to(place) for v in (m, n, sigma))
-    number = torch.from_numpy(np.bincount(index[where], minlength=count)).to(place)
-    objects = torch.from_numpy(index[where]).to(place)
-    base = point_to_lines.object_sum(origin, objects, count) / number[:, None]
-    origin = origin - base[objects]
-    # The rays are sorted by their distance from the closed form. So the input order does not affect the tried pairs.
-    points, _ = point_to_lines.least_squares(origin, direction, objects, count)
-    order = torch.argsort(point_to_lines.Lines.through(origin - points[objects], direction, objects, count).foot.norm(dim=1))
-    order = order[torch.argsort(objects[order], stable=True)]
-    bundle = Bundle(origin[order], direction[order], noise[order], position_sigma, objects[order], number)
-    return where[order.cpu().numpy()], base, bundle
+def _sorted_bundle(
+    m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, backend: Backend
+) -> tuple[Ints, Tensor, Bundle]:
+    """Return the same as `_bundle`, but with the rays of each object sorted by their distance from the closed form. So the
+    input order does not affect the tried pairs."""
+    where, base, rays = _bundle(m, n, index, count, sigma, position_sigma, backend)
+    xp = module_of(rays.origin)
+    points, _ = least_squares(rays)
+    objects = rays.index
+    order = xp.argsort(length(Lines.through(rays.origin - points[objects], rays.direction, objects, count).foot))
+    order = order[xp.argsort(objects[order], stable=True)]
+    bundle = Bundle(rays.origin[order], rays.direction[order], rays.sigma[order], position_sigma, objects, rays.number)
+    return where[as_numpy(order)], base, bundle
 
 
 def _miss(m: Floats, n: Floats, index: Ints, positions: Floats) -> tuple[Floats, Floats]:

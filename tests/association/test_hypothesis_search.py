@@ -1,6 +1,7 @@
 """The search for points that rays agree on, and their refinement, against direct formulas."""
 
 import numpy as np
+import pytest
 import torch
 from association_scenes import rays_of_boxes, watch
 from scipy.optimize import least_squares
@@ -8,6 +9,7 @@ from scipy.optimize import least_squares
 from objslam.association.hypothesis_search import Search, _Scorer, discover
 from objslam.association.observations import observe
 from objslam.association.refinement import refine
+from objslam.core.array_module import as_numpy
 from objslam.core.geometry import lift_se2
 
 SEARCH = Search(hypotheses=256, support=3.0, gate=13.8, parallax=np.radians(2), device="cpu")
@@ -26,11 +28,12 @@ def observed(scene, rays=None, position_sigma=0.0):
 THREE = np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.1, -0.5, 0.5]])
 
 
-def test_supports_and_their_sums_over_frames_by_the_plain_formula():
+@pytest.mark.parametrize("backend", ["numpy", "cpu"])
+def test_supports_and_their_sums_over_frames_by_the_plain_formula(backend):
     obs = observed(watch(THREE, circle(40), pixel_sigma=3.0), position_sigma=0.01)
     rng = np.random.default_rng(0)
     points = np.concatenate([THREE, rng.uniform(-1, 1, (20, 3))])
-    scorer = _Scorer(obs, SEARCH)
+    scorer = _Scorer(obs, SEARCH, backend)
     support = scorer.supports(scorer.load(points))
     to = points[:, None] - obs.origin
     depth = np.einsum("hrj,rj->hr", to, obs.direction)
@@ -38,8 +41,8 @@ def test_supports_and_their_sums_over_frames_by_the_plain_formula():
     plain = np.clip(1 - offset2 / (SEARCH.gate * ((obs.sigma * depth) ** 2 + obs.position_sigma**2)), 0, 1) * (depth > 0)
     best = np.zeros((len(points), 40))
     np.maximum.at(best, (slice(None), obs.frame), plain)
-    np.testing.assert_allclose(scorer.per_frame(support).numpy(), best.sum(axis=1), rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(support.sum(dim=1).numpy(), plain.sum(axis=1), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(as_numpy(scorer.per_frame(support)), best.sum(axis=1), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(as_numpy(support.sum(axis=1)), plain.sum(axis=1), rtol=1e-3, atol=1e-3)
 
 
 def test_points_are_found_among_three_times_as_many_strays():
@@ -49,7 +52,9 @@ def test_points_are_found_among_three_times_as_many_strays():
     centre = rng.uniform([20, 20], [620, 460], (540, 2))
     box = np.column_stack([centre - 10, centre + 10])
     strays = rays_of_boxes(frame, box, np.zeros(540, dtype=np.int64), scene.cameras[0], ("cup",), 2.0)
-    both = {k: np.concatenate([v, vars(strays)[k]]) for k, v in vars(scene.rays).items() if k != "label_names"}
+    both = {
+        k: np.concatenate([v, vars(strays)[k]]) for k, v in vars(scene.rays).items() if k != "label_names" and v is not None
+    }
     rays = type(strays)(**both, label_names=("cup",))
     found = discover(observed(scene, rays), SEARCH, np.random.default_rng(0))
     gaps = np.linalg.norm(found[:3, None] - THREE, axis=2)
@@ -57,10 +62,14 @@ def test_points_are_found_among_three_times_as_many_strays():
     assert gaps.min(axis=1).max() < 0.02
 
 
-def test_threads_are_given_back():
+def test_torch_finds_the_same_points_and_gives_its_threads_back(monkeypatch):
+    obs = observed(watch(THREE, circle(20), pixel_sigma=1.0))
+    small = discover(obs, SEARCH, np.random.default_rng(0))
+    monkeypatch.setattr("objslam.association.hypothesis_search._LARGE", 0)
     before = torch.get_num_threads()
-    discover(observed(watch(THREE, circle(20))), SEARCH, np.random.default_rng(0))
+    large = discover(obs, SEARCH, np.random.default_rng(0))
     assert torch.get_num_threads() == before
+    np.testing.assert_allclose(large, small, rtol=0, atol=1e-3)  # single precision
 
 
 def test_refinement_is_the_least_of_the_robust_angles():

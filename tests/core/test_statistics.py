@@ -1,6 +1,7 @@
 """The numbers of statistics: each is what its sentence says, and has no second home."""
 
 import ast
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from scipy.stats import chi2, norm, rayleigh
 
 import objslam
 from objslam.core import statistics
-from objslam.core.statistics import grouped_median, grouped_quantile, noise_factors
+from objslam.core.statistics import grouped_median, grouped_quantile, noise_factors, poisson_tail
 
 
 def test_they_are_the_quantiles_that_they_say():
@@ -75,3 +76,9 @@ def test_the_noise_of_each_group_is_that_of_its_median_ray():
     deviations[500:600] = 100.0  # a fifth of one group fits nothing
     found = noise_factors(deviations, index, 5, fewest=6)
     np.testing.assert_allclose(found, [1.0, 1.1, 3.0, 1.0, 1.0], atol=0.2)
+
+
+def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
+    least, mean = np.array([-2, 0, 1, 2, 5, 3]), np.array([1.0, 0.0, 0.5, 3.0, 2.0, 0.0])
+    expected = [1 - sum(math.exp(-m) * m**k / math.factorial(k) for k in range(n)) for n, m in zip(least, mean, strict=True)]
+    np.testing.assert_allclose(poisson_tail(least, mean), expected, atol=1e-15)

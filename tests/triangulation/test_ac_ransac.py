@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from objslam import config
 from objslam.triangulation.ac_ransac import fit_consensus
-from objslam.triangulation.triangulate import _bundle, solve_eq1, triangulate
+from objslam.triangulation.triangulate import _sorted_bundle, solve_eq1, triangulate
 
 TOOLS = Path(__file__).parents[2] / "tools"
 SETTINGS = config.Triangulation()
@@ -28,12 +27,12 @@ def load_tool(name):
 def consensus(m, n, index, count, sigma, settings, seed=0):
     """Which rays (R,) agree on their object, and the log NFA (N,) of each object."""
     unit = n / np.linalg.norm(n, axis=1, keepdims=True)
-    where, _, bundle = _bundle(m, unit, index, count, np.full(len(m), sigma), 0.0, "cpu")
-    jitter = torch.from_numpy(np.random.default_rng(seed).random(settings.hypotheses))
+    where, _, bundle = _sorted_bundle(m, unit, index, count, np.full(len(m), sigma), 0.0, "numpy")
+    jitter = np.random.default_rng(seed).random(settings.hypotheses)
     _, use, nfa = fit_consensus(bundle, settings.hypotheses, jitter)
     inlier = np.zeros(len(m), dtype=bool)
-    inlier[where] = use.numpy()
-    return inlier, nfa.numpy()
+    inlier[where] = use
+    return inlier, nfa
 
 
 def log_nfa(point, m, n, sigma):

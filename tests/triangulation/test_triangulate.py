@@ -1,5 +1,8 @@
 """Positions with their covariance, what is called ok, and ranges: by simulation and in cases with a known answer."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -236,3 +239,40 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(ConfigError, match="CUDA"):
         triangulate([[0, 0, 0]], [[0, 0, 1]], [0], 1, 0.1, config.Triangulation(device="cuda"))
+
+
+@pytest.mark.parametrize("ranged", [False, True])
+def test_numpy_and_torch_agree(monkeypatch, ranged):
+    """A large batch goes to torch. It is the same code, so the results are the same up to rounding."""
+    rng = np.random.default_rng(12)
+    m, n, index, truth = approaching(rng, 30, 25, 0.004)
+    n[::5] += 0.5 * rng.normal(size=(150, 3))
+    index[::7] = -1
+    ranges = np.linalg.norm(truth - m, axis=1) + 0.05 * rng.normal(size=len(m)) if ranged else None
+
+    def results():
+        whole = triangulate(m, n, index, 31, 0.004, SETTINGS, ranges=ranges, range_sigma=0.05, position_sigma=0.01)
+        return whole, solve_eq1(m, n, index, 31)
+
+    small, eq1 = results()
+    monkeypatch.setattr("objslam.triangulation.triangulate._LARGE", 0)
+    large, eq1_large = results()
+    for name in ("ok", "weight", "counts"):
+        np.testing.assert_array_equal(getattr(large, name), getattr(small, name))
+    for name in ("positions", "parallax", "rms", "distance"):
+        np.testing.assert_allclose(getattr(large, name), getattr(small, name), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(large.covariance, small.covariance, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(eq1_large[0], eq1[0], rtol=0, atol=1e-10)
+    assert np.nanmax(eq1_large[2]) < 1e-9
+
+
+def test_a_small_batch_does_not_import_torch():
+    code = """
+import sys
+from objslam import config
+from objslam.triangulation.triangulate import triangulate
+rays = [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[1, 0, 3], [0, 0, 3], [-1, 0, 3.0]]
+assert triangulate(*rays, [0, 0, 0], 1, 0.01, config.Triangulation()).ok.all()
+sys.exit("torch" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

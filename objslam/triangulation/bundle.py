@@ -1,0 +1,60 @@
+"""The rays of many objects in one batch, and their division into dense blocks of objects with similar numbers of rays."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from objslam.core.array_module import Tensor, indices_of, module_of
+
+_SIMILAR = (2, 32)
+"""A block holds objects with up to a n + b rays, if its smallest has n. Larger values make fewer blocks with more filler.
+With these, half of a block is filler at worst, unless its objects have so few rays that filler costs nothing."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Rays of many objects, sorted by object. All arrays are numpy arrays, or all are torch tensors.
+
+    origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise along each
+    perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each ray. number: (N,) number of rays
+    of each object.
+    """
+
+    origin: Tensor
+    direction: Tensor
+    sigma: Tensor
+    position_sigma: float
+    index: Tensor
+    number: Tensor
+
+    def select(self, use: Tensor) -> "Bundle":
+        """Return the rays in the mask `use` (R,), of the same objects."""
+        if bool(use.all()):
+            return self
+        index = self.index[use]
+        number = module_of(index).bincount(index, minlength=len(self.number))
+        return Bundle(self.origin[use], self.direction[use], self.sigma[use], self.position_sigma, index, number)
+
+    def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Split objects, given by their indices, into blocks of at most `most` places for rays, or of one object.
+
+        A block holds the objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill
+        the rows of objects with fewer rays.
+        """
+        xp = module_of(self.number)
+        first = xp.cumsum(self.number, 0) - self.number
+        objects = objects[xp.argsort(self.number[objects], stable=True)]
+        size = self.number[objects]  # The sizes increase, so the fitting objects come first.
+        sizes = size.tolist()
+        begin = 0
+        while begin < len(sizes):
+            end, limit = begin + 1, _SIMILAR[0] * sizes[begin] + _SIMILAR[1]
+            while end < len(sizes) and sizes[end] <= limit and (end + 1 - begin) * sizes[end] <= most:
+                end += 1
+            slot = xp.arange(sizes[end - 1], device=self.number.device)
+            real = slot < size[begin:end, None]
+            yield objects[begin:end], first[objects[begin:end], None] + xp.where(real, slot, 0), real
+            begin = end
+
+    def with_rays(self) -> Tensor:
+        """Return the indices of the objects that have rays."""
+        return indices_of(self.number > 0)

@@ -1,0 +1,112 @@
+"""Lines of several objects in dense arrays, and small symmetric systems of all objects at once.
+
+The coordinates of a vector are the first axis and the objects the last one. So each operation is one pass over contiguous
+numbers, and a sum over the lines of an object needs no indices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from objslam.core.array_module import Tensor, as_type, contiguous, module_of, rows
+from objslam.triangulation.bundle import Bundle
+
+_FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # Where the nine entries of a symmetric matrix lie among its six.
+
+
+@dataclass(frozen=True)
+class LineBlock:
+    """Lines of B objects with up to n lines each. foot: (3, n, B) the point of each line nearest to the coordinate origin.
+    direction: (3, n, B) unit. weight: (n, B) 1 for a line, 0 for a filler."""
+
+    foot: Tensor
+    direction: Tensor
+    weight: Tensor
+
+    def offset(self, points: Tensor) -> Tensor:
+        """Return the perpendicular offset (3, n, B) from each line to the point (3, B) of its object."""
+        return perpendicular(points[:, None], self.direction) - self.foot
+
+    def spread(self, weight: Tensor) -> Tensor:
+        """Return the sum (6, B) of weight (n, B) times I - n n^T over the lines of each object with directions n."""
+        result = -outer(self.direction * weight, self.direction)
+        result[:3] += weight.sum(axis=0)
+        return result
+
+    def select(self, objects: Tensor) -> LineBlock:
+        """Return the lines of the objects in a mask (B,)."""
+        return LineBlock(self.foot[:, :, objects], self.direction[:, :, objects], self.weight[:, objects])
+
+    def scaled(self, scale: Tensor) -> LineBlock:
+        """Return the lines with feet multiplied by the scale (B,) of their object."""
+        return LineBlock(self.foot * scale, self.direction, self.weight)
+
+
+def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return origins (3, n, B), directions (3, n, B) and weights (n, B) of the rays (B, n) of a block of the bundle.
+
+    The longer one of the axes n and B is contiguous in memory, because a pass over a short one is slow.
+    """
+    wide = rays.shape[0] >= rays.shape[1]
+    weight = as_type(real, bundle.origin)
+    rays, weight = (rays.T, weight.T) if wide else (rays, weight)
+    parts = [contiguous(module_of(rays).moveaxis(rows(values, rays), 2, 0)) for values in (bundle.origin, bundle.direction)]
+    parts.append(contiguous(weight))
+    origin, direction, weight = parts if wide else [part.mT for part in parts]
+    return origin, direction, weight
+
+
+def through(origin: Tensor, direction: Tensor, weight: Tensor) -> LineBlock:
+    """Return the lines through points (3, n, B), in coordinates of their object, along unit directions (3, n, B)."""
+    # The first projection leaves a rounding error along the line of the size of the origin. The second removes it.
+    return LineBlock(perpendicular(perpendicular(origin, direction), direction), direction, weight)
+
+
+def perpendicular(vectors: Tensor, direction: Tensor) -> Tensor:
+    """Return the part (3, n, B) of vectors (3, n, B) that is perpendicular to the unit directions (3, n, B)."""
+    return vectors - direction * dot(vectors, direction)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Return the dot products (...) of vectors (3, ...)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def norm(vectors: Tensor) -> Tensor:
+    """Return the lengths (...) of vectors (3, ...)."""
+    return module_of(vectors).sqrt(dot(vectors, vectors))
+
+
+def outer(a: Tensor, b: Tensor) -> Tensor:
+    """Return the sums (6, B) of (a b^T + b a^T) / 2 over the lines of each object: xx, yy, zz, xy, xz, yz.
+
+    a, b: (3, n, B). `b` may be `a` times a weight, or any other vector.
+    """
+    xp = module_of(a)
+    diagonal = [(a[i] * b[i]).sum(axis=0) for i in range(3)]
+    pairs = ((0, 1), (0, 2), (1, 2))
+    return xp.stack(diagonal + [0.5 * (a[i] * b[j] + a[j] * b[i]).sum(axis=0) for i, j in pairs])
+
+
+def full(six: Tensor) -> Tensor:
+    """Return symmetric matrices (B, 3, 3) from their six entries (6, B)."""
+    return six[list(_FULL)].T.reshape(-1, 3, 3)
+
+
+def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x (3, B) with A x = b by Cramer's rule, and how regular A is: its determinant over the cube of its mean
+    eigenvalue, (B,), from 0 to 1. a: (6, B) positive semidefinite. b: (3, B). Where A is singular, x is useless."""
+    xx, yy, zz, xy, xz, yz = a
+    c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    determinant = xx * c0 + xy * c1 + xz * c2
+    c3, c4, c5 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    xp = module_of(a)
+    mean = (xx + yy + zz) / 3
+    regular = determinant / (mean * mean * mean).clip(min=1e-30)
+    x = xp.stack([dot((c0, c1, c2), b), dot((c1, c3, c4), b), dot((c2, c4, c5), b)])
+    return x / xp.where(determinant == 0, 1.0, determinant), regular
+
+
+def apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Return the products (3, B) of matrices (B, 3, 3) and vectors (3, B)."""
+    return (matrices @ vectors.T[:, :, None])[:, :, 0].T
