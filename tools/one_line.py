@@ -11,7 +11,7 @@ from objslam.errors import ObjslamError
 
 
 def end_with(main: Callable[[], None]) -> NoReturn:
-    """Run `main` and end the program. An ObjslamError is printed as one line on stderr, and its exit code is the program's."""
+    """Run `main` and end the program. An ObjslamError becomes one line on stderr and its exit code."""
     try:
         main()
     except ObjslamError as error:

@@ -88,6 +88,32 @@ def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
     assert session.snapshot().stamp == pytest.approx(result.keyframes.stamps.max())
 
 
+@pytest.mark.parametrize("classes", [12, 3])
+def test_an_object_keeps_its_id_to_the_end(classes):
+    """An id of the last snapshot is in the result the id of the same thing. The end associates the 3 labels once more."""
+    log = make_log(classes=classes)
+    session = drive(log)
+    shown = {o.id: o for o in session.snapshot().map.resolved()}
+    end = session.stop().map.objects
+    assert len({o.id for o in end}) == len(end)
+    kept = [(shown[o.id], o) for o in end if o.id in shown]
+    assert len(kept) >= 10
+    if classes == 3:  # counted anew, they would have other ids
+        assert [o.id for o in end] != list(range(len(end)))
+    for before, after in kept:
+        others = [o for o in end if o.label == before.label]
+        assert min(others, key=lambda o: np.linalg.norm(o.position - before.position)) is after
+
+
+def test_poses_that_the_settings_leave_unused_are_no_loss(log):
+    """They are counted apart from what is dropped."""
+    session = Session(load_settings(None, ("mode=joint", "poses.use=odometry")))
+    assert not session.push_localization(1.0, np.eye(4))
+    assert session.push_odometry(1.0, np.eye(4))
+    assert session.counters.accepted() == {"localization not used": 1, "odometry": 1}
+    assert not session.counters.dropped()
+
+
 @pytest.mark.parametrize("share", [0.5, 0.01, 1e-4])
 def test_the_status_is_asked_as_in_the_end(log, share):
     """An object that the end calls too uncertain for its distance, no snapshot called sure."""
