@@ -518,7 +518,7 @@ def test_fiducials_are_used_up_to_the_edge_as_offline(log, tmp_path):
         session.abort()
         kept = read(tmp_path / str(whole), Ledger())
         assert kept.cameras[0].detections.whole == whole
-        reason = "boxes cut off by the image's edge (rays.border)"
+        reason = "boxes cut off by the image's edge (rays.border, rays.border_share)"
         used[whole] = session.counters.dropped().get(reason, 0)
         for found in (cut, kept):
             offline = Ledger()
