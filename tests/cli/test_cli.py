@@ -323,7 +323,7 @@ def test_a_run_imports_what_it_uses(log_folder, tmp_path):
         (("--set", "seed=abc"), ("seed", "integer")),
         (("--set", "poses.max_gap=-1"), ("poses.max_gap", "greater than 0")),
         (("--set", "rays=[1"), ("not YAML",)),
-        (("--config", "no_such.yaml"), ("no_such.yaml", "No such file")),
+        (("--config", "no_such.yaml"), ("no_such.yaml", "no such file", "odometry, paper")),
         (("--format", "vhs"), ("vhs", "mrclam")),
     ],
 )
