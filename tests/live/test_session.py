@@ -84,6 +84,10 @@ def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
     assert len(off) >= 11
     assert max(off.values()) < 0.15
     assert result.summary["counts"]["detection_frames"] == 150
+    assert len(result.path_after) == len(log.odometry)
+    at = np.searchsorted(result.path_after.stamps, result.keyframes.stamps)
+    off = result.path_after.poses[np.minimum(at, len(log.odometry) - 1), :3, 3] - result.map_T_base[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).max() < 0.1  # the next pose of the path: less than a step further
     assert len(result.rays) == len(result.weight) == len(result.association.object)
     assert session.snapshot().stamp == pytest.approx(result.keyframes.stamps.max())
 

@@ -11,8 +11,10 @@ from scipy.optimize import linear_sum_assignment
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
-from objslam.core.types import Association, Trajectory
+from objslam.core.trajectory import correct_path
+from objslam.core.types import Association, Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
@@ -72,8 +74,19 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         settings=settings,
         cameras=cameras,
         path=Trajectory(stamps, keyframes.map_T_base[first]),
-        path_after=Trajectory(stamps, estimate.map_T_base[first]),
+        path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
+
+
+def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
+    """Return the recorded path at its full rate, corrected as the keyframes at `stamps` (K,) were to map_T_base (K, 4, 4).
+
+    It follows the odometry, where there is one, because the localisation jitters.
+    """
+    way = log.odometry or log.localization
+    assert way is not None  # without a path there is no keyframe
+    before, _ = interpolate(way.stamps, way.poses, np.clip(stamps, way.stamps[0], way.stamps[-1]), np.inf)
+    return correct_path(way, stamps, before, map_T_base)
 
 
 def _kept_ids(before: Association, ids: Ints, now: Association) -> list[int]:
