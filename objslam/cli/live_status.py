@@ -59,10 +59,11 @@ class _Rates:
         }
         shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
         resolved = len(snapshot.map.resolved())
+        found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
-            f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | {snapshot.keyframes} keyframes | {shown} | "
-            f"lag {1e3 * snapshot.lag:.0f} ms | {_lost(snapshot, ledger)} | {calibrated}{times(snapshot, '')}"
+            f"{found if snapshot.keyframes else ''}{shown} | {_lost(snapshot, ledger)} | lag {1e3 * snapshot.lag:.0f} ms | "
+            f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, '')}"
         ).rstrip(" |")
 
 
