@@ -11,11 +11,13 @@ import pytest
 from scipy.optimize import minimize
 
 from objslam.config import Settings, load_settings
+from objslam.config.presets import find_config, presets
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3
 from objslam.core.result import RunResult
 from objslam.core.types import Log, Trajectory, Truth
+from objslam.errors import ConfigError
 from objslam.evaluation.alignment import Alignment
 from objslam.evaluation.evaluate import ObjectScores, evaluate
 from objslam.mapping.pipeline import run
@@ -24,6 +26,19 @@ from objslam.simulation.settings import DepthNoise
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 NAMES = sorted(file.name for file in CONFIGS.glob("*.yaml"))
+
+
+def test_each_comes_with_the_package_and_is_taken_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The package has the same files. A file of that name in the working folder counts before them, a folder does not."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "paper").mkdir()
+    (tmp_path / "tags").write_text("mode: joint")
+    for name in NAMES:
+        word = name.removesuffix(".yaml")
+        found = find_config(Path(word))
+        assert found == Path("tags") if word == "tags" else found.read_bytes() == (CONFIGS / name).read_bytes()
+    with pytest.raises(ConfigError, match=f"no such file .ready settings: {', '.join(sorted(presets()))}"):
+        find_config(Path("nosuch"))
 
 
 @pytest.fixture(scope="module")

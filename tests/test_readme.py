@@ -79,7 +79,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
-    for result in ("demo_out/fixed", "demo_out/joint", "my_map", "out"):
+    for result in ("demo_boxes/fixed", "demo_boxes/joint", "my_map", "out"):
         assert (played / result / "map.png").is_file()
         assert (played / result / "recording.rrd").is_file()
     (cup,) = json.loads((played / "my_map" / "objects.json").read_text())["objects"]
@@ -95,7 +95,7 @@ def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
     assert (played / "out" / "objects.csv").is_file()
     assert (played / "out" / "map.mcap").is_file()
     assert json.loads((played / "map.geojson").read_text())["type"] == "FeatureCollection"
-    mapped = ObjectMap.load(played / "out"), ObjectMap.load(played / "demo_out" / "fixed")
+    mapped = ObjectMap.load(played / "out"), ObjectMap.load(played / "demo_boxes" / "fixed")
     both = ObjectMap.load(played / "both.json")
     assert max(map(len, mapped)) <= len(both) < sum(map(len, mapped))  # the same room twice
 
@@ -108,7 +108,7 @@ def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
         written |= {key for o in objects["objects"] for key in o}
     assert written <= fields
     assert fields - written <= {"ray"}  # no object was unresolved
-    results = {file.name for name in ("demo_out/joint", "my_map") for file in (played / name).iterdir()}
+    results = {file.name for name in ("demo_boxes/joint", "my_map") for file in (played / name).iterdir()}
     section = README.partition("## What comes out")[2]
     for name in results:
         assert f"`{name}`" in section, name
@@ -117,7 +117,7 @@ def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
 def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
     table = {row[1]: row for row in rows("drive")}
     for mode in ("fixed", "joint"):
-        evaluation = json.loads((played / "demo_out" / mode / "evaluation.json").read_text())
+        evaluation = json.loads((played / "demo_boxes" / mode / "evaluation.json").read_text())
         row = table[mode]
         assert row[2] == f"{evaluation['matched']} / {evaluation['matched'] + evaluation['missed']}"
         assert row[3] == str(evaluation["false"])

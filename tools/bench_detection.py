@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from one_line import end_with
 
 from objslam import config
 from objslam.core.camera import Camera
@@ -23,6 +24,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.detection import load_detector
 from objslam.detection.cache import DetectionCache, Entry
 from objslam.detection.detect_log import load_frame
+from objslam.errors import LogError
 
 PARTS = ("read and decode", "fit in", "network", "boxes from outputs", "write to cache")
 ENOUGH = 5.0  # ms that everything around the network may take
@@ -53,6 +55,9 @@ def main() -> None:
     detector = load_detector(args.model, config.Detector(threads=args.threads, min_score=args.min_score))
     camera = Camera("camera", args.width, args.height, np.eye(3))
     pictures = [cv2.imread(str(path)) for path in args.images] or [picture(args.width, args.height)]
+    for path, image in zip(args.images, pictures, strict=False):
+        if image is None:
+            raise LogError("not an image that can be read", where=str(path))
     rows, found = [], 0
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder, f"{i}.{args.format}") for i in range(len(pictures))]
@@ -90,4 +95,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    end_with(main)

@@ -21,12 +21,14 @@ import cv2
 import numpy as np
 import open3d as o3d
 from mesh_view import Picture, View, save
+from one_line import end_with
 
 from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, interpolate, make_pose
 from objslam.core.types import Log, Surface, Trajectory
+from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
 from objslam.mapping import pipeline
 from objslam.mapping.reconstruction import Grid, Lens, choose_shots, load_shot, reconstruct
@@ -145,6 +147,10 @@ def main() -> None:
     if args.fill:
         fill()
         return
+    for needed in (Path("log", "depth.txt"), *(Path(mode, "detections.jsonl") for mode in ("fixed", "joint"))):
+        if not (args.demo / needed).is_file():
+            hint = "`objslam demo` without --boxes makes one"
+            raise OutputError(f"no rendered demo here: {needed} is missing", where=str(args.demo), hint=hint)
     log, scene = read(args.demo / "log", Ledger()), true_room(args.seed)
     found = surfaces(log, args.demo)
     print(f"{'poses':<24}{'mean mm':>10}{'median mm':>11}{'95 % mm':>9}{'vertices':>10}")
@@ -175,4 +181,4 @@ def verdict(value: float, bar: float, unit: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    end_with(main)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from one_line import end_with
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -171,4 +172,4 @@ def session(view: LiveView | None, snapshot: Snapshot) -> Session:
 
 
 if __name__ == "__main__":
-    main()
+    end_with(main)

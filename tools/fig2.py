@@ -20,10 +20,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mesh_view import Picture, View, read_mesh, save
+from one_line import end_with
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject
 from objslam.core.types import Surface
+from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
 from objslam.results.files import SURFACE
 from objslam.results.read import load_map, load_rays
@@ -72,7 +74,13 @@ def main() -> None:
     parser.add_argument("--object", type=int, help="id; the one with the most rays if not given")
     parser.add_argument("-o", "--out", type=Path, default=Path("fig2.png"))
     args = parser.parse_args()
-    surface, objects, rays = read_mesh(args.result / SURFACE), load_map(args.result).resolved(), load_rays(args.result)
+    objects, rays = load_map(args.result).resolved(), load_rays(args.result)
+    if not (args.result / SURFACE).is_file():
+        hint = "a run writes it where the log has depth images: `objslam demo` without --boxes makes one"
+        raise OutputError("there is no reconstruction", where=str(args.result / SURFACE), hint=hint)
+    if not objects:
+        raise OutputError("no object of this map is resolved", where=str(args.result))
+    surface = read_mesh(args.result / SURFACE)
     named = {o.id: o for o in objects}
     if args.object is not None and args.object not in named:
         parser.error(f"there is no resolved object {args.object}")
@@ -127,4 +135,4 @@ def through(rays: RaysTable, i: int, o: MapObject, beyond: float) -> Floats:
 
 
 if __name__ == "__main__":
-    main()
+    end_with(main)

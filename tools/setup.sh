@@ -125,7 +125,8 @@ say "installing objslam and what it needs into .venv (the first time, this takes
 small_torch
 extras=
 [ "$want" = run ] || extras="[dev]"
-pip_install --editable "$root$extras" || die "pip could not install everything: see above (the network is needed for the first set-up)"
+# compat: a path that mypy and editors follow too; the default is an import hook that only Python sees
+pip_install --config-settings editable_mode=compat --editable "$root$extras" || die "pip could not install everything: see above (the network is needed for the first set-up)"
 problem=$("$venv/bin/python" -c 'import open3d' 2>&1) || die "Open3D cannot be imported: $(tail -n 1 <<<"$problem")"
 echo "$key $want" >"$stamp"
 say "done"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,11 +33,16 @@ def report(ledger: Ledger) -> None:
         say(f"warning: {line}", stderr=True)
 
 
+@functools.cache
 def console(stderr: bool = False) -> Console:
-    """Return a console with the width of the terminal, or with 120 columns if stdout is not a terminal."""
+    """Return the console of stdout or stderr, with the width of the terminal, or 120 columns if it is no terminal.
+
+    Each stream has one console, so that a line printed during a progress bar or status line does not mix with it.
+    """
     from rich.console import Console
 
-    return Console(stderr=stderr, highlight=False, width=None if sys.stdout.isatty() else 120)
+    stream = sys.stderr if stderr else sys.stdout
+    return Console(stderr=stderr, highlight=False, width=None if stream.isatty() else 120)
 
 
 def say(text: str, *, stderr: bool = False, markup: bool = False, end: str = "\n") -> None:

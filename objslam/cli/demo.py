@@ -9,12 +9,14 @@ import typer
 import objslam
 from objslam.cli.console import progress_bar, say
 from objslam.cli.evaluate import print_evaluation
-from objslam.cli.options import Out, settings_of
+from objslam.cli.options import settings_of
 from objslam.cli.run import run_log
 
 
 def demo(
-    out: Out = Path("demo_out"),
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for log and results. [default: demo_out, --boxes: demo_boxes]")
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random room and drive.")] = 0,
     boxes: Annotated[
         bool, typer.Option("--boxes", help="Simulate detector boxes without rendering images. This takes only seconds.")
@@ -31,6 +33,7 @@ def demo(
     from objslam.sources import read
     from objslam.sources.log_folder import write_log_folder
 
+    out = out or Path("demo_boxes" if boxes else "demo_out")
     prepare_output(out)
     log, model = out / "log", None
     mark = out / ".objslam-demo"  # This file marks a log that the demo may replace.

@@ -1,5 +1,6 @@
 """The command `objslam export`, which writes a result in the format of another tool."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -20,12 +21,18 @@ def export(
     to: Annotated[str, typer.Option("--to", metavar="|".join(FORMATS), help=_HELP)],
     file: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="The file to write. Default: the usual file name of the format, in OUT."),
+        typer.Option(
+            "-o", "--out", help="The file to write, - for stdout. Default: the usual file name of the format, in OUT."
+        ),
     ] = None,
     datum: Annotated[str | None, typer.Option("--datum", metavar="LAT,LON,HEADING", help=_DATUM_HELP)] = None,
 ) -> None:
     """Write the map of a result in the format of another tool."""
-    from objslam.output.export import write_export
+    from objslam.output.export import dump_export, write_export
     from objslam.output.export.content import Datum
 
-    say(f"wrote {write_export(out, to, file, None if datum is None else Datum.parse(datum))}")
+    place = None if datum is None else Datum.parse(datum)
+    if file == Path("-"):
+        sys.stdout.buffer.write(dump_export(out, to, place))
+        return
+    say(f"wrote {write_export(out, to, file, place)}")

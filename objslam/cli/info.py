@@ -78,12 +78,16 @@ def _show_bag(source: Path, options: SourceOptions) -> None:
 
 
 def _show_cameras(cameras: Iterable[Camera]) -> None:
+    from objslam.sources.camera_words import doubts_of, view_of
+
     for camera in cameras:
         fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
         say(
             f"camera {camera.name}: {camera.width}x{camera.height}, f {fx:.1f} {fy:.1f} px, {camera.distortion_model}, "
-            f"at {_place(camera.base_T_camera)} in base"
+            f"at {_place(camera.base_T_camera)} in base: {view_of(camera)}"
         )
+        for doubt in doubts_of(camera):
+            say(f"warning: {doubt}", stderr=True)
 
 
 def _place(pose: Floats) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import say
+from objslam.cli.console import progress_bar, say
 from objslam.cli.live_drive import LatestObjects, drive, finish
 from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
@@ -17,6 +17,7 @@ from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
 
 if TYPE_CHECKING:
+    from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
     from objslam.core.types import Log
 
@@ -70,7 +71,7 @@ def live(
     settings = settings_of("joint", config, set_, calibration)
     _say_what_is_not_used(source, options, speed, publish)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
-    recording = None if source in ADAPTERS else _read(Path(source), options)
+    recording = None if source in ADAPTERS else _read(Path(source), options, settings)
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)
@@ -110,11 +111,15 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
     """Warn of the given options that have no effect on a source. `sources.read` checks the options for recordings."""
     adapter = ADAPTERS.get(source)
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
+    if adapter is None:
+        taken |= {"detector"}
     for flag in unused(options, LiveOptions, taken) + (["--speed"] if adapter and speed != 1.0 else []):
         say(f"warning: {flag} has no meaning for {source if adapter else 'a recording'}", stderr=True)
 
 
-def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
+def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:
+    """Read a recording to replay. A detector finds its boxes first. LogError if the recording has no boxes then."""
+    from objslam.cli.run import find_boxes
     from objslam.core.diagnostics import Ledger
     from objslam.errors import LogError
     from objslam.sources import read
@@ -123,7 +128,13 @@ def _read(path: Path, options: SourceOptions) -> tuple[Log, Ledger]:
         hint = f"SOURCE is {', '.join(ADAPTERS)}, a log or a bag"
         raise LogError("there is no such recording", where=str(path), hint=hint)
     ledger = Ledger()
-    return read(path, ledger, options), ledger
+    log = read(path, ledger, options)
+    if options.detector is not None:
+        with progress_bar() as show:
+            log = find_boxes(log, options.detector, settings, ledger, show)
+    if all(camera_log.detections is None for camera_log in log.cameras):
+        raise LogError("the recording has no boxes to replay", where=str(path), hint="find them with --detector MODEL.onnx")
+    return log, ledger
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:

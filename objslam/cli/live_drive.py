@@ -77,7 +77,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
                     latest.write(snapshot)
                     for view in feed.views:
                         view(snapshot)
-                    show(snapshot)
+                    show(snapshot, feed.adapter.ledger)
         except Exception as error:  # noqa: BLE001 - raised by `finish` after the map is written
             broken = error
         stop.set()

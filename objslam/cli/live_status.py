@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -10,30 +11,34 @@ from typing import TYPE_CHECKING
 from objslam.cli.console import console, say
 
 if TYPE_CHECKING:
+    from objslam.core.diagnostics import Ledger
     from objslam.core.snapshot import Snapshot
 
 _LINES = 10.0  # The time in s between two status lines if stderr is not a terminal.
 
 
 @contextmanager
-def status_line() -> Iterator[Callable[[Snapshot], None]]:
-    """Yield a function that shows a snapshot in the status line on stderr. If stderr is not a terminal, the function prints
-    at most one line in ten seconds."""
+def status_line() -> Iterator[Callable[[Snapshot, Ledger], None]]:
+    """Yield a function that shows a snapshot, and the drops of the adapter, in the status line on stderr.
+
+    On a terminal, the line is cut to the width. Else the function prints at most one line in ten seconds.
+    """
     from rich.live import Live as Line
+    from rich.text import Text
 
     screen = console(stderr=True)
     rates = _Rates()
     if screen.is_terminal:
         with Line(console=screen, refresh_per_second=4, transient=True) as line:
-            yield lambda snapshot: line.update(rates.line(snapshot))
+            yield lambda *seen: line.update(Text(rates.line(*seen), no_wrap=True, overflow="ellipsis"))
         return
     printed = time.monotonic()
 
-    def print_line(snapshot: Snapshot) -> None:
+    def print_line(snapshot: Snapshot, ledger: Ledger) -> None:
         nonlocal printed
         if time.monotonic() - printed >= _LINES:
             printed = time.monotonic()
-            say(rates.line(snapshot), stderr=True)
+            say(rates.line(snapshot, ledger), stderr=True)
 
     yield print_line
 
@@ -44,7 +49,7 @@ class _Rates:
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
 
-    def line(self, snapshot: Snapshot) -> str:
+    def line(self, snapshot: Snapshot, ledger: Ledger) -> str:
         now, then, before = time.monotonic(), *self._before
         self._before = (now, snapshot.counters)
         rates = {
@@ -54,12 +59,22 @@ class _Rates:
         }
         shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
         resolved = len(snapshot.map.resolved())
+        found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
-            f"{shown} | lag {1e3 * snapshot.lag:.0f} ms | dropped {sum(snapshot.dropped.values())} | "
-            f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, ' | ')}"
-            f"{resolved} objects, {len(snapshot.map) - resolved} unresolved"
-        )
+            f"{found if snapshot.keyframes else ''}{shown} | {_lost(snapshot, ledger)} | lag {1e3 * snapshot.lag:.0f} ms | "
+            f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, '')}"
+        ).rstrip(" |")
+
+
+def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
+    """Return a text of how much was dropped, with the most frequent reason, and of how much the settings leave unused."""
+    from objslam.core.snapshot import NOT_USED
+
+    dropped = Counter(snapshot.dropped) + Counter(ledger.dropped)
+    reason = f" ({dropped.most_common(1)[0][0]})" if dropped else ""
+    unused = "".join(f", {n} {kind}" for kind, n in snapshot.counters.items() if kind.endswith(NOT_USED))
+    return f"dropped {dropped.total()}{reason}{unused}"
 
 
 def times(snapshot: Snapshot, then: str) -> str:

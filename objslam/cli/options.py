@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from objslam.config import Settings
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
-Config = Annotated[Path | None, typer.Option("--config", help="YAML file with settings.")]
+Config = Annotated[
+    Path | None, typer.Option("--config", help="YAML file with settings, or the name of ready settings, such as odometry.")
+]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting. May be repeated.")]
 Mode = Annotated[
     Literal["fixed", "joint"] | None,
@@ -46,9 +48,12 @@ def settings_of(mode: str | None, config: Path | None, set_: list[str] | None, c
     import yaml
 
     from objslam.config import load_settings
+    from objslam.config.presets import find_config
 
     more = () if calibration is None else (f"calibration.file={yaml.safe_dump(str(calibration.resolve()))}",)
-    settings = load_settings(config, ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ()))
+    settings = load_settings(
+        None if config is None else find_config(config), ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ())
+    )
     if settings.calibration.file is not None:
         from objslam.io.calibration_yaml import load_calibration
 

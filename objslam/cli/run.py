@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -12,12 +13,37 @@ from objslam.cli.options import CalibrationFile, Config, DetectorModel, Mode, Ou
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
+    from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
     from objslam.core.types import Log
+    from objslam.mapping.progress import Progress
+
+_COLUMNS: Final[dict[str, Callable[[MapObject], str]]] = {
+    "id": lambda o: str(o.id),
+    "label": lambda o: o.label,
+    "x m": lambda o: f"{o.position[0]:.3f}",
+    "y m": lambda o: f"{o.position[1]:.3f}",
+    "z m": lambda o: f"{o.position[2]:.3f}",
+    "sigma m": lambda o: "" if o.sigma is None else f"{o.sigma:.3f}",
+    "rays": lambda o: str(o.rays),
+    "parallax deg": lambda o: f"{o.parallax_deg:.1f}",
+    "rms deg": lambda o: f"{o.rms_deg:.2f}",
+    "status": lambda o: o.status,
+}
+"""The columns of the table of objects, each with the text of its cells."""
+_SPARE = (
+    "parallax deg",
+    "rms deg",
+    "rays",
+    "sigma m",
+    "status",
+)  # Columns that a narrow terminal leaves out, in this order.
+_WIDE = 10_000  # The width at which a table is measured, columns. It is larger than any table.
 
 
 @with_options
@@ -51,10 +77,7 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
 
     with progress_bar() as show:
         if detector is not None:
-            from objslam.detection import default_cache, detect_log, load_detector
-
-            network = load_detector(detector, settings.detector)
-            log = detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
+            log = find_boxes(log, detector, settings, ledger, show)
         result = pipeline.run(log, settings, ledger, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
@@ -65,19 +88,17 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
     say_result(result, f", {settings.mode} mode; {times}", out, removed)
 
 
+def find_boxes(log: Log, detector: Path, settings: Settings, ledger: Ledger, show: Progress) -> Log:
+    """Return the log with the boxes that a detector finds in its images, or found in an earlier run."""
+    from objslam.detection import default_cache, detect_log, load_detector
+
+    network = load_detector(detector, settings.detector)
+    return detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
+
+
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
     """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
-    from rich.table import Table
-
-    table = Table(title="objects")
-    for name in ("id", "label", "x m", "y m", "z m", "sigma m", "rays", "parallax deg", "rms deg", "status"):
-        table.add_column(name, justify="left" if name in ("label", "status") else "right")
-    for o in result.map.objects:
-        sigma = "" if o.sigma is None else f"{o.sigma:.3f}"
-        place = (f"{x:.3f}" for x in o.position)
-        numbers = (str(o.rays), f"{o.parallax_deg:.1f}", f"{o.rms_deg:.2f}")
-        table.add_row(str(o.id), o.label, *place, sigma, *numbers, o.status, style="dim" if o.status != "ok" else "")
-    console().print(table)
+    console().print(objects_table(result.map.objects, console()))
     if calibration := result.summary.get("calibration"):
         console().print(calibration_table(calibration))
     if noise := result.summary.get("noise"):
@@ -92,6 +113,26 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     if removed:
         say(f"removed the older result from {out}: {', '.join(removed)}")
     say(f"wrote {out}")
+
+
+def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
+    """Return a table of objects. The `_SPARE` columns that the screen has no room for are left out, so no number is cut."""
+    from rich.measure import Measurement
+    from rich.table import Table
+
+    names = list(_COLUMNS)
+    for spare in (None, *_SPARE):
+        if spare is not None:
+            names.remove(spare)
+        table = Table(title="objects")
+        for name in names:
+            words = name in ("label", "status")
+            table.add_column(name, justify="left" if words else "right", overflow="fold")
+        for o in objects:
+            table.add_row(*(_COLUMNS[name](o) for name in names), style="dim" if o.status != "ok" else "")
+        if Measurement.get(screen, screen.options.update(max_width=_WIDE), table).maximum <= screen.width:
+            break
+    return table
 
 
 def calibration_table(calibration: dict[str, Any]) -> Table:

@@ -11,17 +11,24 @@ _EXAMPLES = 3  # The most examples that are kept for each reason. A larger numbe
 
 @dataclass
 class Ledger:
-    """Counts of dropped data by reason, examples of where each reason occurred first, and warnings of one line each."""
+    """Counts of dropped data by reason, out of how many where that is known, examples of where each reason occurred first,
+    and warnings of one line each."""
 
     dropped: dict[str, int] = field(default_factory=dict)
+    totals: dict[str, int] = field(default_factory=dict)
     examples: dict[str, list[str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
-    def drop(self, reason: str, count: int = 1, where: str | None = None) -> None:
-        """Count `count` more drops for a reason. where: the file:line or stamp, kept for the first few drops only."""
+    def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
+        """Count `count` more drops for a reason, out of `of` more data that were looked at, if that is known.
+
+        where: the file:line or stamp, kept for the first few drops only.
+        """
+        reason = one_line(reason)
+        if of is not None:
+            self.totals[reason] = self.totals.get(reason, 0) + int(of)
         if count <= 0:
             return
-        reason = one_line(reason)
         self.dropped[reason] = self.dropped.get(reason, 0) + int(count)
         places = self.examples.setdefault(reason, [])
         if where is not None and len(places) < _EXAMPLES and (place := one_line(where)) not in places:
@@ -36,7 +43,7 @@ class Ledger:
     def add(self, other: Ledger) -> None:
         """Add the counts and warnings of another ledger, with the first example of each reason."""
         for reason, count in other.dropped.items():
-            self.drop(reason, count, next(iter(other.examples.get(reason, [])), None))
+            self.drop(reason, count, next(iter(other.examples.get(reason, [])), None), other.totals.get(reason))
         for message in other.warnings:
             self.warn(message)
 
@@ -44,6 +51,7 @@ class Ledger:
         """Return each drop and then each warning as one line of text."""
         lines = []
         for reason, count in self.dropped.items():
-            places = self.examples.get(reason)
-            lines.append(f"dropped {count}: {reason}" + (f" (first: {', '.join(places)})" if places else ""))
+            places, total = self.examples.get(reason), self.totals.get(reason)
+            share = f" of {total} ({100 * count / total:.0f} %)" if total else ""
+            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {', '.join(places)})" if places else ""))
         return lines + self.warnings

@@ -11,6 +11,8 @@ from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 
+NOT_USED = " not used"  # The end of the kinds in `Snapshot.counters` whose messages the settings leave unused.
+
 
 @dataclass(frozen=True)
 class CameraFrame:

@@ -104,10 +104,10 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     if of.border >= 0 and not whole:
         border = np.maximum(of.border, of.border_share * (high - low))
         cut = (low <= border) | (high >= size - 1 - border)
-        wrong["boxes cut off by the image's edge (rays.border)"] = cut.any(axis=1)
+        wrong["boxes cut off by the image's edge (rays.border, rays.border_share)"] = cut.any(axis=1)
     left = np.ones(len(boxes), dtype=bool)
     for reason, bad in wrong.items():
-        ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}")
+        ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}", of=len(boxes))
         left &= ~bad
     return np.flatnonzero(left)
 

@@ -31,6 +31,14 @@ class Calibration:
     placed: bool
 
 
+@dataclass(frozen=True)
+class Mount:
+    """Where a camera sits on the robot, from a file that says no more of it. name: "" if the file has no name."""
+
+    name: str
+    base_T_camera: Floats
+
+
 def read_camera(
     path: Path, ledger: Ledger, *, name: str | None = None, place_needed: bool = True, depth_scale: float = 1000.0
 ) -> Camera:
@@ -44,14 +52,38 @@ def read_camera(
 
 
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
-    """Read one camera, or several named cameras under the key `cameras`. Raises LogError with the line of an error."""
+    """Read one camera, or several named cameras under the key `cameras`. Raises LogError with the line of an error.
+
+    Cameras of which the file says only base_T_camera are left to `read_mounts`.
+    """
+    return tuple(_read(path, keys, ledger, name) for name, keys in _sections(path) if not _only_mount(keys))
+
+
+def read_mounts(path: Path) -> tuple[Mount, ...]:
+    """Read the cameras of a file for `read_calibrations` of which it says only base_T_camera, and perhaps the name."""
+    named = [(name, keys) for name, keys in _sections(path) if _only_mount(keys)]
+    return tuple(
+        Mount(
+            name or (_text(path, keys["camera_name"], "camera_name") if "camera_name" in keys else ""),
+            _pose(path, keys["base_T_camera"]),
+        )
+        for name, keys in named
+    )
+
+
+def _sections(path: Path) -> list[tuple[str | None, _Mapping]]:
+    """Return the name and the keys of each camera in a file. A single camera has no name here."""
     top = _load(path, read_bytes(path), "the file")
     if _CAMERAS not in top:
-        return (_read(path, top, ledger),)
+        return [(None, top)]
     cameras = _mapping(path, top[_CAMERAS], _CAMERAS)
     if not cameras:
         raise _error(path, top[_CAMERAS], "no camera in it")
-    return tuple(_read(path, _mapping(path, node, f"{_CAMERAS}.{name}"), ledger, name) for name, node in cameras.items())
+    return [(name, _mapping(path, node, f"{_CAMERAS}.{name}")) for name, node in cameras.items()]
+
+
+def _only_mount(keys: _Mapping) -> bool:
+    return "base_T_camera" in keys and set(keys) <= {"base_T_camera", "camera_name"}
 
 
 def _read(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from objslam.core.types import MAX_BOXES, Detections
 from objslam.errors import LogError
 from objslam.io.box_collector import BoxCollector
 from objslam.io.text import read_lines
+
+_EXAMPLE = 'a line is {"stamp": 12.5, "boxes": [[x1, y1, x2, y2]], "labels": ["cup"], "scores": [0.9]}'
 
 
 class Malformed(ValueError):
@@ -26,16 +29,21 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
-    whole = True
+    whole, reasons = True, Counter[str]()
     for number, text in lines:
         place = f"{path}:{number}"
         try:
             whole &= add_frame(parse_object(text), place, collector)
         except Malformed as malformed:
             ledger.drop(f"detection frame malformed: {malformed}", where=place)
+            reasons[str(malformed)] += 1
     if not collector.stamps:
-        state = f"none of its {len(lines)} lines is a detection frame" if lines else "no detection frame in it"
-        raise LogError(state, where=str(path), hint="remove this file, and run a detector on rgb.txt (--detector)")
+        if not lines:
+            hint = "remove this file, and run a detector on rgb.txt (--detector)"
+            raise LogError("no detection frame in it", where=str(path), hint=hint)
+        why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
+        hint = "a list holds all of them: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE
+        raise LogError(f"none of its {len(lines)} lines is a detection frame{why}", where=str(path), hint=hint)
     return replace(collector.checked(ledger), whole=whole)
 
 
@@ -84,6 +92,8 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
     boxes = _list(frame, "boxes")
     if len(boxes) > MAX_BOXES:
         raise Malformed(f"more than {MAX_BOXES} boxes")
+    if any(type(box) is not list for box in boxes):
+        raise Malformed("boxes holds no lists x1, y1, x2, y2")
     boxes = [read_numbers(box, "a box") for box in boxes]
     labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
     unknown = [None] * len(boxes)

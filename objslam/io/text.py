@@ -83,13 +83,19 @@ def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]
 
 
 def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
-    """Read a text file in which each line has `columns` numbers, separated by white space. Raises LogError if none is valid.
+    """Read a text file in which each line has `columns` numbers, separated by white space, as `to_table` does."""
+    return to_table(read_lines(path, ledger), path, columns, ledger, what)
+
+
+def to_table(
+    numbered: Sequence[tuple[int, str]], path: Path, columns: int, ledger: Ledger, what: str, form: str = ""
+) -> Table:
+    """Return the table of lines from `read_lines` that have `columns` numbers each. Raises LogError if none is valid.
 
     Lines with another number of columns or a value that is not finite are dropped and counted. `what` is the name of such a
-    line in the drop reason, such as "pose".
+    line in the drop reason, such as "pose". `form` is the names of the columns for the error.
     """
     values, places = [], []
-    numbered = read_lines(path, ledger)
     for row, (line, text) in enumerate(numbered):
         numbers = parse_numbers(text.split())
         if numbers is None or len(numbers) != columns:
@@ -102,7 +108,7 @@ def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
     table = select(table, finite, f"{what} line with a value that is not finite", path, ledger)
     if not len(table.lines):
         state = f"none of its {len(numbered)} lines is usable" if numbered else "nothing in it"
-        raise LogError(f"{state}; a {what} line is {columns} numbers", where=str(path))
+        raise LogError(f"{state}; a {what} line is {form or f'{columns} numbers'}", where=str(path))
     return table
 
 

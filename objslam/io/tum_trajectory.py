@@ -1,5 +1,9 @@
-"""Trajectories in TUM format. Each line is "stamp tx ty tz qx qy qz qw" or a comment after '#'."""
+"""Trajectories in TUM format. Each line is "stamp tx ty tz qx qy qz qw" or a comment after '#'.
 
+Other programs write commas and a header, and planar robots "stamp x y yaw". Both are read too.
+"""
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,22 +12,25 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.types import Trajectory
 from objslam.errors import LogError
-from objslam.io.text import Table, in_order, read_table, select
+from objslam.io.text import Table, in_order, parse_numbers, read_lines, select, to_table
 
-_HEADER = "# stamp tx ty tz qx qy qz qw\n"
+_COLUMNS, _PLANAR = "stamp tx ty tz qx qy qz qw", "stamp x y yaw"
+_HEADER = f"# {_COLUMNS}\n"
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
-    """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w.
+    """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w, a
+    yaw is in rad. Commas may separate the numbers, and the first line may name the columns.
 
-    Malformed lines, zero quaternions and poses out of time order are dropped and counted. Raises LogError if none is left.
+    Malformed lines, zero quaternions and poses out of time order are dropped and counted. Raises LogError if none is left,
+    or if the names of the columns are in another order.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
 
 def read_pose_table(path: Path, ledger: Ledger) -> Table:
     """Read a trajectory file as `read_trajectory` does, but return a table with its 8 columns."""
-    table = read_table(path, 8, ledger, "pose")
+    table = _read_numbers(path, ledger)
     with np.errstate(over="ignore"):
         length = np.linalg.norm(table.values[:, 4:], axis=1)
     turns = (length > 1e-6) & np.isfinite(length)
@@ -37,6 +44,24 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
         first = f"{path}:{table.lines[off][0]}"
         ledger.warn(f"{first}: {int(off.sum())} quaternions are not of length 1: are the columns tx ty tz qx qy qz qw?")
     return table
+
+
+def _read_numbers(path: Path, ledger: Ledger) -> Table:
+    """Return a table with 8 columns, also of a file with "stamp x y yaw". The first line with either number decides."""
+    lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
+    names = lines[0][1].split() if lines else []
+    if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):
+        if len(names) == 8 and not names[7].lower().endswith("w"):
+            raise LogError(f"its columns are {' '.join(names)}; they must be {_COLUMNS}", where=f"{path}:{lines[0][0]}")
+        lines = lines[1:]
+    counts = (len(text.split()) for _, text in lines if parse_numbers(text.split()) is not None)
+    columns = next((count for count in counts if count in (4, 8)), 8)
+    table = to_table(lines, path, columns, ledger, "pose", f"{_COLUMNS}, or {_PLANAR} of a planar robot")
+    if columns == 8:
+        return table
+    stamp, x, y, yaw = table.values.T
+    zero = np.zeros(len(stamp))
+    return replace(table, values=np.column_stack([stamp, x, y, zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)]))
 
 
 def to_trajectory(table: Table) -> Trajectory:

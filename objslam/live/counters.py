@@ -18,9 +18,9 @@ class _Guarded(Ledger):
         super().__init__()
         self._lock = lock
 
-    def drop(self, reason: str, count: int = 1, where: str | None = None) -> None:
+    def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
         with self._lock:
-            super().drop(reason, count, where)
+            super().drop(reason, count, where, of)
 
     def warn(self, message: str) -> None:
         with self._lock:

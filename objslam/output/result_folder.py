@@ -104,6 +104,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
     writers: dict[str, Callable[[Path], object]] = {
         files.OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
         files.TRAJECTORY: partial(write_trajectory, Trajectory(stamps, result.map_T_base[first])),
+        files.PATH: partial(write_trajectory, result.path_after),
         files.RAYS: lambda file: file.write_bytes(dump_rays(_rays_table(result))),
         files.CONFIG: lambda file: file.write_bytes(encode(dump_settings(result.settings))),
         files.SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),

@@ -9,6 +9,7 @@ import numpy as np
 
 OBJECTS = "objects.json"  # The map of objects.
 TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
+PATH = "path.txt"  # The pose map_T_base at each pose of the recorded path.
 RAYS = "rays.parquet"  # Each ray with its object.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
 CONFIG = "config.yaml"  # All settings of the run.
@@ -26,7 +27,7 @@ TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path of the log.
 GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in the files OBJECTS and TRAJECTORY.
 
 PARTS = (
-    *(OBJECTS, TRAJECTORY, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
+    *(OBJECTS, TRAJECTORY, PATH, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
     *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT),
 )
 """The files of a result, including the files of later commands. SUMMARY and exported files are not included."""

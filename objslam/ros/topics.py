@@ -6,6 +6,7 @@ from itertools import takewhile
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError
+from objslam.io.camera_yaml import Mount
 
 ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
 TF, NONE = "tf", "none"  # Words for --topic in place of a topic. TF: transforms supply the role. NONE: nothing does.
@@ -59,6 +60,12 @@ def closeness(a: str, b: str) -> int:
     """Return the number of leading name parts that two topics share."""
     pairs = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def mount_of(mounts: Sequence[Mount], frame: str, topic: str) -> Mount | None:
+    """Return the mount of the camera with a frame and a topic. A single mount without a name fits every camera."""
+    named = (mount for mount in mounts if mount.name and is_named(mount.name, frame, topic))
+    return next(named, mounts[0] if len(mounts) == 1 and not mounts[0].name else None)
 
 
 def is_named(camera: str, frame: str, topic: str) -> bool:

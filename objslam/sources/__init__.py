@@ -148,5 +148,7 @@ def choose(path: Path, name: str | None = None) -> Source:
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
     if (path / "objects.json").is_file() and (path / "summary.json").is_file():
         raise LogError("this is a result, not a log", where=str(path), hint="give its log, the log_path in summary.json")
+    from objslam.sources.unknown import unknown_recording
+
     looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)
-    raise LogError("nothing here that objslam reads", where=str(path), hint=f"looked for {looked_for}")
+    raise unknown_recording(path, lambda inner: any(source.detects(inner) for source in SOURCES), looked_for)

@@ -119,7 +119,16 @@ def test_the_console_script_runs_evaluates_and_leaves_a_whole_result(log_folder,
     assert run.code == 0, run.err
     assert "tall chair" in run.out
     assert "4 objects (0 unresolved)" in run.out
-    names = {"objects.json", "trajectory.txt", "rays.parquet", "summary.json", "config.yaml", "map.png", "recording.rrd"}
+    names = {
+        "objects.json",
+        "trajectory.txt",
+        "path.txt",
+        "rays.parquet",
+        "summary.json",
+        "config.yaml",
+        "map.png",
+        "recording.rrd",
+    }
     assert names | {"groundtruth_objects.json", "groundtruth_trajectory.txt"} == {f.name for f in out.iterdir()}
     assert all(f.stat().st_size > 0 for f in out.iterdir())
     evaluated = in_process_of_its_own("eval", out)
@@ -323,7 +332,7 @@ def test_a_run_imports_what_it_uses(log_folder, tmp_path):
         (("--set", "seed=abc"), ("seed", "integer")),
         (("--set", "poses.max_gap=-1"), ("poses.max_gap", "greater than 0")),
         (("--set", "rays=[1"), ("not YAML",)),
-        (("--config", "no_such.yaml"), ("no_such.yaml", "No such file")),
+        (("--config", "no_such.yaml"), ("no_such.yaml", "no such file", "odometry, paper")),
         (("--format", "vhs"), ("vhs", "mrclam")),
     ],
 )
@@ -666,7 +675,7 @@ def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
         ("objects.json", b"[]", "not an objects file"),
         ("objects.json", b"\xff\xfe", "not UTF-8 text"),
         ("objects.json", None, "missing"),
-        ("trajectory.txt", b"hello\n", "8 numbers"),
+        ("trajectory.txt", b"hello\n", "a pose line is stamp tx ty tz"),
         ("trajectory.txt", None, "missing"),
         ("groundtruth_objects.json", b'{"objects": [{"id": 1}]}', "objects[0]"),
         ("groundtruth_trajectory.txt", b"", "nothing in it"),

@@ -153,10 +153,11 @@ def test_every_unusable_box_is_counted_once():
     assert ledger.dropped == {
         "boxes below rays.min_score 0.5": 2,
         "boxes with their centre outside the image": 1,
-        "boxes cut off by the image's edge (rays.border)": 2,
+        "boxes cut off by the image's edge (rays.border, rays.border_share)": 2,
         "boxes where the lens model has no inverse": 1,
     }
     assert all("camera front" in line for line in ledger.lines())
+    assert ledger.lines()[2].startswith("dropped 2 of 7 (29 %): boxes cut off")
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         ({k: v for k, v in _GOOD.items() if k != "labels"}, "labels is missing or not a list"),
         ({k: v for k, v in _GOOD.items() if k != "scores"}, "scores is missing or not a list"),
         (_GOOD | {"boxes": {"0": [1, 2, 3, 4]}}, "boxes is missing or not a list"),
-        (_GOOD | {"boxes": [1, 2, 3, 4]}, "a box must hold numbers only"),
+        (_GOOD | {"boxes": [1, 2, 3, 4]}, "boxes holds no lists x1, y1, x2, y2"),
         (_GOOD | {"boxes": [[1, 2, 3, "4"]]}, "a box must hold numbers only"),
         (_GOOD | {"boxes": [[1, 2, 3, True]]}, "a box must hold numbers only"),
         (_GOOD | {"boxes": [[1, 2, 3, 10**400]]}, "a box holds an integer beyond the range of floats"),
@@ -207,3 +207,30 @@ def test_no_usable_frame_is_an_error_that_names_the_file(tmp_path, content):
     with pytest.raises(LogError, match="detection frame") as caught:
         read_detections(file, Ledger())
     assert caught.value.where == str(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "why", "hint"),
+    [
+        (
+            3 * '\n{"stamp": 1, "boxes": [[1, 2, 3, 4]], "scores": [1]}',
+            "labels is missing or not a list",
+            '"labels": ["cup"]',
+        ),
+        (
+            '{"stamp": 1, "boxes": [1, 2, 3, 4], "labels": ["a"], "scores": [1]}',
+            "boxes holds no lists",
+            "[[x1, y1, x2, y2]]",
+        ),
+        ('[\n {"stamp": 1},\n {"stamp": 2}\n]', "not JSON", "one frame a line"),
+        ('[{"stamp": 1}]', "not a JSON object", "one frame a line"),
+    ],
+)
+def test_a_file_without_a_good_line_says_why(tmp_path, text, why, hint):
+    file = tmp_path / "detections.jsonl"
+    file.write_text(text)
+    with pytest.raises(LogError) as caught:
+        read_detections(file, Ledger())
+    assert caught.value.where == str(file)
+    assert why in caught.value.message
+    assert hint in caught.value.hint

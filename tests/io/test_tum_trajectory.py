@@ -44,6 +44,50 @@ def test_a_pose_is_read_as_tum_writes_it(tmp_path):
     assert f"{file}:2: 1 quaternions are not of length 1" in ledger.warnings[0]
 
 
+TURNED = [[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 0], [0, 0, 0, 1]]  # a quarter turn to the left at (3, 4)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 0 0 0\n2 3 4 1.5707963267948966\n",
+        "stamp x y yaw\n1 0 0 0\n2 3 4 1.5707963267948966\n",
+        "t,x,y,theta\n1,0,0,0\n2, 3, 4, 1.5707963267948966\n",
+        "timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,3,4,0,0,0,0.7071067811865476,0.7071067811865476\n",
+        "1,0,0,0,0,0,0,1\r\n2,3,4,0,0,0,0.7071067811865476,0.7071067811865476\r\n",
+    ],
+)
+def test_commas_a_header_and_planar_poses_are_read(tmp_path, text):
+    file, ledger = tmp_path / "odometry.csv", Ledger()
+    file.write_text(text)
+    path = read_trajectory(file, ledger)
+    assert path.stamps.tolist() == [1, 2]
+    np.testing.assert_allclose(path.poses, [np.eye(4), TURNED], atol=1e-12)
+    assert not ledger.lines()
+
+
+def test_columns_that_their_header_names_otherwise_are_refused(tmp_path):
+    file = tmp_path / "odometry.txt"
+    file.write_text("stamp tx ty tz qw qx qy qz\n1 0 0 0 1 0 0 0\n")
+    with pytest.raises(LogError, match=r"they must be stamp tx ty tz qx qy qz qw") as caught:
+        read_trajectory(file, Ledger())
+    assert caught.value.where == f"{file}:1"
+
+
+def test_a_planar_file_drops_what_is_not_planar(tmp_path):
+    file, ledger = tmp_path / "odometry.txt", Ledger()
+    file.write_text("1 0 0 0\n2 1 0\n3 2 0 0 0 0 0 1\n4 3 0 0.5\n")
+    assert read_trajectory(file, ledger).stamps.tolist() == [1, 4]
+    assert ledger.dropped == {"pose line that is not 4 numbers": 2}
+
+
+def test_a_file_without_a_pose_says_what_a_pose_is(tmp_path):
+    file = tmp_path / "odometry.txt"
+    file.write_text("a b c\n1 2\n")
+    with pytest.raises(LogError, match="a pose line is stamp tx ty tz qx qy qz qw, or stamp x y yaw of a planar robot"):
+        read_trajectory(file, Ledger())
+
+
 def test_every_bad_line_is_dropped_and_named(tmp_path):
     file = tmp_path / "odometry.txt"
     lines = [

@@ -255,6 +255,21 @@ def test_a_calibration_file_takes_the_place_of_camera_info(maker, tmp_path):
     assert robot.sink.detections[0][1] == "kinect"
 
 
+def test_a_file_of_a_mount_alone_leaves_the_lens_to_camera_info(maker, tmp_path):
+    """A robot without tf of its camera: the file says where it sits."""
+    (tmp_path / "mount.yaml").write_text(
+        "base_T_camera: {translation: [1.0, 2.0, 3.0], rotation_xyzw: [0.0, 0.0, 0.0, 1.0]}"
+    )
+    robot = Robot(maker, camera_info=tmp_path / "mount.yaml")
+    robot.odometry(1.0)
+    robot.info()
+    robot.detections(1.1)
+    (camera,) = robot.sink.cameras
+    np.testing.assert_allclose(camera.matrix, CAMERA.matrix)
+    np.testing.assert_allclose(camera.base_T_camera[:, 3], [1, 2, 3, 1])
+    assert len(robot.sink.detections) == 1
+
+
 def test_the_nearest_camera_info_serves_boxes_of_a_frame_of_their_own(maker):
     robot = Robot(maker)
     robot.odometry(1.0)

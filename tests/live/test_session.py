@@ -84,8 +84,38 @@ def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
     assert len(off) >= 11
     assert max(off.values()) < 0.15
     assert result.summary["counts"]["detection_frames"] == 150
+    assert len(result.path_after) == len(log.odometry)
+    at = np.searchsorted(result.path_after.stamps, result.keyframes.stamps)
+    off = result.path_after.poses[np.minimum(at, len(log.odometry) - 1), :3, 3] - result.map_T_base[:, :3, 3]
+    assert np.linalg.norm(off, axis=1).max() < 0.1  # the next pose of the path: less than a step further
     assert len(result.rays) == len(result.weight) == len(result.association.object)
     assert session.snapshot().stamp == pytest.approx(result.keyframes.stamps.max())
+
+
+@pytest.mark.parametrize("classes", [12, 3])
+def test_an_object_keeps_its_id_to_the_end(classes):
+    """An id of the last snapshot is in the result the id of the same thing. The end associates the 3 labels once more."""
+    log = make_log(classes=classes)
+    session = drive(log)
+    shown = {o.id: o for o in session.snapshot().map.resolved()}
+    end = session.stop().map.objects
+    assert len({o.id for o in end}) == len(end)
+    kept = [(shown[o.id], o) for o in end if o.id in shown]
+    assert len(kept) >= 10
+    if classes == 3:  # counted anew, they would have other ids
+        assert [o.id for o in end] != list(range(len(end)))
+    for before, after in kept:
+        others = [o for o in end if o.label == before.label]
+        assert min(others, key=lambda o: np.linalg.norm(o.position - before.position)) is after
+
+
+def test_poses_that_the_settings_leave_unused_are_no_loss(log):
+    """They are counted apart from what is dropped."""
+    session = Session(load_settings(None, ("mode=joint", "poses.use=odometry")))
+    assert not session.push_localization(1.0, np.eye(4))
+    assert session.push_odometry(1.0, np.eye(4))
+    assert session.counters.accepted() == {"localization not used": 1, "odometry": 1}
+    assert not session.counters.dropped()
 
 
 @pytest.mark.parametrize("share", [0.5, 0.01, 1e-4])
@@ -492,7 +522,7 @@ def test_fiducials_are_used_up_to_the_edge_as_offline(log, tmp_path):
         session.abort()
         kept = read(tmp_path / str(whole), Ledger())
         assert kept.cameras[0].detections.whole == whole
-        reason = "boxes cut off by the image's edge (rays.border)"
+        reason = "boxes cut off by the image's edge (rays.border, rays.border_share)"
         used[whole] = session.counters.dropped().get(reason, 0)
         for found in (cut, kept):
             offline = Ledger()

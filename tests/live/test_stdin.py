@@ -114,7 +114,7 @@ def test_boxes_that_no_edge_cuts_off_say_so():
 
 def test_boxes_that_no_edge_cuts_off_are_used_from_stdin_as_from_a_file(tmp_path):
     """The same lines: heard by a session, replayed from its journal, and read as detections.jsonl."""
-    edge = "boxes cut off by the image's edge (rays.border)"
+    edge = "boxes cut off by the image's edge (rays.border, rays.border_share)"
     config = load_settings(None, ("mode=joint", "live.keyframe_distance=0"))
     frames = [{"stamp": 1 + i, "boxes": [[0, 200, 40 + i, 240]], "labels": ["tag"], "scores": [1]} for i in range(4)]
     for whole in (False, True):

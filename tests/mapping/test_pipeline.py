@@ -138,6 +138,16 @@ def test_no_usable_box_is_an_error_that_says_why(mode):
         run(log, mode, "rays.min_score=2")
 
 
+def test_few_boxes_between_0_and_1_are_called_shares_of_the_image():
+    log = small_log(frames=3)
+    (camera_log,) = log.cameras
+    boxes = camera_log.detections.boxes / np.tile(camera_log.camera.size, 2)
+    assert 0 < len(boxes) < 20
+    shares = replace(log, cameras=(replace(camera_log, detections=replace(camera_log.detections, boxes=boxes)),))
+    with pytest.raises(SolveError, match="between 0 and 1: they are probably shares of the image"):
+        run(shares, "fixed")
+
+
 # Logs of every shape
 
 

@@ -88,13 +88,46 @@ def test_the_options_of_every_source_are_among_those_of_all(source):
 
 
 def test_nothing_that_fits_lists_what_was_looked_for(tmp_path):
+    (tmp_path / "notes.md").touch()
+    with pytest.raises(LogError, match=r"the folder holds notes\.md") as caught:
+        read(tmp_path, Ledger())
+    assert caught.value.where == str(tmp_path)
+    for source in SOURCES:
+        assert f"{source.name}: {source.looks_for}" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("files", "given", "what", "hint"),
+    [
+        (["drive.mp4"], "drive.mp4", "a video has neither poses nor a calibration", "images"),
+        (["drive.MP4", "more.avi"], "", "a video has neither poses nor a calibration", "images"),
+        (["log.zip"], "log.zip", "an archive", "unpack"),
+        (["log.tar.gz"], "log.tar.gz", "an archive", "unpack"),
+        (["1.jpg"], "1.jpg", "a single image", "camera.yaml"),
+        (["notes.txt"], "notes.txt", "no ROS bag", "camera.yaml"),
+        ([], "", "the folder is empty", "camera.yaml"),
+        (["1.jpg", "2.PNG", "notes.txt"], "", "2 images, but camera.yaml, rgb.txt, and the poses", "README"),
+        (["rgb/1.jpg", "rgb.txt"], "", "1 images in rgb/, but camera.yaml, and the poses", "README"),
+        (["mine/camera.yaml", "mine/odometry.txt"], "", "the recordings are in its subfolders", "mine"),
+    ],
+)
+def test_what_no_source_reads_is_called_by_its_name(tmp_path, files, given, what, hint):
+    folder = tmp_path / "given"
+    folder.mkdir()
+    for name in files:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("something")
+    with pytest.raises(LogError) as caught:
+        read(folder / given, Ledger())
+    assert what in caught.value.message
+    assert hint in caught.value.hint
+    assert len(str(caught.value)) < 300 + len(str(folder))
+
+
+def test_an_empty_file_is_called_empty(tmp_path):
     (tmp_path / "photo.jpg").touch()
-    for path in (tmp_path, tmp_path / "photo.jpg"):
-        with pytest.raises(LogError) as caught:
-            read(path, Ledger())
-        assert caught.value.where == str(path)
-        for source in SOURCES:
-            assert f"{source.name}: {source.looks_for}" in caught.value.hint
+    with pytest.raises(LogError, match="the file is empty"):
+        read(tmp_path / "photo.jpg", Ledger())
 
 
 @pytest.mark.parametrize("order", [1, -1])

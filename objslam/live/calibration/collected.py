@@ -17,15 +17,17 @@ from objslam.mapping.alternation import seen_something
 class Collected:
     """What a session has collected, as offline mapping takes it.
 
-    keyframes: in time order, as they were measured. rays: theirs, as they were measured. association: of the rays.
-    map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: the same keyframes
-    and rays as a function of the shared errors, None if neither errors nor noise are estimated. theta: (P,) the values by
-    which the session corrects its measurements. Errors that the session takes out but does not estimate are taken out here.
+    keyframes: in time order, as they were measured. rays: theirs, as they were measured. association: of the rays. ids: (N,)
+    of the objects in the session. map_T_camera, positions: (K, 4, 4), (N, 3) its estimate. log: the paths and cameras.
+    errors: the same keyframes and rays as a function of the shared errors, None if neither errors nor noise are estimated.
+    theta: (P,) the values by which the session corrects its measurements. Errors that the session takes out but does not
+    estimate are taken out here.
     """
 
     keyframes: Keyframes
     rays: Rays
     association: Association
+    ids: Ints
     map_T_camera: Floats
     positions: Floats
     log: Log
@@ -71,7 +73,7 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
         log = known.corrected_log(values)
         errors = None if errors is None else replace(errors, log=log, keyframes=keyframes, rays=rays)
     theta = None if errors is None else corrections(m, errors)
-    return Collected(keyframes, rays, association, poses[kept], place[objects], log, errors, theta)
+    return Collected(keyframes, rays, association, objects, poses[kept], place[objects], log, errors, theta)
 
 
 def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> SharedErrors | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.errors import LogError
-from objslam.io.camera_yaml import Calibration
+from objslam.io.camera_yaml import Calibration, Mount
 from objslam.live.interface import Sink
 from objslam.live.ros.boxes import Boxes, DepthImages, Drop
 from objslam.ros.bag.records import frame_name
@@ -19,7 +19,7 @@ from objslam.ros.messages.camera_info import camera_names, camera_of
 from objslam.ros.messages.detections import boxes_of_points
 from objslam.ros.tf.buffer import TfBuffer, UnknownTransform
 from objslam.ros.tf.frames import unchanged
-from objslam.ros.topics import closeness, is_named, is_rectified
+from objslam.ros.topics import closeness, is_named, is_rectified, mount_of
 
 PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s. A larger value drops fewer boxes.
 _DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value uses depths of slower cameras.
@@ -56,9 +56,10 @@ class Cameras:
         drop: Drop,
         calibrations: Sequence[Calibration],
         rectified: bool | None,
+        mounts: Sequence[Mount] = (),
     ) -> None:
         self._sink, self._tf, self._base, self._drop = sink, tf, base, drop
-        self._calibrations, self._rectified = calibrations, rectified
+        self._calibrations, self._rectified, self._mounts = calibrations, rectified, mounts
         self._infos: dict[str, tuple[bytes, str, Any]] = {}
         self._known: dict[str, _Known] = {}
         self._frames: list[str] = []
@@ -169,7 +170,10 @@ class Cameras:
             except LogError as error:
                 return str(error)
             placed_by = frame if frame in self._tf.frames else source
-            known = _Known(camera, source, placed_by, frame_T_camera, placed=False)
+            mount = mount_of(self._mounts, frame, boxes.topic)
+            if mount is not None:
+                camera = replace(camera, base_T_camera=mount.base_T_camera)
+            known = _Known(camera, source, placed_by, frame_T_camera, placed=mount is not None)
         self._known[frame] = known
         return known
 

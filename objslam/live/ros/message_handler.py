@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
-from objslam.io.camera_yaml import read_calibrations
+from objslam.io.camera_yaml import read_calibrations, read_mounts
 from objslam.live.interface import Sink
 from objslam.live.ros.boxes import Boxes
 from objslam.live.ros.camera_registry import Cameras
@@ -56,9 +56,10 @@ class RosMessages:
         options = self._options = options or RosOptions()
         self.chosen = parse_topics(options.topics, live=True)
         calibrations = read_calibrations(options.camera_info, self.ledger) if options.camera_info is not None else ()
+        mounts = read_mounts(options.camera_info) if options.camera_info is not None else ()
         self._lock = threading.RLock()
         self._tf = TfBuffer()
-        self._cameras = Cameras(sink, self._tf, self._base, self.refuse, calibrations, options.rectified)
+        self._cameras = Cameras(sink, self._tf, self._base, self.refuse, calibrations, options.rectified, mounts)
         self.sources = {role: names[0] for (_, role), names in self.chosen.names.items() if len(names) == 1}
         self._child = self._odom = ""
         self._correction: Floats | None = None

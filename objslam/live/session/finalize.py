@@ -1,15 +1,20 @@
 """The end of a session. Its keyframes and rays are solved once more, as in offline mapping, and become a result."""
 
+import itertools
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
-from objslam.core.types import Trajectory
+from objslam.core.trajectory import correct_path
+from objslam.core.types import Association, Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
@@ -53,6 +58,8 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
+    ids = _kept_ids(found.association, found.ids, solution.association)
+    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     accepted = m.counters.accepted()
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
@@ -67,8 +74,34 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         settings=settings,
         cameras=cameras,
         path=Trajectory(stamps, keyframes.map_T_base[first]),
-        path_after=Trajectory(stamps, estimate.map_T_base[first]),
+        path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
+
+
+def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
+    """Return the recorded path at its full rate, corrected as the keyframes at `stamps` (K,) were to map_T_base (K, 4, 4).
+
+    It follows the odometry, where there is one, because the localisation jitters.
+    """
+    way = log.odometry or log.localization
+    assert way is not None  # without a path there is no keyframe
+    before, _ = interpolate(way.stamps, way.poses, np.clip(stamps, way.stamps[0], way.stamps[-1]), np.inf)
+    return correct_path(way, stamps, before, map_T_base)
+
+
+def _kept_ids(before: Association, ids: Ints, now: Association) -> list[int]:
+    """Return an id for each object of `now`, so that an object of the session has one id from its first snapshot to its end.
+
+    The objects are paired one to one so that the pairs share the most rays. An object without a partner gets a new id.
+    before: the association of the same rays in the session. ids: (N,) the ids of its objects.
+    """
+    held = (before.object >= 0) & (now.object >= 0)
+    cells = before.object[held] * now.count + now.object[held]
+    shared = np.bincount(cells, minlength=before.count * now.count).reshape(before.count, now.count)
+    pairs = zip(*linear_sum_assignment(shared, maximize=True), strict=True)
+    kept = {int(j): int(ids[i]) for i, j in pairs if shared[i, j] > 0}
+    unused = itertools.count(int(ids.max(initial=-1)) + 1)
+    return [kept[j] if j in kept else next(unused) for j in range(now.count)]
 
 
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:

@@ -12,6 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse
+from objslam.core.snapshot import NOT_USED
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
@@ -153,7 +154,8 @@ class Intake:
         if matrix is None or given is None:
             return self._refuse(f"{path} without a rigid pose or a stamp", f"stamp {checks.told(stamp)}")
         if self._settings.poses.use not in ("auto", path):
-            return self._refuse(f"{path} that is not used (poses.use)")
+            self.counters.accept(f"{path}{NOT_USED}")  # The user chose so (poses.use): nothing is lost.
+            return False
         with self._lock:
             self._lead.choose(path, given + self._clock.shift)
             last = self._last.get(path)

@@ -13,7 +13,7 @@ _OVERLAP = 0.5
 _UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
 """Units of time, by how many of them are a second."""
 _FEWEST = 20
-"""The fewest boxes that are judged. A few boxes may lie anywhere."""
+"""The fewest boxes that are judged, except whether they lie between 0 and 1. A few boxes may lie anywhere."""
 _PART = 0.9
 """The share of boxes that must be odd. A smaller share finds fault with logs of a few odd boxes."""
 _WITHOUT_AREA = 0.2
@@ -59,7 +59,7 @@ def check_boxes(log: Log) -> list[Finding]:
     """Return what is wrong with the boxes of a log, seen from their corners alone."""
     found: list[Finding] = []
     for one in log.cameras:
-        if one.detections is not None and len(one.detections) >= _FEWEST:
+        if one.detections is not None and len(one.detections):
             first = next(_judge(one.detections, one.camera), None)
             if first is not None:
                 found.append(first)
@@ -71,6 +71,8 @@ def _judge(found: Detections, camera: Camera) -> Iterator[Finding]:
     size = f"{camera.width} x {camera.height} px"
     if (boxes.max(axis=1) <= 1.5).mean() > _PART:
         yield Finding("boxes 0..1", f"the {name} lie between 0 and 1: they are probably shares of the image, not px")
+    if len(boxes) < _FEWEST:
+        return
     flat = float(((boxes[:, 2] <= boxes[:, 0]) | (boxes[:, 3] <= boxes[:, 1])).mean())
     if flat > _WITHOUT_AREA:
         yield Finding(

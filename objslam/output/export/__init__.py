@@ -13,6 +13,7 @@ from objslam.output.export.formats import FORMATS
 
 if TYPE_CHECKING:
     from objslam.output.export.content import Datum
+    from objslam.output.export.export_format import ExportFormat
 
 
 def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | None = None) -> Path:
@@ -27,16 +28,26 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
         OutputError: the result cannot be read or lacks data that the format needs, or the file cannot be written.
     """
     from objslam.io.atomic_files import write_file
+
+    file = file or out / _chosen(to, datum).file
+    if file.is_dir():
+        raise OutputError("a folder stands where the file goes", where=str(file))
+    write_file(file, dump_export(out, to, datum))
+    return file
+
+
+def dump_export(out: Path, to: str, datum: Datum | None = None) -> bytes:
+    """Return what `write_export` writes. Raises the same errors."""
     from objslam.output.export.content import load_content
 
+    return _chosen(to, datum).dump(load_content(out, datum))
+
+
+def _chosen(to: str, datum: Datum | None) -> ExportFormat:
     if to not in FORMATS:
         raise ConfigError(f"there is no export format {to!r}", hint=f"--to takes {', '.join(FORMATS)}")
     chosen = FORMATS[to]
     if datum is not None and not chosen.takes_datum:
         takers = " or ".join(f"--to {other.name}" for other in FORMATS.values() if other.takes_datum)
         raise ConfigError(f"a datum has no meaning for {to}", hint=f"--datum goes with {takers}")
-    file = file or out / chosen.file
-    if file.is_dir():
-        raise OutputError("a folder stands where the file goes", where=str(file))
-    write_file(file, chosen.dump(load_content(out, datum)))
-    return file
+    return chosen

@@ -7,11 +7,11 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Trajectory
 from objslam.errors import LogError
-from objslam.io.camera_yaml import Calibration
+from objslam.io.camera_yaml import Calibration, Mount
 from objslam.ros.messages.camera_info import camera_names, camera_of
 from objslam.ros.messages.topic_types import COMPRESSED
 from objslam.ros.tf.tree import TfTree
-from objslam.ros.topics import closeness, is_named, is_rectified
+from objslam.ros.topics import closeness, is_named, is_rectified, mount_of
 from objslam.sources.ros_bag.survey import Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool
 from objslam.sources.ros_bag.trajectories import tf_path
@@ -74,9 +74,12 @@ def find_cameras(
     )
 
 
-def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) -> tuple[Camera, Trajectory | None]:
+def build_camera(
+    topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger, mounts: Sequence[Mount] = ()
+) -> tuple[Camera, Trajectory | None]:
     """Build a camera from its topics. Returns it with base_T_camera over time, or None if the camera does not move on base.
 
+    mounts: base_T_camera of cameras with a CameraInfo, from a file. They count in place of tf.
     Raises LogError if the calibration is missing or tf does not connect base with the camera.
     """
     given = topics.calibration
@@ -89,6 +92,9 @@ def build_camera(topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger) 
             ledger.warn(f"{topics.info.name}: the calibration changes during the recording, the first one is used")
         info = next(iter(topics.info.infos.values()))
         camera, correction = camera_of(info, topics.name, topics.info.name, topics.rectified)
+        mount = mount_of(mounts, topics.frame, (topics.detections or topics.image or topics.info).name)
+        if mount is not None:
+            return replace(camera, base_T_camera=mount.base_T_camera), None
     else:
         hint = "give --topic camera_info=/name, or --camera-info FILE"
         what = f"no CameraInfo belongs to this camera (frame {topics.frame!r})"

@@ -16,7 +16,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
-from objslam.io.camera_yaml import read_calibrations
+from objslam.io.camera_yaml import read_calibrations, read_mounts
 from objslam.io.text import count_drops, in_order
 from objslam.ros.bag.recording import Recording, find_recording, read_messages
 from objslam.ros.bag.records import Connection, FileReport
@@ -86,6 +86,7 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
 def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) -> Assembly:
     """Read a recording without its images, and give topics their roles. Raises LogError if no file can be read."""
     calibrations = () if options.camera_info is None else read_calibrations(options.camera_info, ledger)
+    mounts = () if options.camera_info is None else read_mounts(options.camera_info)
     choices = parse_topics(options.topics)
     survey = take_survey(find_recording(paths, ledger), options.label or "")
     check_choices(choices, survey)
@@ -105,7 +106,7 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
     cast = find_cameras(pool, tree, calibrations, options.rectified)
     for topics in cast:
         try:
-            cameras.append((topics, *build_camera(topics, tree, base, ledger)))
+            cameras.append((topics, *build_camera(topics, tree, base, ledger, mounts)))
         except LogError as error:
             refused.append(error)
     if not cameras and not refused:

@@ -215,3 +215,15 @@ def test_the_command(result, tmp_path, capsys, monkeypatch, arguments, code, wor
     assert exit_.value.code == code
     assert word in said.out + said.err
     assert (tmp_path / "file").exists() == (code == 0)
+
+
+def test_a_file_called_minus_is_stdout(result, tmp_path, capfdbinary, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["objslam", "export", str(result), "-o", "-", "--to", "ply"])
+    monkeypatch.setattr(sys, "stdout", open(1, "w", closefd=False))  # noqa: SIM115 - the real one, as in a shell
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    sys.stdout.flush()
+    assert exit_.value.code == 0
+    assert capfdbinary.readouterr().out == write_export(result, "ply", tmp_path / "file").read_bytes()
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]

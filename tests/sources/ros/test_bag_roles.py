@@ -315,6 +315,19 @@ def test_a_calibration_file_stands_in(makers, tmp_path):
     assert ledger.warnings == ["/rig/front/tags: left out, because no calibration has a fitting name (left)"]
 
 
+@pytest.mark.parametrize("text", ["{}", "camera_name: front\n{}", "cameras: {{front: {{{}}}}}"])
+def test_a_file_of_a_mount_alone_leaves_the_lens_to_camera_info(makers, tmp_path, text):
+    """A bag without tf of its camera: the file says where it sits."""
+    bag = Bag(makers["4"]).odometry(child="rig").boxes("/front/tags").camera()
+    with pytest.raises(LogError, match="tf"):
+        _read(bag, tmp_path)
+    mount = "base_T_camera: {translation: [1.0, 2.0, 3.0], rotation_xyzw: [0.0, 0.0, 0.0, 1.0]}"
+    (tmp_path / "mount.yaml").write_text(text.format(mount))
+    (camera_log,) = _read(bag, tmp_path, camera_info=tmp_path / "mount.yaml").cameras
+    np.testing.assert_allclose(camera_log.camera.matrix, _CAMERA.matrix)
+    np.testing.assert_allclose(camera_log.camera.base_T_camera[:, 3], [1, 2, 3, 1])
+
+
 def test_a_calibration_file_without_a_place_leaves_that_to_tf(makers, tmp_path):
     bag = Bag(makers["4"]).odometry().tf("base_link", _FRAME, _OPTICAL, static=True).boxes()
     write_camera(_CAMERA, tmp_path / "camera.yaml")

@@ -1,0 +1,97 @@
+"""What a terminal of few columns shows: tables without a cut number, and a status line that stays one line."""
+
+import io
+import re
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from objslam.cli import console as terminal
+from objslam.cli.live_status import status_line
+from objslam.cli.run import objects_table
+from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.snapshot import Snapshot
+from objslam.core.types import Trajectory
+
+EMPTY = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+
+
+def thing(number: int, label: str, place: tuple[float, float, float]) -> MapObject:
+    return MapObject(number, label, np.array(place), 0.25 * np.eye(3), "ok", 1234, 99, 41.25, 0.375, 0.0, 1.0)
+
+
+def shown(width: int) -> str:
+    objects = (thing(0, "cup", (-12.345, 101.111, 2.222)), thing(117, "dispenser_button", (-2.468, -1.357, -0.975)))
+    screen = Console(file=io.StringIO(), width=width)
+    screen.print(objects_table(objects, screen))
+    return screen.file.getvalue()
+
+
+@pytest.mark.parametrize("width", range(55, 121, 5))
+def test_a_table_cuts_no_number(width):
+    text = shown(width)
+    assert max(map(len, text.splitlines())) <= width
+    for number in ("117", "-12.345", "101.111", "2.222", "-2.468", "-1.357", "-0.975", "dispenser_button"):
+        assert re.search(rf"[ │]{re.escape(number)}[ │]", text), text
+    assert ("41.2" in text) <= ("0.38" in text) <= ("1234" in text)  # the order in which columns go
+
+
+def test_a_table_of_80_columns_leaves_out_parallax_and_not_sigma():
+    assert "41.2" in shown(120)
+    assert "41.2" not in shown(80)
+    assert "0.500" in shown(80)
+
+
+class Tty(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
+    """The screen is what is left after each carriage return, erased line and line up."""
+    screen = Tty()
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("TERM", "xterm")
+    terminal.console.cache_clear()
+    snapshot = Snapshot(1.0, ObjectMap(()), EMPTY, 7, counters={"odometry": 5, "frames": 3}, dropped={"frame too late": 2})
+    try:
+        with status_line() as show:
+            show(snapshot, Ledger())
+            terminal.say("warning: no publisher of boxes", stderr=True)
+            show(snapshot, Ledger())
+    finally:
+        terminal.console.cache_clear()
+    assert "0 objects, 0 unresolved | odometry " in screen.getvalue()
+    lines = [""]
+    for part in re.split(r"(\x1b\[[0-9?]*[A-Za-z]|\r|\n)", screen.getvalue()):
+        if part == "\n":
+            lines.append("")
+        elif part == "\x1b[2K":
+            lines[-1] = ""
+        elif part == "\x1b[1A":
+            lines.pop()
+        elif part != "\r" and not part.startswith("\x1b"):
+            lines[-1] += part
+            assert len(lines[-1]) <= 60
+    assert [line for line in lines if line] == ["warning: no publisher of boxes"]
+
+
+def test_the_status_line_says_why_most_was_dropped(monkeypatch):
+    """Also what the adapter dropped, and apart from it what the settings leave unused."""
+    monkeypatch.setattr("objslam.cli.live_status._LINES", 0.0)
+    seen = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", seen)
+    terminal.console.cache_clear()
+    ledger = Ledger()
+    ledger.drop("line malformed: not JSON", 3)
+    snapshot = Snapshot(np.nan, ObjectMap(()), EMPTY, counters={"localization not used": 141}, dropped={"frame too late": 1})
+    try:
+        with status_line() as show:
+            show(snapshot, ledger)
+    finally:
+        terminal.console.cache_clear()
+    assert "dropped 4 (line malformed: not JSON), 141 localization not used" in seen.getvalue()
