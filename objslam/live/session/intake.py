@@ -12,6 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse
+from objslam.core.validity import valid_positions
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
@@ -172,6 +173,8 @@ class Intake:
                     return self._refuse(f"{path} that is late", f"stamp {given:.3f}")
             if path == "odometry":
                 matrix = self._continuous(at, matrix)
+                if not valid_positions(matrix[:3, 3]):
+                    return self._refuse("odometry that leads too far away", f"stamp {given:.3f}")
             message = PoseMessage(path, at, matrix)
             if not self._hand_on(message):
                 return False
