@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from objslam.config.yaml_text import parse_yaml
 from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.validity import covariance_fault
@@ -32,7 +33,7 @@ def load_calibration(path: Path) -> Calibration:
             raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MiB")
         text = read_bytes(path).decode()
         _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader))
-        return _calibration(yaml.safe_load(text))
+        return _calibration(parse_yaml(text))
     except LogError as error:
         raise ConfigError(error.message, where=error.where, hint="give a file of objslam calibrate") from error
     except (yaml.YAMLError, ValueError, OSError, RecursionError, OverflowError) as error:
