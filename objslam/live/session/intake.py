@@ -34,6 +34,7 @@ _FAR = 0.1  # The least difference from zero, m and rad, before such a gap. A la
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
+_ALONE = "with a stamp far ahead, which the next one did not confirm yet"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 
 
@@ -156,13 +157,15 @@ class Intake:
         if self._settings.poses.use not in ("auto", path):
             return self._refuse(f"{path} that is not used (poses.use)")
         with self._lock:
-            self._lead.choose(path, given + self._clock.shift)
+            if not self._lead.choose(path, given + self._clock.shift):
+                return self._refuse(f"{path} {_ALONE}", f"stamp {given:.3f}")
             last = self._last.get(path)
             if path == self._lead.path:
                 at, back = self._clock.step(given)
                 if at is None:
                     again = last is not None and last.stamp == given + self._clock.shift
-                    fault = "with a repeated stamp" if again else "that is late"
+                    ahead = given + self._clock.shift > self.newest
+                    fault = "with a repeated stamp" if again else _ALONE if ahead else "that is late"
                     return self._refuse(f"{path} {fault}", f"stamp {given:.3f}")
                 if back:
                     self.counters.accept("clock set back")
