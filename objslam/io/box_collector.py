@@ -58,7 +58,9 @@ class BoxCollector:
             good &= fine
         depths = np.array(self.depths, dtype=np.float64)
         wrong = ~np.isnan(depths) & ~valid_depths(depths)
-        drop_rows("depth of a box that is not above zero or too large (taken as unknown)", good & wrong, self.box_places, ledger)
+        drop_rows(
+            "depth of a box that is not above zero or too large (taken as unknown)", good & wrong, self.box_places, ledger
+        )
         depths[wrong] = np.nan
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(

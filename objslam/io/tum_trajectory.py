@@ -26,7 +26,9 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
     """Read a trajectory file as `read_trajectory` does, but return a table with its 8 columns."""
     table = read_table(path, 8, ledger, "pose")
     table = select(table, valid_stamps(table.values[:, 0]), "pose line with a stamp that is too large", path, ledger)
-    table = select(table, valid_positions(table.values[:, 1:4]), "pose line with a position that is too far away", path, ledger)
+    table = select(
+        table, valid_positions(table.values[:, 1:4]), "pose line with a position that is too far away", path, ledger
+    )
     turns = valid_pose_rows(table.values[:, 1:])
     table = select(table, turns, "pose line with a quaternion that is zero or too long", path, ledger)
     forward = in_order(table.values[:, 0])

@@ -45,7 +45,9 @@ def test_what_is_no_pose(row, column, value):
 @given(npst.arrays(np.float64, (3, 4, 4), elements=st.floats()))
 def test_no_array_is_rigid_that_is_no_rotation(poses):
     exact, _ = rigid_poses(poses)
-    np.testing.assert_allclose(np.swapaxes(exact[:, :3, :3], 1, 2) @ exact[:, :3, :3], np.tile(np.eye(3), (3, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        np.swapaxes(exact[:, :3, :3], 1, 2) @ exact[:, :3, :3], np.tile(np.eye(3), (3, 1, 1)), atol=1e-9
+    )
     assert np.abs(exact[:, :3, 3]).max() < 1e7
 
 

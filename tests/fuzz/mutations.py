@@ -21,7 +21,26 @@ ROUNDS = int(os.environ.get("OBJSLAM_FUZZ_ROUNDS", "1"))
 SEED = int(os.environ.get("OBJSLAM_FUZZ_SEED", "0"))
 """The first seed of the byte mutations. tools/fuzz.sh counts it up, so that each of its rounds has other inputs."""
 NUMBERS = [b"nan", b"inf", b"-1", b"1e300", b"1e400", b"99999999999999999999", b"0", b"null", b"true", b"[]", b"{}", b'""']
-ODD = [None, True, -1, 0, 2**31, 2**63, 10**400, 1e8, 1e300, 1e-300, float("nan"), float("inf"), "", "\ud800", "x", [], {}, [[]]]
+ODD = [
+    None,
+    True,
+    -1,
+    0,
+    2**31,
+    2**63,
+    10**400,
+    1e8,
+    1e300,
+    1e-300,
+    float("nan"),
+    float("inf"),
+    "",
+    "\ud800",
+    "x",
+    [],
+    {},
+    [[]],
+]
 
 odd = st.sampled_from(ODD) | st.floats() | st.integers() | st.text(max_size=3) | st.lists(st.integers(), max_size=3)
 
@@ -103,7 +122,14 @@ def check(found: Any) -> None:
             value = getattr(found, field.name)
             if isinstance(value, np.ndarray) and field.name in ("pose", "base_T_camera", "odometry", "motion"):
                 poses(value.reshape(-1, 4, 4))
-            elif isinstance(value, np.ndarray) and field.name in ("covariance", "boxes", "stamps", "scores", "matrix", "stamp"):
+            elif isinstance(value, np.ndarray) and field.name in (
+                "covariance",
+                "boxes",
+                "stamps",
+                "scores",
+                "matrix",
+                "stamp",
+            ):
                 assert np.isfinite(value).all(), field.name
             else:
                 check(value)

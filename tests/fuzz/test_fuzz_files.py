@@ -65,7 +65,12 @@ def camera_text(folder):
 FILES = {
     "trajectory": (lambda folder: TUM, "odometry.txt", lambda file: read_trajectory(file, Ledger()), 400),
     "image list": (lambda folder: LIST, "rgb.txt", lambda file: read_images(file, Ledger()), 100),
-    "detections": (lambda folder: as_json(FRAME) + b"\n", "detections.jsonl", lambda file: read_detections(file, Ledger()), 300),
+    "detections": (
+        lambda folder: as_json(FRAME) + b"\n",
+        "detections.jsonl",
+        lambda file: read_detections(file, Ledger()),
+        300,
+    ),
     "camera": (camera_text, "camera.yaml", lambda file: read_calibrations(file, Ledger()), 150),
     "calibration": (
         lambda folder: dump_calibration(CALIBRATION).encode(),

@@ -38,7 +38,9 @@ class PoseRows:
         good = valid_pose_rows(values)
         stamps = choose_times(self.stamps, self.logged) / 1e9
         where = None if good.all() else f"stamp {stamps[~good][0]:.3f}"
-        ledger.drop(f"{what} whose pose is invalid (not finite, too far away, or a zero quaternion)", int((~good).sum()), where)
+        ledger.drop(
+            f"{what} whose pose is invalid (not finite, too far away, or a zero quaternion)", int((~good).sum()), where
+        )
         return stamps[good], pose_from_quaternion(values[good, :3], values[good, 3:])
 
 
