@@ -17,7 +17,6 @@ from objslam.config.section import Section
 from objslam.config.yaml_text import MAX_YAML, parse_yaml
 from objslam.errors import ConfigError
 
-
 _SHOWN = 200  # The most letters of a wrong value in a message. A larger number shows more of it.
 
 
@@ -115,12 +114,13 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
         if first["type"] == "extra_forbidden":
             message = f"there is no setting {key}{_meant(key)}"
         else:
-            message = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, got {_short(first['input'])}"
+            wrong = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+            message = f"{key}: {wrong}, got {_short(first['input'])}"
         raise ConfigError(message, where=where, hint="`objslam config dump` shows every setting") from error
 
 
 def _short(value: Any) -> str:
-    """Return the text of a wrong value. Aliases in YAML can make a value of any size, so deep and long parts are left out."""
+    """Return the text of a wrong value. Aliases in YAML can make a value of any size, so long parts are left out."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = _SHOWN
     return short.repr(value)

@@ -39,7 +39,8 @@ TUM = b"# stamp tx ty tz qx qy qz qw\n1.0 0 0 0 0 0 0 1\n1.5 0.1 0 0 0 0 0.1 0.9
 LIST = b"# stamp path\n1.0 rgb/1.png\n2.0 rgb/2.png\n"
 FRAME = {"stamp": 12.5, "boxes": [[1, 2, 3, 4]], "labels": ["cup"], "scores": [0.9], "depths": [1.2], "track_ids": [3]}
 OBJECT = {
-    "id": 0, "label": "cup", "position": [1, 2.0, 3], "covariance": np.eye(3).tolist(), "status": "ok", "rays": 3, "frames": 3,
+    "id": 0, "label": "cup", "position": [1, 2.0, 3], "covariance": np.eye(3).tolist(), "status": "ok",
+    "rays": 3, "frames": 3,
     "parallax_deg": 9.0, "rms_deg": 0.1, "extent": [0.1, 0.2], "first_seen": 0.0, "last_seen": 1.0, "labels": {"cup": 1.0},
     "existence": 0.9, "ray": {"origin": [0, 0, 0], "direction": [1, 0, 0]},
 }  # fmt: skip

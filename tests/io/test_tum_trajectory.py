@@ -84,7 +84,7 @@ def test_a_number_that_is_too_large_is_dropped(tmp_path, line):
     file.write_text(f"{line}\n2 9.9e6 0 0 0 0 0 1\n")
     ledger = Ledger()
     assert read_trajectory(file, ledger).stamps.tolist() == [2]
-    assert [count for count in ledger.dropped.values()] == [1]
+    assert list(ledger.dropped.values()) == [1]
 
 
 def test_no_pose_left(tmp_path):

@@ -39,7 +39,7 @@ _FIELDS: dict[str, dict[str, str]] = {
     COMPRESSED: _HEADER | {"format": "text", "data[]": "bytes"},
     CAMERA_INFO: _HEADER | _SIZE | _REGION | {"distortion_model": "text", "binning_x": "integer", "binning_y": "integer"}
     | {"d[]": "number", "k[9]": "number", "r[9]": "number", "p[12]": "number"},
-    **dict.fromkeys(TRANSFORMS, {f"transforms[].{path}": kind for path, kind in _TRANSFORM.items()}),
+    **{name: {f"transforms[].{path}": kind for path, kind in _TRANSFORM.items()} for name in TRANSFORMS},
 }  # fmt: skip
 """The fields by type, as the path to each and its kind. [] marks a list of any length, and [9] an array of 9."""
 

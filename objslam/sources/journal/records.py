@@ -11,7 +11,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
-from objslam.core.camera import Camera
+from objslam.core.camera import COEFFICIENTS, Camera
 from objslam.core.validity import (
     box_rules,
     camera_fault,
@@ -188,12 +188,13 @@ def _read_calibration(data: bytes) -> CalibrationMessage:
 
 def _read_camera(data: bytes) -> CameraMessage:
     name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
-    lens = _array(matrix, (3, 3)), model, _array(distortion, (-1,))
+    known = next((one for one in COEFFICIENTS if one == model), None)
+    if known is None:
+        raise ValueError("an unknown lens model")
+    inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
     sees_size = bool(more[0]) if more else True  # Older journals do not store the flag.
     size = _integer(width), _integer(height)
-    if not isinstance(model, str):
-        raise ValueError("a lens model that is no name")
-    camera = Camera(_name(name), *size, *lens, _pose(base_T_camera), float(scale), sees_size)
+    camera = Camera(_name(name), *size, inner, known, outer, _pose(base_T_camera), float(scale), sees_size)
     fault = camera_fault(camera)
     if fault is not None:
         raise ValueError(f"camera {fault}")
@@ -225,7 +226,7 @@ _READERS: dict[bytes, Callable[[bytes], Message]] = {
 
 
 def _stamp(value: float) -> float:
-    if not valid_stamps(np.float64(value)):
+    if not valid_stamps(np.array(value, dtype=np.float64)):
         raise ValueError("a stamp is not finite or too large")
     return float(value)
 
