@@ -36,6 +36,37 @@ def write(tmp_path, text):
     return file
 
 
+BOMB = "a: &a [x, x]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "mode: !!timestamp x",
+        "seed: !!int ''",
+        "seed: !!int _",
+        "seed: !!float ''",
+        "seed: !!bool x",
+        "mode: !!binary 'é'",
+        "mode: 2026-13-01",
+        "? [a, {b: c}]\n: 1",
+        "[" * 5000,
+        "&a [*a]",
+        "mode: &a [*a]",
+        BOMB,
+        "1: 2",
+        "detector: [names]",
+        "x" * (1 << 21),
+    ],
+)
+def test_a_text_that_yaml_cannot_construct_is_told(tmp_path, text):
+    with pytest.raises(ConfigError) as told:
+        load_settings(write(tmp_path, text))
+    assert len(str(told.value)) < 5000
+
+
 @given(some_settings())
 def test_what_is_dumped_is_read_back(tmp_path_factory, settings):
     file = write(tmp_path_factory.mktemp("config"), dump_settings(settings))

@@ -1,5 +1,6 @@
 """The class of all settings. Settings are loaded from a YAML file and from overrides, and are written as YAML."""
 
+import reprlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,10 @@ from objslam.config.checks import Checks
 from objslam.config.detector import Detector
 from objslam.config.noise import Noise
 from objslam.config.section import Section
+from objslam.config.yaml_text import MAX_YAML, parse_yaml
 from objslam.errors import ConfigError
+
+_SHOWN = 200  # The most letters of a wrong value in a message. A larger number shows more of it.
 
 
 class Settings(Section):
@@ -55,8 +59,8 @@ def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> 
         if not sign or not key:
             raise ConfigError(f"--set {text!r} is not key=value", hint="for example --set joint.loss=cauchy")
         try:
-            _put(data, key.strip().split("."), yaml.safe_load(value))
-        except (yaml.YAMLError, ValueError) as error:  # PyYAML raises ValueError for an impossible date
+            _put(data, key.strip().split("."), parse_yaml(value))
+        except yaml.YAMLError as error:
             raise ConfigError(f"the value of --set {text!r} is not YAML") from error
         _validate(data, f"--set {text}")
     return _validate(data, "settings")
@@ -69,10 +73,11 @@ def dump_settings(settings: Settings) -> str:
 
 def _read_yaml(file: Path) -> dict[str, Any]:
     try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+        with file.open("rb") as stream:
+            data = parse_yaml(stream.read(MAX_YAML + 1).decode("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the settings: {error}", where=str(file)) from error
-    except (yaml.YAMLError, ValueError) as error:
+    except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{file}:{mark.line + 1}" if mark else str(file)
         raise ConfigError(f"not YAML: {getattr(error, 'problem', error)}", where=where) from error
@@ -109,8 +114,16 @@ def _validate(data: dict[str, Any], where: str) -> Settings:
         if first["type"] == "extra_forbidden":
             message = f"there is no setting {key}{_meant(key)}"
         else:
-            message = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}, got {first['input']!r}"
+            wrong = f"{first['msg'][0].lower()}{first['msg'][1:]}"
+            message = f"{key}: {wrong}, got {_short(first['input'])}"
         raise ConfigError(message, where=where, hint="`objslam config dump` shows every setting") from error
+
+
+def _short(value: Any) -> str:
+    """Return the text of a wrong value. Aliases in YAML can make a value of any size, so long parts are left out."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = _SHOWN
+    return short.repr(value)
 
 
 def _meant(key: str) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, label_table
+from objslam.core.validity import box_rules, is_name, valid_depths
 from objslam.io.text import drop_rows, in_order
 
 
@@ -43,26 +44,23 @@ class BoxCollector:
 
     def checked(self, ledger: Ledger) -> Detections:
         """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted.
-        A depth that is not above zero becomes unknown and is counted."""
+        A depth that is not above zero, or too large, becomes unknown and is counted."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)
         frame = np.array(self.frame, dtype=np.int64)
         boxes = np.array(self.boxes, dtype=np.float64).reshape(-1, 4)
         scores = np.array(self.scores, dtype=np.float64)
-        names = np.array([bool(label.strip()) and label.isprintable() for label in self.labels], dtype=bool)
+        names = np.array([is_name(label) for label in self.labels], dtype=bool)
         good = forward[frame]
-        for fine, reason in (
-            (np.isfinite(boxes).all(axis=1), "box with a corner that is not finite"),
-            ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1]), "box without area (x2 <= x1 or y2 <= y1)"),
-            ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
-            (names, "box with a label that is empty or not printable"),
-        ):
+        for fine, reason in box_rules(boxes, scores, names):
             drop_rows(reason, good & ~fine, self.box_places, ledger)
             good &= fine
         depths = np.array(self.depths, dtype=np.float64)
-        wrong = ~np.isnan(depths) & ~((depths > 0) & np.isfinite(depths))
-        drop_rows("depth of a box that is not above zero (taken as unknown)", good & wrong, self.box_places, ledger)
+        wrong = ~np.isnan(depths) & ~valid_depths(depths)
+        drop_rows(
+            "depth of a box that is not above zero or too large (taken as unknown)", good & wrong, self.box_places, ledger
+        )
         depths[wrong] = np.nan
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(

@@ -6,16 +6,15 @@ from typing import Any
 import numpy as np
 import yaml
 
+from objslam.config.yaml_text import parse_yaml
 from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
+from objslam.core.validity import covariance_fault
 from objslam.errors import ConfigError, LogError, one_line
 from objslam.io.text import read_bytes
 
 _MOST_BYTES = 1 << 20
 """The largest size of a file, bytes. A larger file is refused unread. A robot with ten cameras needs 100 kB."""
-_ASYMMETRY = 1e-6
-"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share takes
-files that somebody rounded more."""
 _HINT = "write it with objslam calibrate"
 
 
@@ -34,7 +33,7 @@ def load_calibration(path: Path) -> Calibration:
             raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MiB")
         text = read_bytes(path).decode()
         _refuse_duplicates(yaml.compose(text, Loader=yaml.SafeLoader))
-        return _calibration(yaml.safe_load(text))
+        return _calibration(parse_yaml(text))
     except LogError as error:
         raise ConfigError(error.message, where=error.where, hint="give a file of objslam calibrate") from error
     except (yaml.YAMLError, ValueError, OSError, RecursionError, OverflowError) as error:
@@ -96,13 +95,11 @@ def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Float
         matrix = np.array([[float(number) for number in row] for row in rows])
     except (TypeError, ValueError):
         raise ValueError(f"{key} is no matrix of numbers") from None
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{key} has a number that is not finite")
+    if (fault := covariance_fault(matrix)) is not None:
+        raise ValueError(f"{key} {fault}")
     if (np.diagonal(matrix) <= 0).any():
         raise ValueError(f"{key} has a variance that is not positive")
     scale = np.sqrt(np.diagonal(matrix))
-    if (np.abs(matrix - matrix.T) > _ASYMMETRY * np.outer(scale, scale)).any():
-        raise ValueError(f"{key} is not symmetric")
     matrix = (matrix + matrix.T) / 2
     try:
         np.linalg.cholesky(matrix / np.outer(scale, scale))  # of the correlation, because the units differ

@@ -15,11 +15,11 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
+from objslam.core.validity import MAX_SIDE, camera_fault, valid_positions
 from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
 _CAMERAS = "cameras"
-_MAX_SIDE = 1 << 16  # The limit of width and height, px. A larger value counts as an error in the file.
 _Mapping = dict[str, yaml.Node]
 
 
@@ -108,6 +108,8 @@ def _read(
     if name is None:
         name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
     camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size == "true")
+    if (fault := camera_fault(camera)) is not None:
+        raise LogError(f"camera {fault}: a number is too large or too small", where=str(path))
     return Calibration(camera, placed)
 
 
@@ -196,8 +198,8 @@ def _number(path: Path, node: yaml.Node, what: str) -> float:
 def _size(path: Path, top: _Mapping, key: str) -> int:
     node = _get(path, top, key)
     number = _number(path, node, key)
-    if not 1 <= number <= _MAX_SIDE or number != int(number):
-        raise _error(path, node, f"{key} must be a whole number of pixels, 1 to {_MAX_SIDE}, got {number:g}")
+    if not 1 <= number <= MAX_SIDE or number != int(number):
+        raise _error(path, node, f"{key} must be a whole number of pixels, 1 to {MAX_SIDE}, got {number:g}")
     return int(number)
 
 
@@ -260,6 +262,8 @@ def _pose(path: Path, node: yaml.Node) -> Floats:
             raise _error(path, data, f"{key} must be {size} numbers, got {len(values)}", form)
         parts.append(values)
     translation, xyzw = parts
+    if not valid_positions(translation):
+        raise _error(path, fields["translation"], "translation is too far away", "metres")
     length = float(np.linalg.norm(xyzw))
     if not abs(length - 1) < 0.01:
         raise _error(path, fields["rotation_xyzw"], f"rotation_xyzw must have length 1, has {length:g}", "x, y, z, w")

@@ -12,9 +12,11 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import TruthObject
+from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/1"  # The value of the key "format", which is the file type and its version.
+_UNIT = 1e-3  # The largest difference of the length of a direction from 1. A larger value accepts worse directions.
 _T = TypeVar("_T")
 
 
@@ -129,6 +131,13 @@ def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[
     return tuple(parsed)
 
 
+def _stamp(entry: dict[str, Any], name: str) -> float:
+    stamp = _number(entry.get(name), name, null=True)
+    if abs(stamp) > MAX_STAMP:
+        raise _Malformed(f"{name} must be a stamp in seconds")
+    return stamp
+
+
 def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     if entry.get("status") == "unresolved":
         return None
@@ -144,28 +153,39 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         if not isinstance(covariance, list) or len(covariance) != 3:
             raise _Malformed("covariance must be 3 rows of 3 numbers, or null")
         covariance = np.stack([_vector(row, "a row of covariance") for row in covariance])
+        if (fault := covariance_fault(covariance)) is not None:
+            raise _Malformed(f"covariance {fault}")
+        if not (np.diagonal(covariance) < MAX_POSITION**2).all():
+            raise _Malformed(f"covariance has a standard deviation beyond {MAX_POSITION:g} m")
     if extent is not None:
         extent = tuple(_vector(extent, "extent", 2).tolist())
+        if not all(0 <= side < MAX_POSITION for side in extent):
+            raise _Malformed("extent must be a width and a height in metres")
     if ray is not None:
         if not isinstance(ray, dict):
             raise _Malformed("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
+        if not valid_positions(ray[0]) or not abs(float(np.linalg.norm(ray[1])) - 1) < _UNIT:
+            raise _Malformed("ray must have an origin in reach and a direction of length 1")
     if labels is not None:
         if not isinstance(labels, dict):
             raise _Malformed("labels must be a mapping of labels to shares")
         labels = {_text(name, "a name in labels"): _number(share, "a share in labels") for name, share in labels.items()}
+    position = _vector(entry.get("position"), "position", null=status == "unresolved")
+    if status == "ok" and not valid_positions(position):
+        raise _Malformed(f"position is not below {MAX_POSITION:g} m")
     return MapObject(
         id=_integer(entry, "id"),
         label=_text(entry.get("label"), "label"),
-        position=_vector(entry.get("position"), "position", null=status == "unresolved"),
+        position=position,
         covariance=covariance,
         status=status,
         rays=_integer(entry, "rays"),
         frames=_integer(entry, "frames"),
         parallax_deg=_number(entry.get("parallax_deg"), "parallax_deg", null=True),
         rms_deg=_number(entry.get("rms_deg"), "rms_deg", null=True),
-        first_seen=_number(entry.get("first_seen"), "first_seen", null=True),
-        last_seen=_number(entry.get("last_seen"), "last_seen", null=True),
+        first_seen=_stamp(entry, "first_seen"),
+        last_seen=_stamp(entry, "last_seen"),
         extent=extent,
         ray=ray,
         labels=labels,

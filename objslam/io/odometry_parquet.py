@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from objslam.core.arrays import Floats
+from objslam.core.validity import covariance_fault, rigid_poses, valid_stamps
 from objslam.errors import OutputError
 
 _COLUMNS = {"before": 1, "after": 1, "motion": 16, "covariance": 36}  # How many numbers each column has in a row.
@@ -50,8 +51,15 @@ def read_motions(file: Path) -> Motions:
             found[name] = values.to_numpy(zero_copy_only=False).astype(np.float64)
         count = table.num_rows
         motion, covariance = found["motion"].reshape(count, 4, 4), found["covariance"].reshape(count, 6, 6)
-        if not all(np.isfinite(values).all() for values in found.values()):
-            raise ValueError("a value is not finite")
+        if not all(len(values) == count * size for values, size in zip(found.values(), _COLUMNS.values(), strict=True)):
+            raise ValueError("a column has empty cells")
+        motion, rigid = rigid_poses(motion)
+        if not rigid.all():
+            raise ValueError("a motion is not a rigid pose")
+        if (fault := covariance_fault(covariance)) is not None:
+            raise ValueError(f"a covariance {fault}")
+        if not (valid_stamps(found["before"]) & (found["before"] < found["after"]) & valid_stamps(found["after"])).all():
+            raise ValueError("a motion does not lead from an earlier stamp to a later one")
     except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError) as error:
         raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
     return Motions(found["before"], found["after"], motion, covariance)

@@ -8,8 +8,13 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.errors import OutputError
+from objslam.core.validity import MAX_POSITION, box_rules, valid_depths, valid_positions, valid_stamps
+from objslam.errors import OutputError, first_line
 from objslam.io.atomic_files import encode
+
+_NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
+_NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
+_UNIT = 1e-3  # The largest difference of a squared length of a direction from 1. A larger value accepts worse directions.
 
 
 @dataclass(frozen=True)
@@ -74,39 +79,65 @@ def dump_rays(rays: RaysTable) -> bytes:
 
 
 def read_rays(file: Path) -> RaysTable:
-    """Read a rays.parquet. Raises OutputError if the file is missing, damaged or from an older version."""
+    """Read a rays.parquet. Raises OutputError if the file is missing, damaged, from an older version or not of a run."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    def numbers(name: str) -> Floats:
-        return np.asarray(table[name].to_numpy(), dtype=np.float64)
-
-    def rows(name: str, length: int) -> Floats:
-        return np.asarray(table[name].combine_chunks().flatten().to_numpy(), dtype=np.float64).reshape(-1, length)
-
     try:
-        table = pq.read_table(file)
+        table = pq.read_table(file, partitioning=None)
+        columns = {name: _column(table, name, size) for name, size in _NUMBERS.items()}
+        columns |= {name: _texts(table, name) for name in ("camera", "label")}
         index = table["object"]
-        return RaysTable(
-            object=np.where(index.is_null(), -1, index.fill_null(-1).to_numpy()).astype(np.int64),
-            stamp=numbers("stamp"),
-            origin=rows("origin", 3),
-            direction=rows("direction", 3),
-            residual=numbers("residual"),
-            weight=numbers("weight"),
-            score=numbers("score"),
-            camera=np.array(table["camera"].to_pylist(), dtype=object),
-            box=rows("box", 4),
-            label=np.array(table["label"].to_pylist(), dtype=object),
-            sigma=numbers("sigma"),
-            residual_before=numbers("residual_before"),
-            image=rows("image", 2),
-            speed=numbers("speed"),
-            turn_rate=numbers("turn_rate"),
-        )
+        if not pa.types.is_integer(index.type):
+            raise ValueError("the column object holds no integers")
+        number = np.where(index.is_null(), -1, index.fill_null(-1).to_numpy()).astype(np.int64)
+        rays = RaysTable(object=number, **columns)
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
     except KeyError as error:
         raise OutputError(f"the column {error} is missing", where=str(file), hint="run again") from error
     except (pa.ArrowException, ValueError) as error:
-        raise OutputError(f"is damaged: {str(error).splitlines()[0]}", where=str(file), hint="run again") from error
+        raise OutputError(f"is damaged: {first_line(error)}", where=str(file), hint="run again") from error
+    if (fault := _fault(rays)) is not None:
+        raise OutputError(f"not what a run writes: a ray with {fault}", where=str(file), hint="run again")
+    return rays
+
+
+def _column(table: Any, name: str, size: int) -> Floats:
+    """Return a column of numbers (R,), or of lists of `size` numbers (R, size). An empty cell is NaN."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    column = table[name].combine_chunks()
+    kind = column.type if size == 1 else getattr(column.type, "value_type", pa.null())
+    if not pa.types.is_floating(kind):
+        raise ValueError(f"the column {name} has not {size} numbers in a row")
+    if size > 1 and (np.asarray(pc.list_value_length(column).fill_null(0)) != size).any():
+        raise ValueError(f"the column {name} has not {size} numbers in a row")
+    values = np.asarray((column if size == 1 else column.flatten()).to_numpy(zero_copy_only=False), dtype=np.float64)
+    return values if size == 1 else values.reshape(-1, size)
+
+
+def _texts(table: Any, name: str) -> Any:
+    texts = table[name].to_pylist()
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"the column {name} holds something else than texts")
+    return np.array(texts, dtype=object)
+
+
+def _fault(rays: RaysTable) -> str | None:
+    """Return what is wrong with a ray, None if all are valid."""
+    boxes = box_rules(rays.box, rays.score, np.ones(len(rays), dtype=bool))
+    angles = [np.isnan(angle) | ((angle >= 0) & (angle <= np.pi)) for angle in (rays.residual, rays.residual_before)]
+    rates = np.column_stack([rays.speed, rays.turn_rate, rays.image])
+    rules = (
+        (valid_stamps(rays.stamp), "a wrong stamp"),
+        (valid_positions(rays.origin), "a wrong origin"),
+        (np.abs((rays.direction**2).sum(axis=1) - 1) < _UNIT, "a direction that has not length 1"),
+        (angles[0] & angles[1], "a residual that is no angle"),
+        ((rays.weight >= 0) & (rays.weight <= 1), "a weight outside 0 to 1"),
+        (valid_depths(rays.sigma), "a sigma that is not above zero"),
+        ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that cannot be"),
+        *boxes,
+    )
+    return next((fault for fine, fault in rules if not fine.all()), None)

@@ -11,6 +11,7 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.types import Trajectory
+from objslam.core.validity import valid_pose_rows, valid_positions, valid_stamps
 from objslam.errors import LogError
 from objslam.io.text import Table, in_order, parse_numbers, read_lines, select, to_table
 
@@ -22,8 +23,8 @@ def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
     """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w, a
     yaw is in rad. Commas may separate the numbers, and the first line may name the columns.
 
-    Malformed lines, zero quaternions and poses out of time order are dropped and counted. Raises LogError if none is left,
-    or if the names of the columns are in another order.
+    Malformed lines, invalid poses and poses out of time order are dropped and counted. Raises LogError if none is left, or if
+    the names of the columns are in another order.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
@@ -31,14 +32,16 @@ def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
 def read_pose_table(path: Path, ledger: Ledger) -> Table:
     """Read a trajectory file as `read_trajectory` does, but return a table with its 8 columns."""
     table = _read_numbers(path, ledger)
-    with np.errstate(over="ignore"):
-        length = np.linalg.norm(table.values[:, 4:], axis=1)
-    turns = (length > 1e-6) & np.isfinite(length)
-    table = select(table, turns, "pose line with a zero quaternion", path, ledger)
+    table = select(table, valid_stamps(table.values[:, 0]), "pose line with a stamp that is too large", path, ledger)
+    table = select(
+        table, valid_positions(table.values[:, 1:4]), "pose line with a position that is too far away", path, ledger
+    )
+    turns = valid_pose_rows(table.values[:, 1:])
+    table = select(table, turns, "pose line with a quaternion that is zero or too long", path, ledger)
     forward = in_order(table.values[:, 0])
     table = select(table, forward, "pose line with a stamp that repeats or goes back", path, ledger)
     if not len(table.lines):
-        raise LogError("no usable pose, every quaternion is zero", where=str(path))
+        raise LogError("no usable pose: every stamp, position or quaternion is invalid", where=str(path))
     off = np.abs(np.linalg.norm(table.values[:, 4:], axis=1) - 1) > 0.01
     if off.any():
         first = f"{path}:{table.lines[off][0]}"

@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory, Truth
@@ -14,6 +16,7 @@ from objslam.io.odometry_parquet import Motions, read_motions
 from objslam.io.rays_parquet import RaysTable, read_rays
 from objslam.io.tum_trajectory import read_trajectory
 from objslam.results import files
+from objslam.results.shapes import EvaluationFile, Summary, fault_of
 
 
 def load_map(out: Path) -> ObjectMap:
@@ -22,21 +25,32 @@ def load_map(out: Path) -> ObjectMap:
 
 
 def load_summary(out: Path) -> dict[str, Any]:
-    """Read summary.json of the result folder `out`. OutputError if it is missing or not a JSON object."""
-    return load_json(_existing(out, files.SUMMARY))
+    """Read summary.json of the result folder `out`. OutputError if it is missing or not what a run writes."""
+    return _load_json(_existing(out, files.SUMMARY), Summary)
 
 
-def load_json(file: Path) -> dict[str, Any]:
-    """Read a file that holds one JSON object. OutputError if it cannot be read, or holds something else."""
+def load_evaluation(out: Path) -> dict[str, Any] | None:
+    """Read evaluation.json of the result folder `out`, None if there is none. OutputError if `eval` did not write it so."""
+    file = out / files.EVALUATION
+    return _load_json(file, EvaluationFile) if file.is_file() else None
+
+
+def _load_json(file: Path, shape: type[BaseModel]) -> dict[str, Any]:
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except OSError as error:
         raise OutputError(f"cannot be read: {error.strerror or error}", where=str(file)) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise OutputError(f"is not JSON: {error}", where=str(file)) from error
     if not isinstance(data, dict):
         raise OutputError("is not a JSON object", where=str(file))
+    if (fault := fault_of(data, shape)) is not None:
+        raise OutputError(f"not what objslam writes: {fault}", where=str(file))
     return data
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number in JSON")
 
 
 def load_trajectory(out: Path) -> Trajectory:

@@ -48,7 +48,7 @@ def test_a_ros_calibration_is_read(tmp_path):
     "camera",
     [
         Camera("camera", 640, 480, np.array([[0.1 + 0.2, 0, 1 / 3], [0, 1e-5, 2 / 3], [0, 0, 1]])),
-        Camera("yes", 1, 2, np.diag([1e17, 3.3e22, 1]), "equidistant", np.array([1e-300, -2e-5, 3, 0.1]), depth_scale=1 / 3),
+        Camera("yes", 1, 2, np.diag([1e6, 3.3e-6, 1]), "equidistant", np.array([1e-300, -2e-5, 3, 0.1]), depth_scale=3.3e22),
         Camera("Küche 1", 9, 9, np.diag([9.0, 9, 1]), "rational_polynomial", np.arange(14) / 7, depth_scale=1e-6),
     ],
 )

@@ -155,8 +155,8 @@ def test_a_malformed_frame_is_dropped_and_named(tmp_path, frame, reason):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"boxes": [[1, 2, float("nan"), 4]]}, "box with a corner that is not finite"),
-        ({"boxes": [[1, 2, float("inf"), 4]]}, "box with a corner that is not finite"),
+        ({"boxes": [[1, 2, float("nan"), 4]]}, "box with a corner that is not finite or too large"),
+        ({"boxes": [[1, 2, float("inf"), 4]]}, "box with a corner that is not finite or too large"),
         ({"boxes": [[3, 2, 3, 4]]}, "box without area (x2 <= x1 or y2 <= y1)"),
         ({"boxes": [[1, 4, 3, 2]]}, "box without area (x2 <= x1 or y2 <= y1)"),
         ({"scores": [1.5]}, "box with a score outside 0 to 1"),
@@ -183,7 +183,7 @@ def test_a_depth_that_cannot_be_is_unknown_and_counted(tmp_path, depth):
     detections, ledger, file = _read(tmp_path, _GOOD | {"depths": [depth]}, _GOOD | {"stamp": 2.0, "depths": [None]})
     assert np.isnan(detections.depths).all()
     assert len(detections) == 2
-    assert ledger.dropped == {"depth of a box that is not above zero (taken as unknown)": 1}
+    assert ledger.dropped == {"depth of a box that is not above zero or too large (taken as unknown)": 1}
     assert next(iter(ledger.examples.values())) == [f"{file}:1"]
 
 

@@ -137,3 +137,10 @@ def test_images_are_decoded_in_one_place():
         if isinstance(node, ast.Attribute) and node.attr in decoding
     }
     assert found == {"io/images.py"}
+
+
+def test_a_jpeg_with_hundreds_of_scans_is_refused():
+    whole = cv2.imencode(".jpg", np.zeros((2048, 2048, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    last = whole.rindex(b"\xff\xda")
+    assert decode_colour(whole) is not None
+    assert decode_colour(whole[:last] + 200 * whole[last:-2] + b"\xff\xd9") is None

@@ -115,11 +115,20 @@ def test_every_bad_line_is_dropped_and_named(tmp_path):
     assert places == {
         "pose line that is not 8 numbers": [2, 3, 4],
         "pose line with a value that is not finite": [5, 6],
-        "pose line with a zero quaternion": [7, 8, 9],
+        "pose line with a quaternion that is zero or too long": [7, 8, 9],
         "pose line with a stamp that repeats or goes back": [11, 12],
     }
     assert ledger.dropped["pose line that is not 8 numbers"] == 4
     assert all(place.startswith(f"{file}:") for found in ledger.examples.values() for place in found)
+
+
+@pytest.mark.parametrize("line", ["1e21 0 0 0 0 0 0 1", "1 0 1e7 0 0 0 0 1", "1 0 0 0 0 0 0 1e4"])
+def test_a_number_that_is_too_large_is_dropped(tmp_path, line):
+    file = tmp_path / "odometry.txt"
+    file.write_text(f"{line}\n2 9.9e6 0 0 0 0 0 1\n")
+    ledger = Ledger()
+    assert read_trajectory(file, ledger).stamps.tolist() == [2]
+    assert list(ledger.dropped.values()) == [1]
 
 
 def test_no_pose_left(tmp_path):

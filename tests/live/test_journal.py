@@ -1,5 +1,7 @@
 """Journals: what goes in comes out, and damage costs no more than what it hit."""
 
+import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
+from objslam.core.validity import is_name
 from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
 from objslam.sources import read
@@ -35,14 +38,18 @@ POSES = st.builds(
 )
 
 
+NAMES = st.text(max_size=9).filter(is_name)
+
+
 @st.composite
 def frames(draw):
     count = draw(st.integers(0, 4))
+    corner = draw(npst.arrays(np.float64, (count, 2), elements=FINITE))
     return FrameMessage(
         draw(FINITE),
-        draw(st.text(max_size=5)),
-        draw(npst.arrays(np.float64, (count, 4), elements=FINITE)),
-        tuple(draw(st.lists(st.text(max_size=5), min_size=count, max_size=count))),
+        draw(NAMES),
+        np.hstack([corner, corner + draw(npst.arrays(np.float64, (count, 2), elements=st.floats(0.01, 1e6)))]),
+        tuple(draw(st.lists(NAMES, min_size=count, max_size=count))),
         draw(npst.arrays(np.float64, count, elements=st.floats(0, 1))),
         draw(npst.arrays(np.float64, count, elements=st.one_of(st.just(np.nan), st.floats(0.1, 10)))),
         draw(npst.arrays(np.int64, count, elements=st.integers(-1, 9))),
@@ -51,13 +58,14 @@ def frames(draw):
 
 
 def calibrations(count):
-    numbers = [npst.arrays(np.float64, shape, elements=FINITE) for shape in (count, (count, count), count)]
-    return st.builds(Calibration, st.tuples(*[st.text(max_size=9)] * count), *numbers)
+    values = npst.arrays(np.float64, count, elements=FINITE)
+    roots = npst.arrays(np.float64, (count, count), elements=st.floats(-1e3, 1e3))
+    return st.builds(Calibration, st.tuples(*[NAMES] * count), values, roots.map(lambda root: root @ root.T), values)
 
 
 MESSAGES = st.one_of(
     st.builds(PoseMessage, st.sampled_from(["odometry", "localization"]), FINITE, POSES),
-    st.builds(MountMessage, FINITE, st.text(max_size=9), POSES),
+    st.builds(MountMessage, FINITE, NAMES, POSES),
     st.builds(NoteMessage, FINITE, POSES),
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations)),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
@@ -88,6 +96,42 @@ def test_bytes_that_are_no_message(data):
         data = data[:1] + b"\x00" + data[1:]  # no JSON begins so, and no other record is so short
     with pytest.raises(LogError, match="record"):
         decode(data[:90])
+
+
+def record(kind, *content):
+    return kind + json.dumps(content).encode()
+
+
+FLAT = np.eye(4).ravel().tolist()
+TWICE = (2 * np.eye(4)).ravel().tolist()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        struct.pack("<c13d", b"O", np.inf, *FLAT[:12]),
+        struct.pack("<c13d", b"O", 1.0, *FLAT[:3], np.inf, *FLAT[4:12]),
+        struct.pack("<c13d", b"L", 1.0, *FLAT[:3], 1e8, *FLAT[4:12]),
+        struct.pack("<c13d", b"O", 1.0, *TWICE[:12]),
+        struct.pack("<cd12dH", b"M", 1.0, *TWICE[:12], 5) + b"front",
+        struct.pack("<cd12dH", b"M", 1.0, *FLAT[:12], 2) + b"\xff\xff",
+        record(b"N", 0.0, TWICE),
+        record(b"N", np.nan, FLAT),
+        record(b"N", 10**400, FLAT),
+        b"N" + b"[" * 100_000,
+        record(b"S", 1, ["clock"], [0.1], [[-1.0]], [1.0]),
+        record(b"S", np.inf, ["clock"], [0.1], [[1.0]], [1.0]),
+        record(b"C", "front", 640, 480, np.eye(3).ravel().tolist(), "plumb_bob", [0.0] * 5, TWICE, 1000.0),
+        record(b"C", "front", 640, 480, np.eye(3).ravel().tolist(), ["plumb_bob"], [0.0] * 5, FLAT, 1000.0),
+        record(b"C", "front", np.inf, 480, np.eye(3).ravel().tolist(), "plumb_bob", [0.0] * 5, FLAT, 1000.0),
+        record(b"F", 1.0, "front", [[9, 9, 1, 1]], ["cup"], [0.5], [1.0], [-1]),
+        record(b"F", 1.0, "front", [[1, 1, 9, 9]], ["cup"], [0.5], [1.0], [2**70]),
+        record(b"F", 1.0, "front", [[1, 1, 9, 9]], ["\ud800"], [0.5], [1.0], [-1]),
+    ],
+)
+def test_a_value_that_no_session_accepts_is_refused(data):
+    with pytest.raises(LogError, match="record"):
+        decode(data)
 
 
 def write(file, found, resume=False):

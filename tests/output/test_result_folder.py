@@ -64,8 +64,12 @@ def same_object(a: MapObject, b: MapObject) -> bool:
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 texts = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=12)
-vectors = hnp.arrays(np.float64, 3, elements=finite)
+vectors = hnp.arrays(np.float64, 3, elements=st.floats(-9.9e6, 9.9e6))
+directions = st.sampled_from([np.array([0.6, 0.0, -0.8]), np.array([0.0, -0.0, 1.0])])
+covariances = hnp.arrays(np.float64, (3, 3), elements=st.floats(-1e3, 1e3)).map(lambda root: root @ root.T)
 maybe = finite | st.just(math.nan)
+stamps = st.floats(-1e20, 1e20) | st.just(math.nan)
+sides = st.floats(0.0, 9.9e6)
 
 
 @st.composite
@@ -75,16 +79,16 @@ def map_objects(draw: st.DrawFn, number: int) -> MapObject:
         id=number,
         label=draw(texts),
         position=draw(vectors),
-        covariance=draw(st.none() | hnp.arrays(np.float64, (3, 3), elements=finite)),
+        covariance=draw(st.none() | covariances),
         status=status,
         rays=draw(st.integers(0, 10**9)),
         frames=draw(st.integers(0, 10**9)),
         parallax_deg=draw(maybe),
         rms_deg=draw(maybe),
-        first_seen=draw(maybe),
-        last_seen=draw(maybe),
-        extent=draw(st.none() | st.tuples(finite, finite)),
-        ray=draw(st.none() | st.tuples(vectors, vectors)) if status == "unresolved" else None,
+        first_seen=draw(stamps),
+        last_seen=draw(stamps),
+        extent=draw(st.none() | st.tuples(sides, sides)),
+        ray=draw(st.none() | st.tuples(vectors, directions)) if status == "unresolved" else None,
     )
 
 

@@ -1,20 +1,25 @@
 """Checks of pushed messages. They turn values of any type into valid numbers, labels, cameras and frames, or refuse them."""
 
-import math
 from collections.abc import Mapping, Set
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import COEFFICIENTS, Camera
 from objslam.core.types import MAX_BOXES
+from objslam.core.validity import (
+    MAX_LIVE_STAMP,
+    box_rules,
+    camera_fault,
+    is_name,
+    rigid_pose,
+    valid_depths,
+    valid_stamps,
+)
 from objslam.sources.journal.records import FrameMessage
 
-LARGEST = 1e9  # The largest valid length, m or px. A larger value accepts more wrong lengths.
-_LATEST = 1e11  # The largest valid stamp, s. Above it, a float is too coarse for microseconds. A larger value accepts more.
-_RIGID = 1e-3  # The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations.
 _LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
 _LETTERS = 80  # The most letters of a message's text in a report. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
@@ -47,7 +52,7 @@ def track_numbers(values: object, count: int) -> Ints | None:
 def stamp_of(value: object) -> float | None:
     """Return a stamp, s; None if the value is no number, not finite or out of range."""
     found = floats(value)
-    return float(found) if found is not None and abs(float(found)) <= _LATEST else None
+    return float(found) if found is not None and valid_stamps(found, MAX_LIVE_STAMP) else None
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
@@ -58,11 +63,6 @@ def label_list(labels: object) -> tuple[object, ...] | None:
         return tuple(labels)  # type: ignore[arg-type]
     except Exception:  # noqa: BLE001 - a foreign object may raise anything; its message is refused and counted
         return None
-
-
-def is_name(value: object) -> bool:
-    """Return whether a value is a printable text on one line that is not blank."""
-    return isinstance(value, str) and value.isprintable() and bool(value.strip())
 
 
 def is_camera_name(value: object) -> bool:
@@ -78,15 +78,9 @@ def told(value: object) -> str:
 
 
 def rigid(pose: object) -> Floats | None:
-    """Copy a rigid pose into an array (4, 4); None if the pose is not rigid, not finite or larger than LARGEST."""
+    """Copy a rigid pose into an array (4, 4) with an exact rotation; None if `validity.rigid_poses` refuses it."""
     matrix = floats(pose, 4, 4)
-    if matrix is None or not np.isfinite(matrix).all() or np.abs(matrix[:3]).max() > LARGEST:
-        return None
-    rotation = matrix[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0:
-        return None
-    matrix[3] = (0.0, 0.0, 0.0, 1.0)
-    return matrix
+    return None if matrix is None else rigid_pose(matrix)
 
 
 def sound_camera(camera: object) -> Camera | str:
@@ -94,26 +88,26 @@ def sound_camera(camera: object) -> Camera | str:
     if not isinstance(camera, Camera) or not is_camera_name(camera.name):
         return "without a name"
     matrix, distortion = floats(camera.matrix, 3, 3), _array(camera.distortion, np.float64)
-    if matrix is None or not _is_pinhole(matrix):
+    if matrix is None:
         return "without a calibration"
     width, height = _count(camera.width), _count(camera.height)
     if width is None or height is None:
         return "without a size"
     model: object = camera.distortion_model
-    counts = COEFFICIENTS.get(camera.distortion_model, ()) if isinstance(model, str) else ()
-    if distortion is None or distortion.ndim != 1 or len(distortion) not in counts or not np.isfinite(distortion).all():
+    if distortion is None or not isinstance(model, str) or model not in COEFFICIENTS:
         return "with an unknown lens model"
     base_T_camera = rigid(camera.base_T_camera)
     if base_T_camera is None:
         return "whose mount is not a rigid pose"
     scale = floats(camera.depth_scale)
-    if scale is None or not 0 < float(scale) < math.inf:
+    if scale is None:
         return "whose depth scale is not above zero"
     sees_size: object = camera.sees_size
     if not isinstance(sees_size, bool | np.bool_):
         return "whose sees_size is neither true nor false"
     lens = matrix, camera.distortion_model, distortion
-    return Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size))
+    copied = Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size))
+    return camera_fault(copied) or copied
 
 
 def sound_frame(
@@ -139,15 +133,8 @@ def sound_frame(
     if corners is None or score is None or depth is None or track is None:
         return malformed
     names = np.array([is_name(word) for word in words], dtype=bool)
-    with np.errstate(invalid="ignore"):
-        area = (corners[:, 2] > corners[:, 0]) & (corners[:, 3] > corners[:, 1])
-        depth = np.where((depth > 0) & (depth <= LARGEST), depth, np.nan)
-    rules: tuple[tuple[Bools, str], ...] = (
-        (np.asarray(np.isfinite(corners).all(axis=1)), "box with a corner that is not finite"),
-        (area, "box without area (x2 <= x1 or y2 <= y1)"),
-        ((score >= 0) & (score <= 1), "box with a score outside 0 to 1"),
-        (names, "box with a label that is empty or not printable"),
-    )
+    rules = box_rules(corners, score, names)
+    depth = np.where(valid_depths(depth), depth, np.nan)
     good, left_out = np.ones(count, dtype=bool), dict[str, int]()
     for fine, reason in rules:
         if not fine.all():
@@ -182,9 +169,4 @@ def _is_short(values: object, scalar: bool = False) -> bool:
 
 def _count(value: object) -> int | None:
     found = floats(value)
-    return int(found) if found is not None and 1 <= float(found) <= LARGEST and float(found).is_integer() else None
-
-
-def _is_pinhole(matrix: Floats) -> bool:
-    plain = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0, 0, 1])
-    return bool(plain and np.abs(matrix).max() <= LARGEST and min(matrix[0, 0], matrix[1, 1]) >= 1 / LARGEST)
+    return int(found) if found is not None and float(found).is_integer() else None

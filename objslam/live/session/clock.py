@@ -1,11 +1,13 @@
 """The clock of a session. It converts stamps to session time, which never goes back, even when the robot's clock does."""
 
+import math
 from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
 _SURE = 5  # The consecutive older poses that show that the clock was set back. A larger number is surer, but slower.
 _BACK = 0.5  # The least step back of a clock that is set back, s. With a smaller step, a pose is late instead.
+_LEAP = 60.0  # The least step ahead that a second pose must confirm, s. A smaller step lets a wrong stamp cost less.
 _KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
 
@@ -21,11 +23,20 @@ class Clock:
     shift: float = 0.0
     newest: float = -float("inf")
     _older: list[float] = field(default_factory=list)
+    _ahead: float | None = None
     _shifts: list[float] = field(default_factory=list)
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a new pose's stamp in session time, None if late or repeated, and whether the clock was set back."""
+        """Return a new pose's stamp in session time, None if it has none, and whether the clock was set back.
+
+        A pose that is late or repeated has none. A pose that leaps ahead has none either, until the next pose confirms it.
+        """
         time = stamp + self.shift
+        if self.newest + _LEAP < time and math.isfinite(self.newest):
+            before, self._ahead = self._ahead, stamp
+            if before is None or not before < stamp < before + _LEAP:
+                return None, False
+        self._ahead = None
         if time > self.newest:
             self.newest = time
             self._older.clear()
@@ -61,16 +72,23 @@ class Lead:
         self._clock, self._max_gap = clock, max_gap
         self._newest: dict[PathKind, float] = {}
         self._odometry_until = -float("inf")
+        self._unconfirmed = False
         self.path: PathKind | None = None
 
-    def choose(self, path: PathKind, at: float) -> None:
-        """Update the leading path for a new pose of a path. at: its session time, s.
+    def choose(self, path: PathKind, at: float) -> bool:
+        """Update the leading path for a new pose of a path. at: its session time, s. Return whether the pose may be used.
 
-        A path that leads again continues from its own newest stamp.
+        A path that leads again continues from its own newest stamp. Two localisations in a row must say that the odometry
+        is silent, because the stamp of a single one may be wrong.
         """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
+            if path == "localization" and self.path is not None and not self._unconfirmed:
+                self._unconfirmed = True
+                return False
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))
+        self._unconfirmed = False
+        return True
 
     def heard(self, path: PathKind, at: float) -> None:
         """Record that a pose of a path was accepted. at: its session time, s."""

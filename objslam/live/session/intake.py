@@ -13,6 +13,7 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse
 from objslam.core.snapshot import NOT_USED
+from objslam.core.validity import valid_positions
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
@@ -34,6 +35,7 @@ _FAR = 0.1  # The least difference from zero, m and rad, before such a gap. A la
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
+_ALONE = "with a stamp far ahead, which the next one did not confirm yet"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
 
 
@@ -157,13 +159,15 @@ class Intake:
             self.counters.accept(f"{path}{NOT_USED}")  # The user chose so (poses.use): nothing is lost.
             return False
         with self._lock:
-            self._lead.choose(path, given + self._clock.shift)
+            if not self._lead.choose(path, given + self._clock.shift):
+                return self._refuse(f"{path} {_ALONE}", f"stamp {given:.3f}")
             last = self._last.get(path)
             if path == self._lead.path:
                 at, back = self._clock.step(given)
                 if at is None:
                     again = last is not None and last.stamp == given + self._clock.shift
-                    fault = "with a repeated stamp" if again else "that is late"
+                    ahead = given + self._clock.shift > self.newest
+                    fault = "with a repeated stamp" if again else _ALONE if ahead else "that is late"
                     return self._refuse(f"{path} {fault}", f"stamp {given:.3f}")
                 if back:
                     self.counters.accept("clock set back")
@@ -174,6 +178,8 @@ class Intake:
                     return self._refuse(f"{path} that is late", f"stamp {given:.3f}")
             if path == "odometry":
                 matrix = self._continuous(at, matrix)
+                if not valid_positions(matrix[:3, 3]):
+                    return self._refuse("odometry that leads too far away", f"stamp {given:.3f}")
             message = PoseMessage(path, at, matrix)
             if not self._hand_on(message):
                 return False

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 _SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # These are types and actions of visualization_msgs/Marker.
+LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s.
 _MIN_SIZE = 0.05  # An object's marker has at least this diameter, m. Smaller markers are invisible at the scale of a room.
 _TEXT_SIZE = 0.15  # The text of a label has this height, m.
 
@@ -36,7 +37,8 @@ class MapMessages:
         return self.store.types[f"{package}/msg/{plain}"](*values)
 
     def header(self, stamp: float) -> Any:
-        """Make a std_msgs/Header from a stamp, s."""
+        """Make a std_msgs/Header from a stamp, s. A stamp that ROS cannot express becomes 0, which means unset in ROS."""
+        stamp = stamp if abs(stamp) < LAST_STAMP else 0.0
         time = self.make("builtin_interfaces/Time", *divmod(round(stamp * 1e9), 10**9))
         return self.make("std_msgs/Header", time, self.frame)
 

@@ -24,8 +24,8 @@ from objslam.output.plot.style import REJECTED_BELOW, captions, is_date, label_c
 from objslam.output.report.charts import Histogram, axis_end, histogram
 from objslam.output.report.crops import Crop, best_rays, cut_crops, images_of
 from objslam.output.report.trends import trends
-from objslam.results.files import CONFIG, EVALUATION, PICTURE, REPORT, SUMMARY
-from objslam.results.read import load_json, load_map, load_rays, load_truth
+from objslam.results.files import CONFIG, PICTURE, REPORT
+from objslam.results.read import load_evaluation, load_map, load_rays, load_summary, load_truth
 
 _BINS, _FEW_BINS = 32, 16  # The histogram of all rays has 32 bins. The histogram of one object has 16 bins.
 _COUNTS = {
@@ -79,7 +79,7 @@ def write_report(
     import jinja2
 
     progress("reading the result", 0, 0)
-    objects, rays, summary = load_map(out), load_rays(out), load_json(out / SUMMARY)
+    objects, rays, summary = load_map(out), load_rays(out), load_summary(out)
     try:
         settings = load_settings(out / CONFIG)
     except ConfigError as error:
@@ -126,7 +126,7 @@ def write_report(
         unexplained=summary.get("unexplained_share", {}),
         dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
-        costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if key in summary},
+        costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
         changed=_changed(settings),
         settings=dump_settings(settings),
     )
@@ -176,9 +176,8 @@ def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any]
     If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default.
     Without a ground truth, there are no errors, and the content is None.
     """
-    if (out / EVALUATION).is_file():
-        scores = load_json(out / EVALUATION)
-    else:
+    scores = load_evaluation(out)
+    if scores is None:
         if load_truth(out) is None:
             return {}, None
         scores = evaluate_folder(out).to_dict()

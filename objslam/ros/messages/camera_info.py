@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel
 from objslam.core.geometry import make_pose
+from objslam.core.validity import MAX_DISTORTION, camera_fault, rigid_pose
 from objslam.errors import LogError
 
 _MODELS = {
@@ -18,8 +20,6 @@ _MODELS = {
     "rational polynomial": "rational_polynomial",
 }  # The distortion models by the alternative names that drivers use.
 _UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # Models without distortion if D is zero.
-_MAX_PIXELS = 1 << 16  # The limit of width and height, px. A calibration with a larger image counts as damaged.
-_MAX_FOCAL = 1e7  # The limit of a camera matrix element, px. A calibration with a larger element counts as damaged.
 _HINT = "--camera-info FILE can give the calibration"
 
 
@@ -42,20 +42,18 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
     matrix[1, 2] -= region.y_offset
     matrix[0] /= across
     matrix[1] /= down
-    sane = (np.abs(matrix) < _MAX_FOCAL).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
-    if not (sane and 0 < width < _MAX_PIXELS > height > 0):
-        which = "P" if rectified else "K"
-        raise LogError(f"the camera is not calibrated ({which} or the size of the image is zero)", where=topic, hint=_HINT)
     matrix[0, 1] = matrix[1, 0] = matrix[2, 0] = matrix[2, 1] = 0.0
     matrix[2, 2] = 1.0
+    camera = Camera(name, width, height, matrix)
+    if camera_fault(camera) is not None:
+        which = "P" if rectified else "K"
+        what = f"the camera is not calibrated ({which} or the size of the image is zero or too large)"
+        raise LogError(what, where=topic, hint=_HINT)
     if rectified:
-        return Camera(name, width, height, matrix), np.eye(4)
+        return camera, np.eye(4)
     model, distortion = _distortion(info, topic)
-    rotation = _values(info, "R").reshape(3, 3)
-    turned = (np.abs(rotation) < 1.01).all() and np.linalg.det(rotation) > 0
-    turned = turned and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
-    camera = Camera(name, width, height, matrix, model, distortion)
-    return camera, make_pose(rotation if turned else np.eye(3), np.zeros(3))
+    turn = rigid_pose(make_pose(_values(info, "R").reshape(3, 3), np.zeros(3)))
+    return replace(camera, distortion_model=model, distortion=distortion), np.eye(4) if turn is None else turn
 
 
 def camera_names(frames: Iterable[str]) -> list[str]:
@@ -73,8 +71,8 @@ def _values(info: Any, name: str) -> Floats:
 
 def _distortion(info: Any, topic: str) -> tuple[DistortionModel, Floats]:
     values = _values(info, "D")
-    if not np.isfinite(values).all():
-        raise LogError("its distortion is not finite", where=topic)
+    if not (np.abs(values) < MAX_DISTORTION).all():
+        raise LogError("its distortion is not finite or too large", where=topic)
     given = str(info.distortion_model)
     name = _MODELS.get(given.lower().replace("-", " ").strip(), given)
     if not values.any() and name in _UNDISTORTED:

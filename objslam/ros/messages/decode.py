@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from objslam.ros.bag.records import Connection
 from objslam.ros.messages import definitions
+from objslam.ros.messages.layouts import missing_field
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -105,6 +106,8 @@ def typestores(name: str, encoding: str, definition: str, language: str) -> tupl
             store = get_typestore(Stores.EMPTY)
             store.register(types)
             store.get_msgdef(name)
+            if (missing := missing_field(store, name)) is not None:
+                raise ValueError(f"it has no usable field {missing}")
         except (TypesysError, SyntaxError, *_WRONG) as error:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0][:80]
             raise DecodeError(f"its definition cannot be used ({reason})") from error

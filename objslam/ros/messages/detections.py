@@ -71,8 +71,8 @@ def vision_boxes(message: Any) -> Iterator[Found]:
             track = detection.tracking_id if detection.is_tracking else ""
         else:
             track = getattr(detection, "id", "")
-        box = [place.x - width / 2, place.y - height / 2, place.x + width / 2, place.y + height / 2]
-        yield Found(box, label, score, str(track))
+        x, y, across, down = (float(value) for value in (place.x, place.y, width / 2, height / 2))
+        yield Found([x - across, y - down, x + across, y + down], label, score, str(track))
 
 
 def tag_boxes(message: Any) -> Iterator[Found]:
@@ -90,7 +90,7 @@ def tag_boxes(message: Any) -> Iterator[Found]:
 
 def _box_around(tag_corners: Any) -> list[float]:
     if hasattr(tag_corners[0], "x"):
-        corners = [(corner.x, corner.y) for corner in tag_corners]
+        corners = [(float(corner.x), float(corner.y)) for corner in tag_corners]
     else:
         corners = [(float(tag_corners[i]), float(tag_corners[i + 1])) for i in range(0, 8, 2)]
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners

@@ -119,7 +119,7 @@ def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
         raise DecodeError("its compressed depth is not PNG of 16 bits")
     if packing.startswith("32fc1"):
         a, b = np.frombuffer(data, dtype="<f4", count=2, offset=4)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             image = np.where(image > 0, a / (image - b), np.nan).astype(np.float32)
     return _depth_units(image)
 

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion
-
-_MAX_VALUES = np.array([1e9] * 3 + [1e3] * 4)  # The limits of x, y, z (m) and quaternion. Larger values count as damage.
-_SHORT = 1e-6  # The length limit below which a quaternion counts as zero. A valid quaternion has length 1.
+from objslam.core.validity import valid_pose_rows
 
 
 @dataclass
@@ -37,23 +35,19 @@ class PoseRows:
         """Return timestamps (N,), s, and valid poses (N, 4, 4) in the order of arrival.
         Invalid poses are counted as drops. `what` is the name of a pose in the drop reason."""
         values = np.frombuffer(self.values).reshape(-1, 7)
-        good = _are_poses(values)
+        good = valid_pose_rows(values)
         stamps = choose_times(self.stamps, self.logged) / 1e9
         where = None if good.all() else f"stamp {stamps[~good][0]:.3f}"
-        ledger.drop(f"{what} whose pose is invalid (not finite, or a zero quaternion)", int((~good).sum()), where)
+        ledger.drop(
+            f"{what} whose pose is invalid (not finite, too far away, or a zero quaternion)", int((~good).sum()), where
+        )
         return stamps[good], pose_from_quaternion(values[good, :3], values[good, 3:])
 
 
 def one_pose(place: Any, turn: Any) -> Floats | None:
     """Return the pose (4, 4) of a position (or translation) and an orientation message, None if it is invalid."""
     values = np.array([[place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]], dtype=np.float64)
-    return pose_from_quaternion(values[:, :3], values[:, 3:])[0] if _are_poses(values)[0] else None
-
-
-def _are_poses(values: Floats) -> Bools:
-    """Return the mask (N,) of valid poses among rows (N, 7) of x, y, z, qx, qy, qz, qw."""
-    good = np.asarray((np.abs(values) < _MAX_VALUES).all(axis=1))
-    return np.asarray(good & (np.linalg.norm(np.where(good[:, None], values[:, 3:], 0.0), axis=1) > _SHORT))
+    return pose_from_quaternion(values[:, :3], values[:, 3:])[0] if valid_pose_rows(values)[0] else None
 
 
 def choose_times(stamps: array[int], logged: array[int]) -> Ints:

@@ -84,7 +84,7 @@ class TfBuffer:
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
         if pose is None:
-            raise ValueError("transform whose pose is invalid (not finite, or a zero quaternion)")
+            raise ValueError("transform whose pose is invalid (not finite, too far away, or a zero quaternion)")
         time = transform.header.stamp
         stamp = time.sec + time.nanosec * 1e-9 or received  # The arrival time (s) replaces an unset timestamp.
         edge = self._edges.get(child)

@@ -3,6 +3,7 @@
 import json
 import struct
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,7 +11,16 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
-from objslam.core.camera import Camera
+from objslam.core.camera import COEFFICIENTS, Camera
+from objslam.core.validity import (
+    box_rules,
+    camera_fault,
+    covariance_fault,
+    is_name,
+    rigid_pose,
+    valid_depths,
+    valid_stamps,
+)
 from objslam.errors import LogError
 
 PathKind = Literal["odometry", "localization"]
@@ -138,53 +148,106 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Decode a message. Raises LogError if the bytes are no message."""
-    kind = data[:1]
+    """Decode a message. Raises LogError if the bytes are no message, or hold a value that no session accepts."""
     try:
-        if kind in _PATHS:
-            _, stamp, *rows = _POSE.unpack(data)
-            return PoseMessage(_PATHS[kind], stamp, _pose(rows))
-        if kind == _MOUNT_KIND:
-            _, stamp, *rows, length = _MOUNT.unpack_from(data)
-            name = data[_MOUNT.size :]
-            if len(name) != length:
-                raise ValueError("the camera's name has not the length that the record states")
-            return MountMessage(stamp, name.decode(), _pose(rows))
-        if kind == _NOTE_KIND:
-            clock, odometry = json.loads(data[1:])
-            return NoteMessage(float(clock), _array(odometry, (4, 4)))
-        if kind == CALIBRATION_KIND:
-            keyframe, names, values, covariance, prior = json.loads(data[1:])
-            n = len(names)
-            numbers = _array(values, (n,)), _array(covariance, (n, n)), _array(prior, (n,))
-            return CalibrationMessage(int(keyframe), Calibration(tuple(map(str, names)), *numbers))
-        if kind == _CAMERA_KIND:
-            name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
-            lens = (_array(matrix, (3, 3)), model, _array(distortion, (-1,)))
-            sees_size = bool(more[0]) if more else True  # Older journals do not store the flag.
-            return CameraMessage(Camera(name, width, height, *lens, _array(base_T_camera, (4, 4)), scale, sees_size))
-        if kind == _FRAME_KIND:
-            stamp, camera, boxes, labels, scores, depths, tracks, *whole = json.loads(data[1:])
-            if whole not in ([], [True]):
-                raise ValueError("the frame has too many fields")
-            known = _array(depths, (len(labels),))
-            return FrameMessage(
-                float(stamp),
-                camera,
-                _array(boxes, (len(labels), 4)),
-                tuple(labels),
-                _array(scores, (len(labels),)),
-                np.where(known > 0, known, np.nan),
-                np.array(tracks, dtype=np.int64).reshape(len(labels)),
-                bool(whole),
-            )
-    except (ValueError, TypeError, struct.error) as error:
+        reader = _READERS.get(data[:1])
+        if reader is None:
+            raise LogError(f"journal record of an unknown kind {data[:1]!r}")
+        return reader(data)
+    except (ValueError, TypeError, OverflowError, RecursionError, struct.error) as error:
         raise LogError(f"journal record that cannot be read: {error}") from error
-    raise LogError(f"journal record of an unknown kind {kind!r}")
 
 
-def _pose(rows: list[float]) -> Floats:
-    return np.array([*rows, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+def _read_pose(data: bytes) -> PoseMessage:
+    kind, stamp, *rows = _POSE.unpack(data)
+    return PoseMessage(_PATHS[kind], _stamp(stamp), _pose([*rows, 0.0, 0.0, 0.0, 1.0]))
+
+
+def _read_mount(data: bytes) -> MountMessage:
+    _, stamp, *rows, length = _MOUNT.unpack_from(data)
+    name = data[_MOUNT.size :]
+    if len(name) != length:
+        raise ValueError("the camera's name has not the length that the record states")
+    return MountMessage(_stamp(stamp), _name(name.decode()), _pose([*rows, 0.0, 0.0, 0.0, 1.0]))
+
+
+def _read_note(data: bytes) -> NoteMessage:
+    clock, odometry = json.loads(data[1:])
+    return NoteMessage(_stamp(clock), _pose(odometry))
+
+
+def _read_calibration(data: bytes) -> CalibrationMessage:
+    keyframe, names, values, covariance, prior = json.loads(data[1:])
+    n = len(names)
+    found = Calibration(tuple(map(_name, names)), _array(values, (n,)), _array(covariance, (n, n)), _array(prior, (n,)))
+    fault = covariance_fault(found.covariance)
+    if fault is not None:
+        raise ValueError(f"the covariance of the calibration {fault}")
+    return CalibrationMessage(_integer(keyframe), found)
+
+
+def _read_camera(data: bytes) -> CameraMessage:
+    name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
+    known = next((one for one in COEFFICIENTS if one == model), None)
+    if known is None:
+        raise ValueError("an unknown lens model")
+    inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
+    sees_size = bool(more[0]) if more else True  # Older journals do not store the flag.
+    size = _integer(width), _integer(height)
+    camera = Camera(_name(name), *size, inner, known, outer, _pose(base_T_camera), float(scale), sees_size)
+    fault = camera_fault(camera)
+    if fault is not None:
+        raise ValueError(f"camera {fault}")
+    return CameraMessage(camera)
+
+
+def _read_frame(data: bytes) -> FrameMessage:
+    stamp, camera, boxes, labels, scores, depths, tracks, *whole = json.loads(data[1:])
+    if whole not in ([], [True]):
+        raise ValueError("the frame has too many fields")
+    count = len(labels)
+    corners, score, depth = _array(boxes, (count, 4)), _array(scores, (count,)), _array(depths, (count,))
+    for fine, reason in box_rules(corners, score, np.array([is_name(label) for label in labels], dtype=bool)):
+        if not fine.all():
+            raise ValueError(reason)
+    depth = np.where(valid_depths(depth), depth, np.nan)
+    track = np.array(tracks, dtype=np.int64).reshape(count)
+    return FrameMessage(_stamp(stamp), _name(camera), corners, tuple(labels), score, depth, track, bool(whole))
+
+
+_READERS: dict[bytes, Callable[[bytes], Message]] = {
+    **dict.fromkeys(_PATHS, _read_pose),
+    _MOUNT_KIND: _read_mount,
+    _NOTE_KIND: _read_note,
+    CALIBRATION_KIND: _read_calibration,
+    _CAMERA_KIND: _read_camera,
+    _FRAME_KIND: _read_frame,
+}
+
+
+def _stamp(value: float) -> float:
+    if not valid_stamps(np.array(value, dtype=np.float64)):
+        raise ValueError("a stamp is not finite or too large")
+    return float(value)
+
+
+def _name(value: object) -> str:
+    if not is_name(value):
+        raise ValueError("a name that is empty or not printable")
+    return str(value)
+
+
+def _integer(value: object) -> int:
+    if type(value) is not int or value < 0:
+        raise ValueError("a count is not a whole number")
+    return value
+
+
+def _pose(values: list[float]) -> Floats:
+    pose = rigid_pose(_array(values, (4, 4)))
+    if pose is None:
+        raise ValueError("a pose that is not rigid, or too far away")
+    return pose
 
 
 def _array(values: list[float], shape: tuple[int, ...]) -> Floats:

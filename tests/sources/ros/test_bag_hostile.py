@@ -10,6 +10,7 @@ import zstandard
 from bag_writer import Raw, serialize, write_bag, write_mcap
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
@@ -248,3 +249,40 @@ def _schema_and_channel(data):
     assert op == 4
     assert zlib.crc32(data[start:end])
     return data[start : end + 9 + size]
+
+
+_HEADER_TEXT = "std_msgs/Header header\n"
+_OTHER_LAYOUTS = {
+    "nav_msgs/msg/Odometry": _HEADER_TEXT + "string child_frame_id\n",
+    "geometry_msgs/msg/PoseStamped": _HEADER_TEXT + "float64 pose\n",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _HEADER_TEXT + "float64[7] pose\n",
+    "tf2_msgs/msg/TFMessage": "std_msgs/Header[] transforms\n",
+    "sensor_msgs/msg/CameraInfo": _HEADER_TEXT + "uint32 height\nuint32 width\nfloat64[4] k\n",
+    "sensor_msgs/msg/Image": _HEADER_TEXT + "uint32 height\nuint32 width\n",
+    "sensor_msgs/msg/CompressedImage": _HEADER_TEXT + "uint8 format\n",
+    "vision_msgs/msg/Detection2DArray": _HEADER_TEXT + "string[] detections\n",
+    "apriltag_msgs/msg/AprilTagDetectionArray": _HEADER_TEXT + "int32 detections\n",
+}
+_OWN_HEADER = f"{'=' * 80}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+_OWN_TIME = f"{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+
+
+@pytest.mark.parametrize("type_", _OTHER_LAYOUTS)
+def test_a_known_name_with_other_fields(tmp_path, makers, type_):
+    text = _OTHER_LAYOUTS[type_] + _OWN_HEADER + _OWN_TIME
+    file = tmp_path / "drive.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(type_, "ros2msg", text.encode())
+        channel = writer.register_channel("/tf" if "tf2" in type_ else "/topic", "cdr", schema)
+        for t in range(3):
+            data = struct.pack("<4sIII4s", b"\0\1\0\0", t + 1, 0, 4, b"map\0") + struct.pack("<I", 1) * 40
+            writer.add_message(channel, t, data, t)
+        writer.finish()
+    info = describe(file, BagOptions())
+    (topic,) = info.topics
+    assert topic.messages == 3
+    assert len(topic.refused) == 1
+    with pytest.raises(LogError):
+        read_bag(file, Ledger())

@@ -28,10 +28,17 @@ def _dump(content: Content) -> bytes:
             where=str(content.out),
             hint="run again with --mode joint, and let poses.use include the log's odometry",
         )
+    if len(path) < 2 and len(motions.before):
+        raise OutputError("trajectory.txt and motions.parquet are from different runs: run again", where=str(content.out))
     before = np.minimum(np.searchsorted(path.stamps, motions.before), max(len(path) - 2, 0))
     if not (np.array_equal(path.stamps[before], motions.before) and np.array_equal(path.stamps[before + 1], motions.after)):
         raise OutputError("trajectory.txt and motions.parquet are from different runs: run again", where=str(content.out))
-    information = np.linalg.inv(motions.covariance)[:, *np.triu_indices(6)]
+    try:
+        information = np.linalg.inv(motions.covariance)[:, *np.triu_indices(6)]
+    except np.linalg.LinAlgError as error:
+        raise OutputError("motions.parquet has a covariance without an inverse", where=str(content.out)) from error
+    if not np.isfinite(information).all():
+        raise OutputError("motions.parquet has a covariance without an inverse", where=str(content.out))
     lines = [f"VERTEX_SE3:QUAT {i} {numbers}" for i, numbers in enumerate(_numbers(path.poses))]
     lines += [f"FIX {i}" for i in np.setdiff1d(np.arange(len(path)), before + 1).tolist()]
     edges = zip(before.tolist(), _numbers(motions.motion, information), strict=True)

@@ -21,7 +21,6 @@ _LATCHED = (
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
 """The offered QoS in the format of rosbag2: reliable and transient local, so that an RViz that joins late gets the map."""
-_LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s. It has no negative stamps.
 
 
 def _dump(content: Content) -> bytes:
@@ -32,10 +31,10 @@ def _dump(content: Content) -> bytes:
     """
     from mcap.writer import CompressionType, Writer
 
-    from objslam.output.export.map_messages import MapMessages
+    from objslam.output.export.map_messages import LAST_STAMP, MapMessages
 
     stamps = content.path.stamps
-    if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < _LAST_STAMP:
+    if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < LAST_STAMP:  # a file has no negative stamps
         raise OutputError("the stamps are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
     messages = MapMessages(content.objects.frame)
     start = float(stamps[0]) if len(stamps) else 0.0

@@ -1,0 +1,21 @@
+"""Parse YAML texts from outside, so that a text that PyYAML cannot construct is an error of YAML as well."""
+
+from typing import Any
+
+import yaml
+
+MAX_YAML = 1 << 20
+"""The most bytes of a YAML text. A larger text is refused unread, because PyYAML takes seconds for a megabyte. Settings need
+a few kB."""
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the plain data of a YAML text. Raises yaml.YAMLError for a text that is not YAML, too long or too deep."""
+    if len(text) > MAX_YAML:
+        raise yaml.YAMLError(f"longer than {MAX_YAML >> 20} MiB")
+    try:
+        return yaml.safe_load(text)
+    except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:  # from PyYAML's constructors
+        raise yaml.YAMLError(f"{error}, in a value that cannot be read") from error
+    except RecursionError as error:
+        raise yaml.YAMLError("nested too deeply") from error

@@ -1,0 +1,155 @@
+"""The rules for data from outside: stamps, poses, covariances, cameras, boxes. Every reader and every push applies them."""
+
+import math
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.camera import COEFFICIENTS, Camera
+
+MAX_POSITION = 1e7
+"""The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is further from the
+origin of its UTM zone, and a float still resolves a nanometre there."""
+MAX_STAMP = 1e20
+"""The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp in ns by mistake is below it, so the
+checks of a run can name this mistake."""
+MAX_LIVE_STAMP = 1e11
+"""The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. Above it, a float does not resolve
+10 us."""
+MAX_PIXEL = 1e7
+"""The bound of a box corner and of an element of a camera matrix, px. A larger bound accepts more wrong numbers. The largest
+image is a hundredth of it."""
+MAX_SIDE = 1 << 16
+"""The largest width and height of an image, px. A larger value accepts more wrong numbers. No robot's camera has more."""
+MAX_DISTORTION = 1e6
+"""The bound of a distortion coefficient. A larger bound accepts more wrong numbers. Calibrations that converged are far
+below it."""
+_RIGID = 1e-3
+"""The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
+are printed with four decimals are below it."""
+_ROUNDING = 1e-12
+"""The difference between R^T R and the identity up to which R stays as it is, bit by bit. A larger value leaves more
+rotations inexact. A product of a hundred rotations is below it."""
+_SHORTEST, _LONGEST = 1e-6, 1e3
+"""The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
+some programs do not normalise theirs."""
+_ASYMMETRY = 1e-6
+"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share takes
+files that somebody rounded more."""
+_NEGATIVE = 1e-6
+"""How far below zero the least eigenvalue of a correlation matrix may be. A larger value takes covariances that somebody
+rounded more."""
+
+
+def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
+    """Return which stamps (...), s, are finite and at most `bound`."""
+    return np.asarray(np.abs(stamps) <= bound)
+
+
+def valid_positions(positions: Floats) -> Bools:
+    """Return which positions (..., 3), m, are finite and below `MAX_POSITION` in each coordinate."""
+    return np.asarray((np.abs(positions) < MAX_POSITION).all(axis=-1))
+
+
+def valid_pose_rows(rows: Floats) -> Bools:
+    """Return which rows (N, 7) of x, y, z, m, and a quaternion qx, qy, qz, qw of any length are poses."""
+    turns = np.asarray((np.abs(rows[:, 3:]) < _LONGEST).all(axis=1))
+    turns &= np.linalg.norm(np.where(turns[:, None], rows[:, 3:], 0.0), axis=1) > _SHORTEST
+    return turns & valid_positions(rows[:, :3])
+
+
+def rigid_poses(poses: Floats) -> tuple[Floats, Bools]:
+    """Return rigid poses (N, 4, 4) with exact rotations, and which of the poses (N, 4, 4) are rigid at all.
+
+    A pose is rigid if its position is valid, its last row is 0, 0, 0, 1, and its rotation is within 1e-3 of an exact one, in
+    every entry of R^T R. The nearest exact rotation (Kabsch 1976) replaces one that is off by more than rounding. The
+    identity replaces a pose that is not rigid.
+    """
+    rotation = poses[:, :3, :3]
+    sane = valid_positions(poses[:, :3, 3]) & np.asarray((np.abs(rotation) < 2).all(axis=(1, 2)))
+    sane &= np.asarray((poses[:, 3] == [0.0, 0.0, 0.0, 1.0]).all(axis=1))
+    exact = np.where(sane[:, None, None], poses, np.eye(4))
+    rotation = exact[:, :3, :3]
+    off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
+    good = sane & (off <= _RIGID) & (np.linalg.det(rotation) > 0)
+    inexact = np.flatnonzero(good & (off > _ROUNDING))
+    left, _, right = np.linalg.svd(rotation[inexact])
+    exact[inexact, :3, :3] = left @ right
+    exact[~good] = np.eye(4)
+    return exact, good
+
+
+def rigid_pose(pose: Floats) -> Floats | None:
+    """Return a rigid pose (4, 4) with an exact rotation, as `rigid_poses` does; None if the pose is not rigid."""
+    exact, good = rigid_poses(pose[None])
+    return exact[0] if good[0] else None
+
+
+def covariance_fault(covariance: Floats) -> str | None:
+    """Return what is wrong with covariances (..., P, P), in words that follow their name; None if all are valid.
+
+    A covariance is finite, symmetric and not negative in any direction. The last two are judged after a division by the
+    standard deviations, because the units differ.
+    """
+    if not np.isfinite(covariance).all():
+        return "has a number that is not finite"
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    if (variance < 0).any():
+        return "has a negative variance"
+    sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
+    with np.errstate(over="ignore", under="ignore"):
+        correlation = covariance / sigma[..., :, None] / sigma[..., None, :]
+    mirrored = np.swapaxes(correlation, -1, -2)
+    with np.errstate(invalid="ignore", over="ignore"):
+        if not (np.abs(correlation - mirrored) <= _ASYMMETRY).all():
+            return "is not symmetric"
+    if not (np.abs(correlation) <= 1 + _NEGATIVE).all():
+        return "has a correlation beyond 1"
+    if covariance.size and np.linalg.eigvalsh((correlation + mirrored) / 2).min() < -_NEGATIVE:
+        return "is negative in some direction"
+    return None
+
+
+def camera_fault(camera: Camera) -> str | None:
+    """Return what is wrong with a camera whose fields have the right types, in words that follow "camera"; None if valid.
+
+    The pose of the camera must be rigid already, because `rigid_pose` returns the exact one.
+    """
+    matrix = camera.matrix
+    if matrix.shape != (3, 3) or not (np.abs(matrix) < MAX_PIXEL).all():
+        return "without a calibration"
+    if matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]) or min(matrix[0, 0], matrix[1, 1]) < 1 / MAX_PIXEL:
+        return "without a calibration"
+    if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
+        return "without a size"
+    distortion, counts = camera.distortion, COEFFICIENTS.get(camera.distortion_model, ())
+    if distortion.ndim != 1 or len(distortion) not in counts or not (np.abs(distortion) < MAX_DISTORTION).all():
+        return "with an unknown lens model"
+    if camera.base_T_camera.shape != (4, 4) or not rigid_poses(camera.base_T_camera[None])[1][0]:
+        return "whose mount is not a rigid pose"
+    return None if 0 < camera.depth_scale < math.inf else "whose depth scale is not above zero"
+
+
+def is_name(value: object) -> bool:
+    """Return whether a value is a printable text on one line that is not blank."""
+    return isinstance(value, str) and value.isprintable() and bool(value.strip())
+
+
+def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
+    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop the others.
+
+    scores: (M,). names: (M,) whether the label of each box `is_name`.
+    """
+    with np.errstate(invalid="ignore"):
+        area = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
+    return (
+        (np.asarray((np.abs(boxes) < MAX_PIXEL).all(axis=1)), "box with a corner that is not finite or too large"),
+        (area, "box without area (x2 <= x1 or y2 <= y1)"),
+        ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
+        (names, "box with a label that is empty or not printable"),
+    )
+
+
+def valid_depths(depths: Floats) -> Bools:
+    """Return which depths (...), m, are above zero and below `MAX_POSITION`."""
+    return np.asarray((depths > 0) & (depths < MAX_POSITION))

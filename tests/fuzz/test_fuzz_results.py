@@ -1,0 +1,110 @@
+"""Mutated result folders, as somebody else may send them, in every command that reads one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mutations import ROUNDS, altered, as_json, mutated, survives
+from synthetic_result import clusters, synthetic_result
+
+from objslam.config import Output, Settings
+from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
+from objslam.io.odometry_parquet import Motions, dump_motions
+from objslam.output.export import write_export
+from objslam.output.export.formats import FORMATS
+from objslam.output.report import write_report
+from objslam.output.result_folder import write_result
+from objslam.results import files
+from objslam.results.read import load_trajectory
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole result with ground truth, evaluation, shared errors and motions."""
+    out = tmp_path_factory.mktemp("result")
+    positions, labels = clusters()
+    plain = Settings(mode="joint", output=Output(recording=False, picture=False))
+    run, truth = synthetic_result(positions[:3], labels[:3], keyframes=12, unresolved=(2,), settings=plain)
+    write_result(run, out, truth)
+    write_evaluation(evaluate_folder(out), out)
+    summary = json.loads((out / files.SUMMARY).read_text())
+    error = {"value": 0.1, "sigma": 0.01, "prior_sigma": 0.1, "unit": "share", "observable": True}
+    summary |= {
+        "calibration": {"parameters": {"odometry.scale": error}, "traded_off": [["a", "b"]]},
+        "seconds": {"solve": 1.0},
+    }
+    summary |= {
+        "dropped": {"box": 1},
+        "dropped_examples": {"box": ["here"]},
+        "unexplained_share": {"cup": 0.1},
+        "cost_before": 1.0,
+    }
+    (out / files.SUMMARY).write_text(json.dumps(summary))
+    stamps = load_trajectory(out).stamps
+    steps = len(stamps) - 1
+    motions = Motions(stamps[:-1], stamps[1:], np.tile(np.eye(4), (steps, 1, 1)), np.tile(1e-4 * np.eye(6), (steps, 1, 1)))
+    (out / files.MOTIONS).write_bytes(dump_motions(motions))
+    assert read_everything(out) == [True] * (2 + len(FORMATS))
+    return out
+
+
+def read_everything(out: Path) -> list[bool]:
+    """Read a result folder with every command, and return which commands take it."""
+    taken = [survives(lambda: write_report(out, crops=0)), survives(lambda: evaluate_folder(out))]
+    return taken + [survives(lambda name=name: write_export(out, name)) for name in FORMATS]  # type: ignore[misc]
+
+
+def with_file(result: Path, name: str, data: bytes) -> Path:
+    out = result.parent / "mutated"
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(result, out)
+    (out / name).write_bytes(data)
+    return out
+
+
+JSON_FILES = (files.SUMMARY, files.EVALUATION, files.OBJECTS, files.TRUTH_OBJECTS)
+
+
+@pytest.mark.parametrize("name", JSON_FILES)
+@settings(max_examples=10 * ROUNDS)
+@given(data=st.data())
+def test_altered_json(result: Path, name: str, data: st.DataObject) -> None:
+    made = data.draw(altered(json.loads((result / name).read_text())))
+    read_everything(with_file(result, name, as_json(made)))
+
+
+@pytest.mark.parametrize("name", [*JSON_FILES, files.TRAJECTORY, files.CONFIG, files.RAYS, files.MOTIONS])
+def test_mutated_bytes(result: Path, name: str) -> None:
+    for data in mutated((result / name).read_bytes(), 4):
+        read_everything(with_file(result, name, data))
+
+
+CELLS = [None, 0.0, -1.0, 1e8, 1e300, float("nan"), float("inf"), "x", b"x", 2**62, True, [], [1.0], [1.0] * 16, [None] * 3]
+
+
+@pytest.mark.parametrize("name", [files.RAYS, files.MOTIONS])
+@settings(max_examples=12 * ROUNDS)
+@given(data=st.data())
+def test_altered_tables(result: Path, name: str, data: st.DataObject) -> None:
+    table = pq.read_table(result / name)
+    column = data.draw(st.sampled_from(table.column_names))
+    at, cell = table.column_names.index(column), data.draw(st.sampled_from(CELLS))
+    kept: list[Any] = table[column].to_pylist()
+    whole = data.draw(st.booleans())
+    values = [cell] * len(kept) if whole else [cell, *kept[1:]]
+    try:
+        made = table.set_column(at, column, pa.array(values))
+    except (pa.ArrowException, TypeError, OverflowError):  # arrow has no column of such cells
+        made = table.remove_column(at)
+    out = with_file(result, name, b"")
+    pq.write_table(made, out / name)
+    read_everything(out)
