@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -72,9 +73,17 @@ def levenberg_marquardt(
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)
     parameters.setAbsoluteErrorTol(1e-12)
+    last = 0
+
+    def hook(number: Any, _: Any, after: Any) -> None:
+        nonlocal last
+        if int(number) > last and on_iteration is not None:  # GTSAM calls once more with the last number if a step fails.
+            on_iteration(float(after), optimizer.values())
+        last = int(number)
+
     try:
         if on_iteration is not None:
-            parameters.iterationHook = lambda number, before, after: on_iteration(float(after), optimizer.values())
+            parameters.iterationHook = hook
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
         before = graph.error(start)
         values = optimizer.optimize()

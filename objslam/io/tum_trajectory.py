@@ -23,8 +23,8 @@ def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
     """Read a trajectory file, which may be packed (.gz). Timestamps are in s, translations in m, quaternions are x y z w, a
     yaw is in rad. Commas may separate the numbers, and the first line may name the columns.
 
-    Malformed lines, invalid poses and poses out of time order are dropped and counted. Raises LogError if none is left, or if
-    the names of the columns are in another order.
+    Malformed lines, invalid poses and poses out of time order are dropped and counted. Raises LogError if none is left,
+    or if the names of the columns are in another order.
     """
     return to_trajectory(read_pose_table(path, ledger))
 

@@ -272,7 +272,8 @@ def test_the_command_ends_with_a_result_and_resumes(exact, tmp_path):
     }
     text = [json.dumps(one) for one in (camera, *sink.lines)]
     out, half = tmp_path / "out", len(text) // 2
-    quiet = ("output.recording=false", "output.picture=false", "rays.pixel_sigma=2", "live.max_lag=1000")
+    held = ("rays.pixel_sigma=2", "calibration.use=false")  # as SETTINGS
+    quiet = ("output.recording=false", "output.picture=false", *held, "live.max_lag=1000")
     command = [sys.executable, "-m", "objslam", "live", "stdin", "-o", str(out)]
     command += [word for setting in quiet for word in ("--set", setting)]
     for more, part in (((), text[:half]), (("--resume",), text[half:])):

@@ -54,7 +54,14 @@ def test_localisation_takes_over_when_odometry_falls_silent():
     entry = intake()
     for tenth in range(10):
         assert entry.push_odometry(0.1 * tenth, at(0.0))
-    taken = [entry.push_localization(float(stamp), at(0.0)) for stamp in range(30, 40)]
+    assert all(entry.push_localization(float(stamp), at(0.0)) for stamp in range(30, 40))
+
+
+def test_a_localisation_far_ahead_takes_over_at_the_second_pose_in_a_row():
+    entry = intake()
+    for tenth in range(10):
+        assert entry.push_odometry(0.1 * tenth, at(0.0))
+    taken = [entry.push_localization(float(stamp), at(0.0)) for stamp in range(100, 110)]
     assert taken == [False] + 9 * [True]
 
 

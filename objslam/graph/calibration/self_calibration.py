@@ -143,7 +143,8 @@ class _Fit:
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
         history: list[tuple[Floats, Floats]] = []
-        for steps in range(_ROUNDS):
+        steps = 0
+        while steps < _ROUNDS:
             system = _without_shrinking(state, linearise(state, errors, theta).reduce(), errors, theta)
             if steps == 0:
                 noisy = self.noise_shares(state, system, theta)
@@ -163,7 +164,7 @@ class _Fit:
                 target, history = theta + (target - theta) / 2, []
             else:
                 break
-            theta, state = other, trial.settled()
+            theta, state, steps = other, trial.settled(), steps + 1
             if self.trace is not None:
                 self.trace.base_T_camera = state.measured.keyframes.base_T_camera
                 moved = Parameters(errors.names, theta, np.sqrt(np.diagonal(covariance)))

@@ -78,12 +78,13 @@ class Lead:
     def choose(self, path: PathKind, at: float) -> bool:
         """Update the leading path for a new pose of a path. at: its session time, s. Return whether the pose may be used.
 
-        A path that leads again continues from its own newest stamp. Two localisations in a row must say that the odometry
-        is silent, because the stamp of a single one may be wrong.
+        A path that leads again continues from its own newest stamp. If a localisation leaps far ahead, a second one in a row
+        must confirm that the odometry is silent, because the stamp of a single one may be wrong.
         """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
-            if path == "localization" and self.path is not None and not self._unconfirmed:
+            far = at > self._odometry_until + _LEAP
+            if path == "localization" and self.path is not None and far and not self._unconfirmed:
                 self._unconfirmed = True
                 return False
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))
