@@ -103,7 +103,8 @@ def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]
     focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
     pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
     depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
-    return np.asarray((rays.box[:, 2:] - rays.box[:, :2]) / focal * depth[:, None])
+    # A box that is read in another order than it was written may have a negative side.
+    return np.asarray(np.maximum(rays.box[:, 2:] - rays.box[:, :2], 0.0) / focal * depth[:, None])
 
 
 def extents(

@@ -125,7 +125,7 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     origin, direction = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     distance = np.maximum(np.linalg.norm(estimate.positions[landmark] - origin, axis=1), MIN_DEPTH)
     angle, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
-    size = np.sqrt(np.maximum(size_per_metre(rays, keyframes, cameras), 0.0).prod(axis=1))
+    size = np.sqrt(size_per_metre(rays, keyframes, cameras).prod(axis=1))
     along = np.where(np.isfinite(rays.range), 1 / rays.range_sigma, 0.0)
     return SizedRays(landmark, origin, direction, distance, np.hypot(angle, place / distance), size, along)
 

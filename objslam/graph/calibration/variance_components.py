@@ -33,6 +33,8 @@ _MOST_SHRINKAGE = 0.3
 """The largest shrinkage that is made up for. A map that is smaller by more has another cause."""
 _LEAST_TOLD = 0.3
 """The least share of the squared ways that neighbours predict, for the prediction to be used. A larger one uses it less."""
+_PRIOR_OBJECTS = 4
+"""The number of objects that the bias of ranges in the settings counts for. A larger number changes it less."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """Scales the mean absolute value of Gaussian numbers to their standard deviation."""
 
@@ -161,7 +163,7 @@ def _updated(
         for k, name in enumerate(("along", "across", "turning")):
             variance = found[name] ** 2
             axis = rows.motion_axes[k]
-            root_of_part = np.sqrt(np.einsum("kii->k", rows.parts[k]) / (axis**2).sum(axis=1))
+            root_of_part = np.sqrt(np.maximum(np.einsum("kii->k", rows.parts[k]), 0.0) / (axis**2).sum(axis=1))
             own, first, second = (
                 _summed(root_of_part[:, None] * np.einsum("ki,kip->kp", axis, part), rows.motion_window)
                 for part in (pushed[..., None], one, two)
@@ -219,10 +221,6 @@ def _range_noise(
     squares = max((middle[has] ** 2 - typical**2 / number[has]).sum(), 0.0) / rows.bias**2
     weight = min(prior, float(_PRIOR_OBJECTS))
     return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
-
-
-_PRIOR_OBJECTS = 4
-"""The number of objects that the bias of ranges in the settings counts for. A larger number changes it less."""
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:

@@ -118,18 +118,13 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
         if sized or change not in (_xywh, _cxcywh):
             yield Hypothesis(name, what, cause, boxed(change))
     for size in _SIZES:
-        yield Hypothesis(
-            f"boxes of size {size:.3g}",
-            f"the boxes divided by {size:.3g}",
-            f"the boxes belong to images {size:.3g} times as large as the calibration says",
-            boxed(partial(_divided, size=size)),
-        )
+        cause = f"the boxes belong to images {size:.3g} times as large as the calibration says"
+        change = partial(_divided, size=size)
+        yield Hypothesis(f"boxes of size {size:.3g}", f"the boxes divided by {size:.3g}", cause, boxed(change))
     for side in _SQUARES:
+        what, cause = f"the boxes stretched from {side} x {side} px to the image", f"the detector's square of {side} px"
         yield Hypothesis(
-            f"boxes of a square of {side}",
-            f"the boxes stretched from {side} x {side} px to the image",
-            f"the boxes are in px of the detector's square of {side} px",
-            boxed(partial(_stretched, side=side)),
+            f"boxes of a square of {side}", what, f"the boxes are in px of {cause}", boxed(partial(_stretched, side=side))
         )
 
 
