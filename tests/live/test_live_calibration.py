@@ -64,6 +64,7 @@ def push(session, log, begin=0, end=None):
         one(session)
         if frame:
             assert session.wait(LIMIT), session.failure
+    assert session.wait(LIMIT), session.failure  # for the poses after the last frame
     return session
 
 
