@@ -12,7 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
-from objslam.errors import ObjslamError
+from objslam.errors import ObjslamError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
@@ -74,6 +74,8 @@ def _solved(log: Log, settings: Settings, progress: Progress) -> Solution:
     ledger = Ledger()
     frames = build_keyframes(log, settings, ledger)
     rays = build_rays(log, frames, settings, ledger)
+    if not len(rays):
+        raise SolveError("no box gives a usable ray", where=log.name)
     errors = shared_errors(log, *seen_something(frames, rays), settings)
     cameras = tuple(one.camera for one in log.cameras)
     quiet = settings.model_copy(update={"output": settings.output.model_copy(update={"recording": False})})
