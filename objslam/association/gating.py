@@ -8,7 +8,7 @@ from objslam.association.landmarks import Landmarks
 from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import range_costs, variance
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import skew
+from objslam.core.rotation import skew
 
 TRACK_GAIN = 2.0
 """The cost reduction of a match if most other boxes of the ray's track have its landmark. A larger value trusts the tracker

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
-from objslam.core.array_backend import array_backend
-from objslam.core.array_module import Backend, Tensor, as_numpy, as_tensor, module_of
+from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Floats, Ints
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.

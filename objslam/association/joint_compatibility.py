@@ -11,7 +11,7 @@ from objslam.association.landmarks import Landmarks, PredictedLandmarks
 from objslam.association.observations import Observations
 from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.geometry import skew
+from objslam.core.rotation import skew
 
 _MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds trust fewer.
 _MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.

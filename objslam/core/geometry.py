@@ -7,9 +7,15 @@ import math
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.rotation import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    rotation_vector,
+    skew,
+)
 
 _ON_A_LINE = 1e-9
 """The second singular value of two point sets' products, as a share of the first, up to which the points count as on a line.
@@ -37,12 +43,12 @@ def inverse(pose: Floats) -> Floats:
 
 def pose_from_quaternion(translation: Floats, xyzw: Floats) -> Floats:
     """Make poses (N, 4, 4) from translations (N, 3), m, and quaternions (N, 4) x, y, z, w of any length above zero."""
-    return make_pose(Rotation.from_quat(xyzw).as_matrix(), translation)
+    return make_pose(rotation_from_quaternion(xyzw), translation)
 
 
 def quaternion(pose: Floats) -> Floats:
     """Return the unit quaternions (N, 4) x, y, z, w with w >= 0 of poses (N, 4, 4)."""
-    return np.asarray(Rotation.from_matrix(pose[..., :3, :3]).as_quat(canonical=True))
+    return quaternion_from_rotation(pose[..., :3, :3])
 
 
 def lift_se2(xy_yaw: Floats) -> Floats:
@@ -75,7 +81,7 @@ def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
 
 def log_se3(pose: Floats) -> Floats:
     """Return the logarithm (N, 6) of poses (N, 4, 4), the twist whose exponential is the pose."""
-    omega = Rotation.from_matrix(pose[..., :3, :3]).as_rotvec()
+    omega = rotation_vector(pose[..., :3, :3])
     return np.concatenate([omega, (_left_jacobian_inverse(omega) @ pose[..., :3, 3:])[..., 0]], axis=-1)
 
 
@@ -113,17 +119,7 @@ def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
 def exp_se3(twist: Floats) -> Floats:
     """Return the exponential (N, 4, 4) of twists (N, 6) (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
     omega = twist[..., :3]
-    return make_pose(Rotation.from_rotvec(omega).as_matrix(), (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
-
-
-_CROSS = np.zeros((3, 9))  # The linear map from x, y, z to the nine entries of the cross-product matrix.
-_CROSS[[1, 2, 0], [2, 3, 7]] = 1.0
-_CROSS[[2, 0, 1], [1, 5, 6]] = -1.0
-
-
-def skew(v: Floats) -> Floats:
-    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    return np.asarray(v @ _CROSS).reshape(*v.shape, 3)
+    return make_pose(rotation_from_vector(omega), (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
@@ -214,6 +210,8 @@ def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
     """Return the rotation (3, 3) that maximises the sum of products of rotated points `a` with `b` (N, 3), and this sum."""
     u, size, vt = np.linalg.svd(b.T @ a)
     if size[0] > 0 and size[1] <= _ON_A_LINE * size[0]:
+        from scipy.spatial.transform import Rotation
+
         return Rotation.align_vectors(u[:, :1].T, vt[:1])[0].as_matrix(), float(size[0])
     sign = np.sign(np.linalg.det(u @ vt))
     return u @ np.diag([1.0, 1.0, sign]) @ vt, float(size[0] + size[1] + sign * size[2])

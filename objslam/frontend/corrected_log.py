@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import make_pose
+from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
 
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
@@ -28,36 +28,51 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
     """
     path, odometry = log.robot_path if stay else None, log.odometry
     if odometry is not None:
-        odometry = corrected_odometry(odometry, turns(odometry), error)
+        odometry = corrected_odometry(odometry, error)
     cameras = tuple(corrected_camera(one, error, path) for one in log.cameras)
     return replace(log, odometry=odometry, cameras=cameras)
 
 
-def turns(odometry: Trajectory) -> Floats:
-    """Return by how much the odometry turns about the vertical axis in each step (N-1,), rad."""
-    rotation = odometry.poses[:, :3, :3]
-    if len(rotation) < 2:
-        return np.zeros(0)
-    return np.asarray(Rotation.from_matrix(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2)).as_rotvec()[:, 2])
+def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
+    """Return the odometry with its ways and its turns corrected. Its first pose stays."""
+    return Trajectory(odometry.stamps, CorrectablePath(odometry).poses(error))
 
 
-def corrected_odometry(odometry: Trajectory, turn: Floats, error: Mapping[str, float]) -> Trajectory:
-    """Return the odometry with its ways and its turns (N-1,) corrected. Its first pose stays."""
-    scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
-    if scale == turn_scale == turn_bias == 0:
-        return odometry
-    more = np.append(0.0, np.cumsum(turn_scale * turn + turn_bias * np.diff(odometry.stamps)))
-    ways = (1 + scale) * np.diff(odometry.poses[:, :3, 3], axis=0)
-    middle = (more[1:] + more[:-1]) / 2  # a scaled arc begins and ends at other headings, its chord lies between them
-    cos, sin = np.cos(middle), np.sin(middle)
-    x, y, z = ways.T
-    ways = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
-    poses = odometry.poses.copy()
-    cos, sin = np.cos(more)[:, None], np.sin(more)[:, None]
-    poses[:, 0, :3] = cos * odometry.poses[:, 0, :3] - sin * odometry.poses[:, 1, :3]
-    poses[:, 1, :3] = sin * odometry.poses[:, 0, :3] + cos * odometry.poses[:, 1, :3]
-    poses[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(ways, axis=0)
-    return Trajectory(odometry.stamps, poses)
+class CorrectablePath:
+    """Odometry that is corrected for many values of its errors. What no error changes is computed once."""
+
+    def __init__(self, odometry: Trajectory) -> None:
+        """Measure the steps of the odometry."""
+        self.odometry = odometry
+        rotation, places = odometry.poses[:, :3, :3], odometry.poses[:, :3, 3]
+        turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # about the vertical axis
+        self._turned = np.append(0.0, np.cumsum(turn))
+        self._seconds = odometry.stamps - odometry.stamps[0]
+        self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
+
+    def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
+        """Return the poses (n, 4, 4) with some of these numbers, or all, as `corrected_odometry` does."""
+        scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        poses = self.odometry.poses if which is None else self.odometry.poses[which]
+        if scale == turn_scale == turn_bias == 0:
+            return poses
+        more = turn_scale * self._turned + turn_bias * self._seconds
+        middle = (more[1:] + more[:-1]) / 2  # a scaled arc begins and ends at other headings, its chord lies between them
+        cos, sin = np.cos(middle), np.sin(middle)
+        x, y, z = self._ways
+        places = np.empty((3, len(more)))
+        places[:, 0] = self.odometry.poses[0, :3, 3] / (1 + scale)
+        places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
+        np.cumsum(places, axis=1, out=places)
+        places *= 1 + scale
+        if which is not None:
+            more, places = more[which], places[:, which]
+        cos, sin = np.cos(more)[:, None], np.sin(more)[:, None]
+        corrected = poses.copy()
+        corrected[:, 0, :3] = cos * poses[:, 0, :3] - sin * poses[:, 1, :3]
+        corrected[:, 1, :3] = sin * poses[:, 0, :3] + cos * poses[:, 1, :3]
+        corrected[:, :3, 3] = places.T
+        return corrected
 
 
 class OdometryCorrection:
@@ -86,7 +101,7 @@ class OdometryCorrection:
         if self._stamp is None:
             self._stamp, self._before, self._place = stamp, pose, pose[:3, 3]
             return pose
-        turn = Rotation.from_matrix(pose[:3, :3] @ self._before[:3, :3].T).as_rotvec()[2]
+        turn = rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2]
         more = float(self._turn_scale * turn + self._turn_bias * (stamp - self._stamp))
         way = (1 + self._scale) * (pose[:3, 3] - self._before[:3, 3])
         self._place = self._place + _about_z(self._turned + more / 2) @ way  # a chord lies between its two headings
@@ -97,7 +112,7 @@ class OdometryCorrection:
 
 def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:
     """Return camera poses on the base (..., 4, 4), turned about the axes of base and moved along them."""
-    turn = Rotation.from_rotvec([error.get(f"{name}.{axis}", 0.0) for axis in AXES]).as_matrix()
+    turn = rotation_from_vector(np.array([error.get(f"{name}.{axis}", 0.0) for axis in AXES]))
     move = np.array([error.get(f"{name}.{axis}", 0.0) for axis in "xyz"])
     return make_pose(turn @ base_T_camera[..., :3, :3], base_T_camera[..., :3, 3] + move)
 

@@ -4,19 +4,19 @@ The parameters change what was measured, never the factors that a graph makes of
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
-from objslam.frontend.corrected_log import ODOMETRY, corrected_mount, corrected_odometry, later, refocused, take_out, turns
+from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, corrected_mount, later, refocused, take_out
 from objslam.frontend.known_errors import error_names, estimates, known_errors, prior_sigma
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
@@ -52,6 +52,7 @@ class SharedErrors:
     mean: Floats
     prior: Floats
     noise: NoiseFactors = NOMINAL
+    _path: list[CorrectablePath] = field(default_factory=list, repr=False, compare=False)  # copies share what it holds
 
     @property
     def unknown_noise(self) -> frozenset[str]:
@@ -163,12 +164,6 @@ class SharedErrors:
         """Return the same errors for other keyframes and rays of the log."""
         return replace(self, keyframes=keyframes, rays=rays)
 
-    @cached_property
-    def _turns(self) -> Floats:
-        """(N-1,) by how much the odometry turns in each step, rad."""
-        assert self.log.odometry is not None
-        return turns(self.log.odometry)
-
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
         """Return keyframes and settings whose odometry has nominal noise only along, only across, only in turning, or none.
 
@@ -212,10 +207,9 @@ class SharedErrors:
         localization, odom_T_base = self.log.localization, keyframes.odom_T_base
         map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, known, max_gap)
         if self.log.odometry is not None:
-            odometry = self._odometry(error)
-            at = _at_stamps(odometry, known, max_gap)
+            at = self._odometry_at(known, error)
             map_T_base = at if localization is None else map_T_base
-            odom_T_base = None if odom_T_base is None else inverse(odometry.poses[0]) @ at
+            odom_T_base = None if odom_T_base is None else inverse(self.log.odometry.poses[0]) @ at
         return _Poses(stamps, known, base_T_camera, map_T_base, odom_T_base)
 
     @cached_property
@@ -223,24 +217,36 @@ class SharedErrors:
         return RecentValues(_KEPT)
 
     @cached_property
-    def _kept_odometry(self) -> RecentValues[Trajectory]:
-        return RecentValues(_KEPT)
-
-    @cached_property
     def _kept_drift(self) -> RecentValues[DriftPath]:
         return RecentValues(1)
 
-    def _odometry(self, error: Mapping[str, float]) -> Trajectory:
-        """The odometry without its errors, with ways that make up for the shrinkage of the map, as the ranges do."""
+    def _odometry_at(self, stamps: Floats, error: Mapping[str, float]) -> Floats:
+        """Poses (Q, 4, 4) of the odometry without its errors. Only the poses around the stamps (Q,) are computed."""
+        odometry = self._correctable().odometry
+        after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, max(len(odometry) - 1, 1))
+        around = np.unique(np.concatenate([after - 1, np.minimum(after, len(odometry) - 1)]))
+        path = Trajectory(odometry.stamps[around], self._corrected(error, around))
+        return _at_stamps(path, stamps, self.settings.poses.max_gap)
+
+    def _corrected(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
+        """Poses of the odometry without its errors, with ways that make up for the shrinkage of the map, as ranges do."""
+        named = dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
+        return self._correctable().poses(named, which)
+
+    def _correctable(self) -> CorrectablePath:
         odometry = self.log.odometry
         assert odometry is not None
-        key = self._odometry_key(error)
-        named = dict(zip(ODOMETRY, key, strict=True))
-        return self._kept_odometry.get(key, lambda: corrected_odometry(odometry, self._turns, named))
+        if not self._path or self._path[0].odometry is not odometry:
+            self._path[:] = [CorrectablePath(odometry)]
+        return self._path[0]
 
     def _drift(self, error: Mapping[str, float]) -> DriftPath:
         """What the drift of the odometry without its errors depends on."""
-        return self._kept_drift.get(self._odometry_key(error), lambda: DriftPath(self._odometry(error)))
+
+        def measured() -> DriftPath:
+            return DriftPath(Trajectory(self._correctable().odometry.stamps, self._corrected(error)))
+
+        return self._kept_drift.get(self._odometry_key(error), measured)
 
     def _odometry_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
         """The errors of the odometry, its scale with what makes up for the shrinkage of the map."""

@@ -5,7 +5,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import skew
+from objslam.core.rotation import skew
 from objslam.graph.factors.priors import point_prior
 from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam import config
-from objslam.core.array_backend import array_backend
-from objslam.core.array_module import Backend, Tensor, as_numpy, as_tensor, group_sum, length, module_of
+from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, group_sum, length, module_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.status import is_resolved
 from objslam.triangulation import ac_ransac

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.geometry import skew
+from objslam.core.rotation import skew
 
 HORIZON = 0.06
 """The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark that is 5 m away by

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse, make_pose
+from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion, rotation_from_vector
 from objslam.core.types import CameraLog, Log, Trajectory
 
 _OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -55,7 +55,7 @@ def _mounts(log: Log) -> Iterator[Hypothesis]:
     yield Hypothesis("mount inverted", "base_T_camera inverted", cause, mounted(inverse))
     if all(np.allclose(one.camera.base_T_camera[:3, :3], np.eye(3), atol=1e-3) for one in log.cameras):
         for side, degrees in _SIDES.items():
-            turn = make_pose(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
+            turn = make_pose(rotation_from_vector(np.array([0.0, 0.0, np.radians(degrees)])), np.zeros(3))
             yield Hypothesis(
                 f"mount unset, {side}",
                 f"a camera that looks {side}",
@@ -169,8 +169,8 @@ def _mounted(pose: Floats, turn: Floats) -> Floats:
 
 def w_last(poses: Floats) -> Floats:
     """Return poses (..., 4, 4) whose quaternions had their w first and were read as if it were last."""
-    read = Rotation.from_matrix(poses[..., :3, :3]).as_quat()
-    return make_pose(Rotation.from_quat(np.roll(read, -1, axis=-1)).as_matrix(), poses[..., :3, 3])
+    read = quaternion_from_rotation(poses[..., :3, :3])
+    return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
 
 def yaws(poses: Floats) -> Floats:
@@ -181,7 +181,7 @@ def yaws(poses: Floats) -> Floats:
 def _yaw_times(poses: Floats, factor: float) -> Floats:
     """Return poses with other headings."""
     yaw = factor * yaws(poses)
-    return make_pose(Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0])).as_matrix(), poses[:, :3, 3])
+    return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
 
 
 def _from_degrees(poses: Floats) -> Floats:
@@ -198,7 +198,7 @@ def _from_degrees(poses: Floats) -> Floats:
     yaw = np.radians(np.append(0.0, np.cumsum(steps)))
     way = np.diff(poses[:, :2, 3], axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     yaw += np.angle(way.sum())
-    return make_pose(Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0])).as_matrix(), poses[:, :3, 3])
+    return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
 
 
 def _swapped(poses: Floats) -> Floats:

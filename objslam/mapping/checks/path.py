@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate
+from objslam.core.rotation import rotation_vector
 from objslam.core.types import Log, Trajectory
 from objslam.mapping.checks.finding import Finding
 
@@ -159,8 +159,8 @@ def _boxes_move(log: Log, start: float, end: float) -> bool:
 def steps(poses: Floats) -> tuple[Floats, Floats]:
     """Return the way (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
     way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = Rotation.from_matrix(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-    return way, np.asarray(turn.magnitude())
+    turn = rotation_vector(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+    return way, np.asarray(np.linalg.norm(turn, axis=1))
 
 
 def straightness(path: Trajectory) -> float | None:

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from scipy.spatial.transform import Rotation
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import ObjectMap
+from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Truth
 from objslam.output.plot.style import captions, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
@@ -47,7 +47,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     bodies = rr.Ellipsoids3D(
         centers=[every[i].position for i, _ in shapes],
         half_sizes=[half for _, (half, _) in shapes],
-        quaternions=Rotation.from_matrix(np.stack([a for _, (_, a) in shapes])).as_quat() if shapes else [],
+        quaternions=quaternion_from_rotation(np.stack([a for _, (_, a) in shapes])) if shapes else [],
         colors=[colour[i] for i, _ in shapes],
         line_radii=rr.Radius.ui_points(0.6),
     )

@@ -1,0 +1,81 @@
+"""Rotations as matrices (..., 3, 3), as vectors (..., 3) and as unit quaternions (..., 4) x, y, z, w, in batches.
+
+They are plain arrays. `scipy.spatial.transform` does the same, but its import takes longer than the map of a small log.
+"""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+
+_SMALL = 1e-4
+"""The angle (rad) below which series replace quotients that become 0 / 0. A larger one makes the series less exact; their
+error is below 1e-17 here."""
+
+
+def _cross_product_map() -> Floats:
+    """Return the linear map (3, 9) from x, y, z to the nine entries of the cross-product matrix."""
+    cross = np.zeros((3, 9))
+    cross[[1, 2, 0], [2, 3, 7]] = 1.0
+    cross[[2, 0, 1], [1, 5, 6]] = -1.0
+    return cross
+
+
+_CROSS = _cross_product_map()
+
+
+def skew(v: Floats) -> Floats:
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    return np.asarray(v @ _CROSS).reshape(*v.shape, 3)
+
+
+def rotation_from_vector(omega: Floats) -> Floats:
+    """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, rad (Rodrigues' formula)."""
+    squared = (omega * omega).sum(axis=-1)[..., None, None]
+    turns = np.sqrt(squared) / np.pi
+    across = omega[..., :, None] * omega[..., None, :] - squared * np.eye(3)  # the square of the cross-product matrix
+    return np.asarray(np.eye(3) + np.sinc(turns) * skew(omega) + np.sinc(turns / 2) ** 2 / 2 * across)
+
+
+def rotation_vector(rotation: Floats) -> Floats:
+    """Return the vectors (..., 3) about which rotations (..., 3, 3) turn, with the angles, rad in [0, pi], as lengths."""
+    xyzw = quaternion_from_rotation(rotation)
+    sine, cosine = np.linalg.norm(xyzw[..., :3], axis=-1, keepdims=True), xyzw[..., 3:]
+    small = sine < _SMALL
+    angle = 2 * np.arctan2(sine, cosine)
+    return np.asarray(xyzw[..., :3] * np.where(small, 2 + sine**2 / 3, angle / np.where(small, 1.0, sine)))
+
+
+def rotation_from_quaternion(xyzw: Floats) -> Floats:
+    """Return the rotations (..., 3, 3) of quaternions (..., 4) x, y, z, w of any length above zero."""
+    x, y, z, w = np.moveaxis(xyzw / np.linalg.norm(xyzw, axis=-1, keepdims=True), -1, 0)
+    rows = (
+        (x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), y * y - x * x - z * z + w * w, 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), z * z - x * x - y * y + w * w),
+    )
+    rotation = np.empty((*x.shape, 3, 3))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            rotation[..., i, j] = entry
+    return rotation
+
+
+def quaternion_from_rotation(rotation: Floats) -> Floats:
+    """Return the unit quaternions (..., 4) x, y, z, w with w >= 0 of rotations (..., 3, 3) (Shepperd 1978).
+
+    Of the two quaternions with w = 0, the one whose first number that is not 0 is positive.
+    """
+    # Row i is the quaternion times four times its number i. The row with the largest diagonal entry is the most exact one.
+    outer = np.empty((*rotation.shape[:-2], 4, 4))
+    diagonal = np.diagonal(rotation, axis1=-2, axis2=-1)
+    trace = diagonal.sum(axis=-1)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[..., i, i] = 1 + 2 * diagonal[..., i] - trace
+        outer[..., i, j] = outer[..., j, i] = rotation[..., i, j] + rotation[..., j, i]
+        outer[..., i, 3] = outer[..., 3, i] = rotation[..., k, j] - rotation[..., j, k]
+    outer[..., 3, 3] = 1 + trace
+    row = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    xyzw = np.take_along_axis(outer, row[..., None, None], axis=-2)[..., 0, :]
+    x, y, z, w = np.moveaxis(xyzw, -1, 0)
+    first = np.where(w != 0, w, np.where(x != 0, x, np.where(y != 0, y, z)))
+    return np.asarray(xyzw * (np.where(first < 0, -1.0, 1.0) / np.linalg.norm(xyzw, axis=-1))[..., None])
