@@ -21,7 +21,7 @@ from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
-from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.optimizers import build_graph, gauss_newton
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
 from objslam.graph.variables import make_values, read_poses, with_points
 
@@ -298,7 +298,7 @@ class _State(Linearised):
 
     def solved(self, landmarks: Ints) -> Self:
         """The same after a few iterations of the inner solve. landmarks: (m,) those in the graph."""
-        optimum = levenberg_marquardt(self.graph, self.values, _INNER, _TOLERANCE)
+        optimum = gauss_newton(self.graph, self.values, _INNER, _TOLERANCE)
         return replace(
             self,
             map_T_camera=read_poses(optimum.values),

@@ -110,13 +110,13 @@ def linearise(
     which = range(len(theta)) if which is None else which
     names = [errors.names[k] for k in which]
     columns = 3 * len(of.landmarks) + 6 * len(of.map_T_camera)
-    jacobian, residual = _whitened(of.graph, of.values, columns)
     keyframes = of.measured.keyframes
     motions = 6 * int(keyframes.measured.sum()) if of.measured.motion is not None else 0
     absolute = 6 * (len(keyframes) if keyframes.localized_every else 1)
-    first_motion = len(residual) - absolute - motions
     ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
-    first_range = first_motion - 3 * len(of.landmarks) - ranged
+    first_range = 2 * len(of.which)
+    first_motion = first_range + ranged + 3 * len(of.landmarks)
+    jacobian, residual = _whitened(of.graph, of.values, first_motion + motions + absolute, columns)
     sides = _parameter_columns(of, errors, theta, which, (len(residual), first_range, first_motion))
     instruments = _instruments(of, names, sides, slice(first_motion, first_motion + motions))
     return LinearSystem(jacobian, sides, instruments, residual, first_range, first_motion)
@@ -135,12 +135,13 @@ def factor(jacobian: sparse.csc_matrix) -> SuperLU:
         raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
 
 
-def _whitened(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, columns: int) -> tuple[sparse.csc_matrix, Floats]:
-    """The whitened Jacobian (M, columns) of a graph, and its whitened residuals (M,), in the order of the factors."""
+def _whitened(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: int, columns: int
+) -> tuple[sparse.csc_matrix, Floats]:
+    """The whitened Jacobian (rows, columns) of a graph, and its whitened residuals (rows,), in the order of the factors."""
     linear = graph.linearize(values)
     row, column, value = linear.sparseJacobian_()  # numbers from 1; the column after the last holds the right-hand side
     row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
-    rows = sum(graph.at(i).dim() for i in range(graph.size()))
     side = column == columns
     residual = np.zeros(rows)
     residual[row[side]] = -value[side]
