@@ -22,7 +22,7 @@ from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
-from objslam.graph.outlier_rejection import misfit, reject_outliers, rejected_stretches, widening
+from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
@@ -30,6 +30,9 @@ from objslam.triangulation.triangulate import Triangulation
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
 """The relative decreases of the cost below which a joint solve ends: the last one, and one before the shared errors and the
 noise are estimated, which moves everything again. Larger values end it sooner."""
+_ROUNDS_BEFORE = 2
+"""The most rounds of solve and test before the shared errors are estimated, which settles the inliers again after each of
+its steps. A larger number is slower, and leads to the same inliers."""
 
 
 def solve_fixed(
@@ -128,13 +131,14 @@ def solve_joint(
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
-    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance)
+    rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
+    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance, rounds)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
         other = reject_outliers(
-            measured, association, found.map_T_camera, found.positions, found.used, back, attempt, tolerance
+            measured, association, found.map_T_camera, found.positions, found.used, back, attempt, tolerance, rounds
         )
         before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
         if after < before:

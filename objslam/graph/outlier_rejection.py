@@ -18,7 +18,7 @@ from objslam.graph.variables import make_values, read_poses, with_points
 _BESIDE, _MOST = 5, 0.6
 """A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is
 rejected too. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore none."""
-_ROUNDS = 4
+ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _SURE = 0.95
 """The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
@@ -49,8 +49,9 @@ def reject_outliers(
     back: Bools,
     trace: Trace | None,
     tolerance: float = 1e-6,
+    rounds: int = ROUNDS,
 ) -> JointSolution:
-    """Solve, and test which rays agree with their objects, until the set of inliers is stable.
+    """Solve, and test which rays agree with their objects, until the set of inliers is stable, or at most `rounds` times.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that count as inliers in the first solve. tolerance: the relative decrease
@@ -58,7 +59,7 @@ def reject_outliers(
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
             agreeing = agreeing | back
