@@ -16,7 +16,6 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
-from objslam.graph.calibration.self_calibration import calibrate
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
@@ -147,6 +146,8 @@ def solve_joint(
                 trace.take(attempt)
     calibrated, calibration = None, None
     if errors is not None and theta is not None:
+        from objslam.graph.calibration.self_calibration import calibrate  # scipy.sparse, which no other solve needs
+
         try:
             calibrated = calibrate(errors, measure, association, found, theta, trace)
         except (SolveError, np.linalg.LinAlgError) as error:

@@ -137,7 +137,6 @@ def _joint(
     errors: SharedErrors | None,
 ) -> tuple[Association, Estimate, list[dict[str, int]]]:
     from objslam.graph import batch_solver
-    from objslam.graph.init_unknown_correspondences import initialize_unknown
 
     theta: Floats | None = None
     measured = frames, all_rays
@@ -173,6 +172,8 @@ def _joint(
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
     if start is None and not keyframes.localized_every:
+        from objslam.graph.init_unknown_correspondences import initialize_unknown
+
         start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
