@@ -20,6 +20,9 @@ _BESIDE, _MOST = 5, 0.6
 rejected too. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore none."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
+_COARSE = 1e-4
+"""The relative decrease of the cost below which a solve ends whose inliers are tested next. A larger value ends it sooner.
+Robust weights converge slowly, and the last digits of a solution hardly change an inlier."""
 _SURE = 0.95
 """The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
 corrects more objects at wrong positions."""
@@ -70,12 +73,17 @@ def reject_outliers(
         graph = build_graph(measured.factors(association.object, which, landmarks, positions, loss))
         values, others = make_values(map_T_camera, positions, landmarks), range(len(which), graph.size())
         traced = trace_solve(trace, positions, landmarks)
-        optimum = optimize(graph, values, loss, measured.settings, others, tolerance, traced)
+        optimum = optimize(graph, values, loss, measured.settings, others, max(tolerance, _COARSE), traced)
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
         positions = with_points(positions, landmarks, optimum.values)
     assert optimum is not None
+    if tolerance < _COARSE and loss != "gnc":
+        optimum = optimize(graph, optimum.values, loss, measured.settings, others, tolerance, traced)
+        iterations += optimum.iterations
+        map_T_camera = read_poses(optimum.values)
+        positions = with_points(positions, landmarks, optimum.values)
     return JointSolution(map_T_camera, positions, used, optimum, cost_before, iterations)
 
 

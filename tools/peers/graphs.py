@@ -168,7 +168,7 @@ def scipy_sparse(drive: Drive) -> Solved:
 
 
 def objslam(drive: Drive) -> Solved:
-    """objslam in joint mode, with the settings it comes with: what all measurements share, the noise and outliers too."""
+    """objslam in joint mode, with names known, and else with its defaults: it estimates shared errors and noise too."""
     return _objslam(drive, ())
 
 
@@ -179,7 +179,7 @@ def objslam_plain(drive: Drive) -> Solved:
 
 def _objslam(drive: Drive, more: tuple[str, ...]) -> Solved:
     begin = time.process_time()
-    settings = load_settings(None, ("mode=joint", "output.recording=false", "output.picture=false", *more))
+    settings = load_settings(None, ("mode=joint", "association.method=by_label", "output.recording=false", *more))
     result = pipeline.run(drive.log, settings, Ledger())
     names = drive.log.cameras[0].detections.label_names if drive.log.cameras[0].detections else ()
     points = np.full((drive.count, 2), np.nan)
