@@ -13,12 +13,13 @@ from objslam.errors import ConfigError
 def array_backend(device: str, large: bool) -> Iterator[Backend]:
     """Give the backend for the setting `triangulation.device`, and prepare its library.
 
-    A batch that is not `large` runs in numpy, without an import of torch. The setting "auto" gives a large one to CUDA if
-    torch sees a CUDA device. The setting "cuda" always gives CUDA, and raises ConfigError if torch sees no CUDA device.
+    A batch that is not `large` runs in numpy, without an import of torch. The setting "auto" gives CUDA to a large batch if
+    torch sees a CUDA device. The setting "cuda" gives CUDA to every batch, and raises ConfigError if torch sees no CUDA
+    device.
 
-    numpy does not warn of divisions by zero, as torch does not. torch gets one thread, because a thread pool waits actively
-    while other processes need the cores. On two cores, one of which was busy, a run took 4 s with one thread and up to 18 s
-    with two.
+    numpy, like torch, does not warn of divisions by zero. torch gets one thread, because a thread pool waits actively while
+    other processes need the cores. On two cores, one of which was busy, a run took 4 s with one thread and up to 18 s with
+    two.
     """
     if device != "cuda" and not large:
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
