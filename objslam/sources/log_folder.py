@@ -113,7 +113,7 @@ def check_target(path: Path, overwrite: bool) -> None:
         if not path.exists() or not any(path.iterdir()):
             return
         if not is_log_folder(path):
-            raise OutputError("the folder has files but is no log", where=str(path), hint="name a new or empty folder")
+            raise OutputError("the folder has files but is not a log", where=str(path), hint="name a new or empty folder")
         if not overwrite:
             raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
 
