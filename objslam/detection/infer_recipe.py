@@ -113,7 +113,7 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """Return the habits of the layout. For families of models with other habits, they are changed."""
+    """Return the habits of the layout, changed for families of models that have other habits."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
         habits = replace(habits, resize="none")  # such models resize the image themselves

@@ -13,14 +13,14 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts kept per camera. With more, frames of a camera on an arm may come later. They cost memory.
+_MOUNTS = 4096  # The mounts kept per camera. More cost memory, and let frames of a camera on an arm come later.
 
 
 @dataclass(frozen=True)
 class FrameView:
     """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4).
 
-    mount: (4, 4) base_T_camera as it came, with its shared errors.
+    mount: (4, 4) base_T_camera as received, with its shared errors.
     """
 
     camera: int
