@@ -21,4 +21,5 @@ class Noise(Section):
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
     prior: Positive = 10.0
-    """the number of residuals that the noise in the settings is worth. With a larger number, short logs change it less."""
+    """the weight of the noise in the settings, as a number of residuals. With a larger weight, short logs change the noise
+    less."""

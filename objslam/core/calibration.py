@@ -177,7 +177,8 @@ class CalibratedMeasurements(Protocol):
         """Return the same measurements with other noise."""
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
-        """Return four pairs of keyframes and settings: odometry noise only along, only across, only in turning, and none.
+        """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
+        turning, and not at all.
 
         The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the errors
         taken out.

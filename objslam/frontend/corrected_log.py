@@ -1,4 +1,4 @@
-"""Take known shared errors out of a log, or of each part of it: odometry, cameras, directions, and stamps of frames."""
+"""Take known shared errors out of a log, or out of one part of it: odometry, cameras, directions, or stamps of frames."""
 
 import math
 from collections.abc import Mapping

@@ -32,8 +32,8 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), rotation first.
 
     The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, where the
-    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. Moved into base
-    at j, this covariance shows how an error of the heading shifts the later positions.
+    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. This covariance,
+    moved into base at j, shows how an error of the heading shifts the later positions.
     """
     return DriftPath(odometry).gathered(stamps, settings)
 

@@ -1,4 +1,4 @@
-"""Read and write the shared errors of a robot as YAML: what `objslam calibrate` found, and what a run starts from."""
+"""Read and write the shared errors of a robot as YAML: the output of `objslam calibrate`, from which a run can start."""
 
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ def _refuse_duplicates(node: yaml.Node | None) -> None:
         if not isinstance(key, yaml.ScalarNode):
             raise ValueError(f"line {key.start_mark.line + 1} has a key that is not a name")
         if key.value in seen:
-            raise ValueError(f"{key.value} is there twice, again in line {key.start_mark.line + 1}")
+            raise ValueError(f"{key.value} occurs twice, the second time in line {key.start_mark.line + 1}")
         seen.add(key.value)
         _refuse_duplicates(value)
 

@@ -82,7 +82,7 @@ def load_truth(path: Path) -> Truth | None:
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not a truth. To compare two results, give this file itself.
+            of its log. The objects.json of a result folder is not a truth. To compare two results, give that file itself.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """

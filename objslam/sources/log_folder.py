@@ -93,7 +93,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """Make an empty folder in the parent folder of a path, so that both are on one disk, and remove it at the end."""
+    """Make an empty folder in the parent folder of a path, and remove it at the end. It is on the same disk as the path."""
     path = Path(os.path.realpath(path))
     with no_empty_folders(path.parent):
         with _writing(path):

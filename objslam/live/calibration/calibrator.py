@@ -36,7 +36,7 @@ rarer."""
 def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which the errors that the session cannot observe stay at their values `now` (P,).
 
-    The other errors get their most probable values, given those at `now`. Otherwise, noise would move the map with each
+    The other errors get their most probable values, given the values `now`. Otherwise, noise would move the map with each
     calibration.
     """
     stay = found.sigma > OBSERVABLE * found.prior

@@ -87,8 +87,8 @@ def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> S
 
 
 def corrections(m: MapState, errors: SharedErrors) -> Floats:
-    """Return the value (P,) of each error by which a session corrects its measurements, or the expected value without
-    one."""
+    """Return the values (P,) of the errors: those that a session takes out of its measurements, and the expected values of
+    others."""
     return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
 
 

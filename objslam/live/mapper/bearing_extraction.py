@@ -13,7 +13,7 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts kept per camera. More cost memory, and let frames of a camera on an arm come later.
+_MOUNTS = 4096  # The mounts kept per camera. More accept later frames of a camera on an arm, and cost memory.
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class BearingExtractor:
         m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Add a mount: a pose of a camera on the robot from a stamp on."""
+        """Add a mount: the pose of a camera on the robot, which holds from its stamp."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:

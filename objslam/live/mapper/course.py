@@ -199,7 +199,7 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """Return the piece of the course whose path has `pose` (4, 4) where the course has start_T_base (4, 4).
+        """Return the piece of the course that puts `pose` (4, 4) of the path at start_T_base (4, 4) on the course.
 
         own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which
         the two poses may differ.

@@ -20,7 +20,8 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether the camera stands still, and enough keyframes have shown all labels `shown` since it stopped."""
+        """Return whether the camera stands still, and the keyframes since it stopped are enough and show all labels
+        `shown`."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 

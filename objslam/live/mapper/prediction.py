@@ -12,8 +12,8 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The keyframes between two slow queries of the covariance. Between them, the odometry adds to it, so more keyframes enlarge
-it."""
+"""The keyframes between two slow queries of the covariance. Between two queries, the odometry adds to the covariance. More
+keyframes make it larger."""
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,8 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 def fit_if_observable(
     obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
 ) -> PointFit | None:
-    """Triangulate rays in map. None if there are too few inliers, the position is uncertain, or parallax is low without
-    ranges.
+    """Triangulate rays in map. Return None if there are too few inliers, the position is uncertain, or the parallax is low
+    without ranges.
 
     least: least number of inliers. share: least share of inliers. early: whether less parallax suffices if the position is
     certain.

@@ -27,9 +27,10 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a new pose's stamp in session time, None if it has none, and whether the clock was set back.
+        """Return a new pose's stamp in session time, or None, and whether the clock was set back.
 
-        A pose that is late or repeated has none. A pose that leaps ahead has none either, until the next pose confirms it.
+        The stamp is None for a pose that is late or repeated. It is also None for a pose that leaps ahead, unless the
+        previous pose leapt as well.
         """
         time = stamp + self.shift
         if self.newest + _LEAP < time and math.isfinite(self.newest):

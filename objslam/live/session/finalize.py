@@ -79,8 +79,7 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
-    """Return the recorded path at its full rate, corrected by the keyframes at `stamps` (K,) with poses map_T_base (K, 4,
-    4).
+    """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,) with map_T_base (K, 4, 4).
 
     It follows the odometry, if there is one, because the localisation jitters.
     """

@@ -30,8 +30,8 @@ from objslam.sources.journal.records import (
 _JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # The largest pose, m and rad, of odometry that restarted in a gap. A larger value detects more restarts.
-_FAR = 0.1  # The least pose, m and rad, before such a gap. A larger value takes more restarts for motion.
+_ZERO = 0.05  # The size of a pose, m and rad, below which odometry restarted in a gap. A larger value detects more restarts.
+_FAR = 0.1  # The least size of the pose before such a gap, m and rad. A larger value takes more restarts for motion.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.

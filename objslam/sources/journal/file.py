@@ -199,8 +199,8 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
 
 
 def calibrations(file: Path) -> Iterator[CalibrationMessage]:
-    """Read only the calibrations of the journal `file`. A calibration takes effect at a keyframe, which may come before it
-    in the file."""
+    """Read only the calibrations of the journal `file`. A calibration may come later in the file than the keyframe at which
+    it takes effect."""
     with file.open("rb") as stream:
         for content in _records(stream):
             if content.startswith(CALIBRATION_KIND):
