@@ -16,7 +16,7 @@ class CalibrationSettings(Section):
     """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it. An error in it that is
     not estimated has the value of the file."""
     scale: NotNegative = 0.03
-    """share by which all ways of the odometry are too long or too short."""
+    """share by which all distances of the odometry are too long or too short."""
     turn_scale: NotNegative = 0.05
     """share by which all turns of the odometry are too large or too small."""
     turn_bias: NotNegative = 0.001
@@ -24,7 +24,7 @@ class CalibrationSettings(Section):
     clock: NotNegative = 0.1
     """s; the offset of each camera's clock against the clock of the poses."""
     max_clock: Positive = 0.5
-    """s; the largest offset of a clock that is looked for."""
+    """s; the largest clock offset that is considered."""
     yaw: NotNegative = 0.03
     """rad; the rotation of each camera on the base about the vertical axis."""
     tilt: NotNegative = 0.02

@@ -7,4 +7,4 @@ class Checks(Section):
     """Configure the checks of the input in every run. `objslam doctor` runs them all."""
 
     use: bool = True
-    """Look for wrong input, and call no object ok if it is found. false maps all the same."""
+    """Look for wrong input, and give no object the status ok if it is found. false skips the search."""

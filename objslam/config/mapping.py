@@ -94,7 +94,7 @@ class AssociationSettings(Section):
     method: Literal["auto", "global", "by_label"] = "auto"
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
-    joint mode, many missing rays are judged again with the noise of the log instead of that in the settings."""
+    joint mode, if many rays miss, they are judged again with the noise of the log instead of that in the settings."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects but is slow."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
@@ -188,8 +188,8 @@ class Live(Section):
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200
-    """Number of keyframes at which the session first estimates the shared errors. It does so again each time that there are
-    half as many keyframes more. 0 leaves it to the end of the session."""
+    """Number of keyframes at which the session first estimates the shared errors. It estimates them again whenever the
+    number of keyframes has grown by half. 0 estimates them only at the end of the session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""

@@ -8,17 +8,18 @@ Estimated = Literal["auto"] | bool
 
 
 class Noise(Section):
-    """Estimate the noise of measurements from the log. The noise in the other settings is then only where the search begins.
+    """Estimate the noise of measurements from the log. The noise in the other settings is then only the start of the search.
 
-    auto: estimated in joint mode if the log has odometry, unless the settings of this noise differ from their defaults. true
-    estimates it also then, and false never.
+    auto: estimate it in joint mode if the log has odometry and the settings of this noise have their defaults. true:
+    estimate it even if they differ from their defaults. false: never estimate it.
     """
 
     rays: Estimated = "auto"
     """rays.pixel_sigma and rays.box_sigma, with one common factor."""
     ranges: Estimated = "auto"
-    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with another one."""
+    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own."""
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
     prior: Positive = 10.0
-    """the number of residuals that the noise in the settings counts for. A larger number changes it less on short logs."""
+    """the weight of the noise in the settings, as a number of residuals. With a larger weight, short logs change the noise
+    less."""

@@ -1,4 +1,4 @@
-"""Errors that all measurements of a robot share: what they are called, and what a solve found of them."""
+"""Errors that all measurements of a robot share: their names, and their estimate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,23 +12,24 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
 OBSERVABLE = 0.8
-"""The largest standard deviation of an observable parameter, as a share of its prior's; larger calls more parameters
-observable. Chosen so that the log has told at least as much as half of what the prior said."""
+"""The largest standard deviation of an observable parameter, as a share of the standard deviation of its prior. A larger
+share calls more parameters observable. At this share, the log gives about half as much information as the prior."""
 TRADED_OFF = 0.9
-"""The correlation from which on two parameters are said to trade off; larger says so more rarely."""
+"""The correlation from which two parameters trade off, so that the log hardly tells them apart. With a larger value, fewer
+pairs trade off."""
 
 SCALES = ("scale", "turn_scale", "range_scale", "focal")
-"""The kinds of parameters that are shares: what was measured is multiplied by 1 + the value."""
+"""The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
 MOST_SCALE = 0.5
-"""The largest absolute value of a share. A larger bound lets a solve shrink what was measured towards nothing. A robot that
-errs by half has wrong units, not a calibration."""
+"""The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of half the value
+comes from wrong units, which no calibration should hide."""
 
 UNITS = {"clock": "s", "turn_bias": "rad/s", "yaw": "rad", "tilt": "rad", "roll": "rad", "x": "m", "y": "m", "z": "m"}
 """The unit of each kind of parameter; the others are shares."""
 
 
 def kind(name: str) -> str:
-    """Return what a parameter is, without the camera that it belongs to: the part of its name after the last dot."""
+    """Return the kind of a parameter: the part of its name after the last dot, without the camera."""
     return name.rpartition(".")[2]
 
 
@@ -70,7 +71,7 @@ class Calibration:
         return [(self.names[i], self.names[j]) for i, j in zip(first, second, strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what summary.json holds: each parameter with value, sigma, prior, unit and whether the log tells it.
+        """Return the entries of summary.json: each parameter with value, sigma, prior, unit and whether it is observable.
 
         A later run that is given the file starts from the values and the covariance.
         """
@@ -97,8 +98,8 @@ class Calibration:
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
     """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
 
-    A parameter that only some of the logs have is taken from these logs. Its prior is that of the first of them, given the
-    parameters that are known from the logs before.
+    A parameter that only some logs have is estimated from these logs. Its prior is from the first of these logs, conditional
+    on the parameters of the logs before.
     """
     names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
     prior, prior_vector, told, told_vector = (np.zeros((len(names),) * axes) for axes in (2, 1, 2, 1))
@@ -111,7 +112,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
         own = (axes * np.maximum(size, 0.0)) @ axes.T  # rounding must not take information away
         told[np.ix_(at, at)] += own
         told_vector[at] += (own + before) @ one.values - before @ one.expected
-        # The chain rule: p(new | known) = p(new, known) / p(known), where all of it is from the prior of this log.
+        # The chain rule: p(new | known) = p(new, known) / p(known). All three are from the prior of this log.
         there = np.flatnonzero(known[at])
         new = before.copy()
         new[np.ix_(there, there)] -= np.linalg.inv(one.before[np.ix_(there, there)])
@@ -125,7 +126,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
 
 
 class CalibratedMeasurements(Protocol):
-    """What a log measured, as a function of the shared errors that are taken out of it."""
+    """The measurements of a log, as a function of the shared errors that are taken out of them."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -169,15 +170,18 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def unknown_scales(self) -> frozenset[str]:
-        """The scales that all lengths have, so that nothing tells a common scale of them; empty if a length has none."""
+        """The scales of the measured lengths, if each length has one. Then the log cannot tell a factor common to all
+        lengths. Else empty."""
 
     def with_noise(self, noise: NoiseFactors) -> Self:
-        """Return the same with other noise."""
+        """Return the same measurements with other noise."""
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
-        """Return keyframes and settings whose odometry has nominal noise only along, only across, only in turning, or none.
+        """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
+        turning, and not at all.
 
-        The last ones have the noise that is not the odometry's. values: (P,) the errors taken out.
+        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the errors
+        taken out.
         """
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:

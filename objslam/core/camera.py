@@ -69,8 +69,8 @@ class Camera:
         """The angle to the optical axis, rad, at which the lens model folds back. It is at most 90 degrees.
 
         Beyond the fold, a larger angle gives a smaller image radius, so the model projects invisible points into the image.
-        A fisheye lens may see beyond 90 degrees, but OpenCV calibrates it with points of z > 0 only. The lens may leave the
-        image corners dark, which the calibration does not tell.
+        A fisheye lens may see beyond 90 degrees, but OpenCV calibrates it with points of z > 0 only. The calibration does
+        not tell whether the lens leaves the image corners dark.
         """
         if not self.distortion.any():
             return np.pi / 2
@@ -198,7 +198,7 @@ def _undistort_fisheye(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
 
 def project(camera: Camera, points: Floats) -> Floats:
-    """Return the raw (distorted) pixels (N, 2) of points (N, 3), m, that are in front of the camera, in the camera frame.
+    """Return the raw (distorted) pixels (N, 2) of points (N, 3), m, in the camera frame and in front of the camera.
 
     A pixel has no meaning if its point is outside the lens field, which `in_field` tests.
     """
@@ -242,7 +242,8 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return for points (N, 3) the depth (N,), m, that divides their size in the image: z, or the distance for a fisheye."""
+    """Return the depth (N,), m, by which the image size of an object at points (N, 3) shrinks: z, or the distance for a
+    fisheye."""
     return np.asarray(np.linalg.norm(points, axis=1) if camera.fisheye else points[:, 2])
 
 

@@ -1,4 +1,4 @@
-"""The ledger of a run: counts of dropped data and warnings to the user. It ends in summary.json."""
+"""The ledger of a run: counts of dropped data and warnings to the user. summary.json contains it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _EXAMPLES = 3  # The most examples that are kept for each reason. A larger numbe
 
 @dataclass
 class Ledger:
-    """Counts of dropped data by reason, out of how many where that is known, examples of where each reason occurred first,
-    and warnings of one line each."""
+    """The dropped data by reason, and warnings of one line each. For each reason: the count, the first places, and the
+    number of data that were checked, if known."""
 
     dropped: dict[str, int] = field(default_factory=dict)
     totals: dict[str, int] = field(default_factory=dict)
@@ -20,9 +20,10 @@ class Ledger:
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
-        """Count `count` more drops for a reason, out of `of` more data that were looked at, if that is known.
+        """Add `count` drops for a reason.
 
-        where: the file:line or stamp, kept for the first few drops only.
+        of: the number of data that were checked, None if unknown. where: the file:line or stamp, kept for the first few
+        drops only.
         """
         reason = one_line(reason)
         if of is not None:

@@ -18,8 +18,9 @@ class Estimate:
     no object weighs 0. cost_before: error of the graph where the first solve starts. cost_after: error of the graph at the
     optimum of the last solve. For Eq. 1 the error is the sum of distances, m.
     calibration: the shared errors that were estimated, or None. The poses belong to measurements without these errors.
-    noise: the noise that was estimated beside them, None without an estimate.
-    box_offset: the share of an object's size by which the centres of its boxes err together. None if boxes have no size.
+    noise: the estimated noise, None if none was estimated.
+    box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
+    None if boxes have no size.
     """
 
     map_T_base: Floats

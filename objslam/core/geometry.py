@@ -18,8 +18,8 @@ from objslam.core.rotation import (
 )
 
 _ON_A_LINE = 1e-9
-"""The second singular value of two point sets' products, as a share of the first, up to which the points count as on a line.
-A larger share calls more points so. Rounding leaves about 1e-15."""
+"""Points count as on a line up to this ratio of the second to the first singular value of their cross-covariance. A larger
+ratio takes more point sets for lines. Rounding leaves about 1e-15."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -66,7 +66,8 @@ def lift_se2(xy_yaw: Floats) -> Floats:
 def split_se2(pose: Floats) -> tuple[Floats, Floats]:
     """Split SE(3) poses (..., 4, 4) into their SE(2) part (..., 3) x, y, yaw and the remainder (..., 4, 4).
 
-    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis from above, and 0 for a vertical x axis.
+    lift_se2(part) @ remainder is the pose. The yaw is the heading of the x axis seen from above, and 0 for a vertical x
+    axis.
     """
     yaw = np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
     part = np.stack([pose[..., 0, 3], pose[..., 1, 3], yaw], axis=-1)
@@ -98,7 +99,7 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
-    """Return the two norms of `twist_lengths` for the step from one pose (4, 4) to another. This is ten times faster."""
+    """Return the two norms of `twist_lengths` for the step from one pose (4, 4) to another, ten times faster."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
     x, y, z = dx - ax, ey - by, fz - cz  # The step and the axis are in the frame in which both poses are given.
@@ -123,7 +124,8 @@ def exp_se3(twist: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles, whether each needs a series because it is small, and the angles with 1 for small ones."""
+    """Return the rotation angles, whether each is so small that it needs a series, and the angles with each small one set to
+    1."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)

@@ -1,4 +1,4 @@
-"""The noise of a log's measurements, as factors on the noise that the settings say."""
+"""The noise of a log's measurements, as factors on the noise in the settings."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -61,4 +61,4 @@ class NoiseFactors:
 
 
 NOMINAL = NoiseFactors()
-"""The noise that the settings say."""
+"""The noise in the settings, unchanged."""

@@ -117,7 +117,7 @@ def _point(values: ArrayLike) -> Floats:
 
 
 def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) -> list[tuple[int, int]]:
-    """Return a pair for each object that both have: its index in `ours` and its index in `theirs`."""
+    """Return a pair for each object that both maps have: its index in `ours` and its index in `theirs`."""
     from scipy.optimize import linear_sum_assignment
 
     mine, its = (

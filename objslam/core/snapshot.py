@@ -11,7 +11,7 @@ from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 
-NOT_USED = " not used"  # The end of the kinds in `Snapshot.counters` whose messages the settings leave unused.
+NOT_USED = " not used"  # The suffix of each kind in `Snapshot.counters` whose messages the settings do not use.
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ SAME_POINT_WIDE = 16.266
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-It is also the share of a single Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
+The share 99.73 % is that of a Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
 """The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
 cost of a ray that fits no object. A larger deviation gives stray rays more influence on the solution."""
@@ -47,8 +47,8 @@ NOISE_FACTORS = (1.0, 3.0)
 """The limits on the factor by which association multiplies the nominal noise of an object's rays. The lower limit is 1,
 because box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
 MOST_NOISE_FACTOR = 5.0
-"""The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is this large, because
-the box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
+"""The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
+box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
 """The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. The
 noise of a class and the nominal noise are weighted likewise. A larger number keeps objects near the noise of their class for

@@ -152,7 +152,7 @@ class Log:
 
     @property
     def robot_path(self) -> Trajectory | None:
-        """The poses that frames are placed by: the localisation if it has poses, else the odometry, None without both."""
+        """The poses that place the frames: the localisation if it has poses, else the odometry, None without both."""
         return next((path for path in (self.localization, self.odometry) if path is not None and len(path)), None)
 
 
@@ -166,8 +166,9 @@ class Keyframes:
     localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
     absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
     None without odometry. drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the same
-    coordinate frame. stretch: (K,) gaps split the odometry into stretches, and this is their number at each keyframe. None
-    means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning.
+    coordinate frame. stretch: (K,) the number of the odometry stretch of each keyframe, where gaps split the odometry into
+    stretches. None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no
+    meaning.
     """
 
     stamps: Floats
@@ -192,8 +193,8 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, it counts
-        as measured all the same. Without odometry, no motion is measured.
+        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, this motion
+        still counts as measured. Without odometry, no motion is measured.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:

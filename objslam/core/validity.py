@@ -34,11 +34,11 @@ _SHORTEST, _LONGEST = 1e-6, 1e3
 """The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
 some programs do not normalise theirs."""
 _ASYMMETRY = 1e-6
-"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share takes
-files that somebody rounded more."""
+"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share
+accepts files with more rounded numbers."""
 _NEGATIVE = 1e-6
-"""How far below zero the least eigenvalue of a correlation matrix may be. A larger value takes covariances that somebody
-rounded more."""
+"""How far below zero the least eigenvalue of a correlation matrix may be. A larger value accepts covariances with more
+rounded numbers."""
 
 
 def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:

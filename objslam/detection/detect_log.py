@@ -111,7 +111,7 @@ def load_frame(path: Path, camera: Camera, cache: DetectionCache | None) -> Fram
         return Frame(digest, problem="rgb image that cannot be decoded", where=str(path))
     if (width, height) != (camera.width, camera.height):
         where = f"{path} is {width}x{height}, the camera {camera.width}x{camera.height}"
-        return Frame(digest, problem="rgb image that has not the camera's size", where=where)
+        return Frame(digest, problem="rgb image that does not have the camera's size", where=where)
     return Frame(digest, image, None if entry is None else entry.boxes)
 
 

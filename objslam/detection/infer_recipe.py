@@ -1,4 +1,5 @@
-"""Inference of a model's recipe. The settings override the model's own description, which overrides the layout's habits."""
+"""Inference of a model's recipe. The settings override the model's own description, which overrides what is usual for the
+layout."""
 
 import json
 import re
@@ -113,7 +114,7 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """Return the habits of the layout. For families of models with other habits, they are changed."""
+    """Return the usual properties of models of the layout, changed for families of models with other properties."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
         habits = replace(habits, resize="none")  # such models resize the image themselves

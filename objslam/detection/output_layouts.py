@@ -46,8 +46,9 @@ class Facts:
 
     @property
     def ultralytics_detr(self) -> bool:
-        """Whether the metadata describes a DETR model of Ultralytics. Its only output has all class scores of each box.
-        Since version 8.4, which adds the metadata key `head`, the output has only the best score and class of each box."""
+        """Whether the metadata describes a DETR model of Ultralytics. Such a model has one output. Up to version 8.3, the
+        output has all class scores of each box. Later versions add the metadata key `head`, and their output has only the
+        best score and class of each box."""
         return "detr" in self.metadata.get("description", "").lower()
 
 

@@ -11,7 +11,7 @@ from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # Boxes without a larger absolute coordinate are in fractions. In px, such boxes are too small to matter.
+_FRACTION = 1.5  # Boxes are in fractions if no absolute coordinate is larger. In px, such boxes are too small to matter.
 _CANDIDATES = 1000  # The maximum number of boxes in non-maximum suppression, whose time grows with the square of it.
 _Outputs = Mapping[Role, Array]
 

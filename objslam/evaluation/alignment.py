@@ -20,12 +20,12 @@ _MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pair
 _DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences.
 _MAX_TRIPLED = 80  # If there are more correspondences than this, triples of them are sampled. 80 have 82,160 triples.
 _MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
-_MAX_TRIPLES = 1000  # The same for transforms that lay three objects onto three. Fewer do, as more of them are right.
+_MAX_TRIPLES = 1000  # The same for alignments of three objects. Fewer suffice, because more of them are right.
 _MAX_REFINED = 12  # This many of the best initial transforms are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _ON_A_LINE = 0.02
-"""The sine of a triangle's angle up to which its corners count as on a line. A larger one leaves more triples out. Chosen so
-that position errors of 2 % of a triangle's length do not turn it about its longest side."""
+"""The sine of a triangle's angle up to which its corners count as on a line. A larger value leaves more triples out. Chosen
+so that position errors of 2 % of a triangle's length do not turn it about its longest side."""
 _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 and sim3 search.
 
 
@@ -163,9 +163,9 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
 
 
 def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: float, kind: Alignment) -> list[Transform]:
-    """Return alignments of three map objects with three true objects, of the correspondences `i`, `k`; none if none fit.
+    """Return alignments of three map objects with three true objects, from the correspondences (i, k). Empty if none fit.
 
-    Each lays a triangle onto a triangle. Three objects on a line make no triangle.
+    Each aligns a triangle with a triangle. Three objects on a line form no triangle.
     """
     rng = np.random.default_rng(0)
     if len(i) <= _MAX_TRIPLED:
@@ -175,7 +175,7 @@ def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: f
     a, b = source[i[drawn]], target[k[drawn]]  # (T, 3, 3): the corners of each triangle in the map and in the truth.
     side_a, side_b = (np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) for corners in (a, b))
     long_a, long_b = side_a.sum(axis=1), side_b.sum(axis=1)
-    likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A side of no length is one object, taken twice.
+    likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A side of length 0 has one object at both ends.
     scale = np.ones(len(a)) if kind == "se3" else long_b / np.maximum(long_a, 1e-9)
     likely &= (scale >= _SCALES[0]) & (scale <= _SCALES[1])
     likely &= (np.abs(scale[:, None] * side_a - side_b) <= 2 * radius).all(axis=1)

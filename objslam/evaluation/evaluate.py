@@ -25,8 +25,8 @@ INSIDE_95_3D = 7.815
 class Match:
     """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
-    squared: squared Mahalanobis distance of the offset in x and y, by the covariance of the object, which is rotated and
-    scaled as the map is. squared_3d: the same in x, y and z. Both are None without a covariance.
+    squared: squared Mahalanobis distance of the offset in x and y, by the object's covariance, rotated and scaled like the
+    map. squared_3d: the same in x, y and z. Both are None without a covariance.
     """
 
     object: MapObject

@@ -79,6 +79,6 @@ def read_depth(path: Path, camera: Camera, ledger: Ledger) -> NDArray[Any] | Non
     if image is None:
         ledger.drop("depth image that cannot be decoded", where=str(path))
     elif image.shape != (camera.height, camera.width):
-        ledger.drop("depth image that has not the camera's size, or colour", where=str(path))
+        ledger.drop("depth image that is in colour or does not have the camera's size", where=str(path))
         return None
     return image

@@ -1,4 +1,4 @@
-"""Take known shared errors out of a log, or of each part of it: odometry, cameras, directions, and stamps of frames."""
+"""Take known shared errors out of a log, or out of one part of it: odometry, cameras, directions, or stamps of frames."""
 
 import math
 from collections.abc import Mapping
@@ -16,15 +16,16 @@ ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 AXES = ("roll", "tilt", "yaw")
 """The rotations of a camera on the base, about x, y and z."""
 _SQUEEZED = 1e-3
-"""The time (s) at an end of the path into which a clock's offset squeezes the frames that it moves beyond that end. A larger
-value moves more frames. A smaller one lets stamps of fast cameras become equal, as float64 holds Unix time to 0.2 us."""
+"""The time (s) at each end of the path that holds the frames which a clock offset moves beyond that end. A larger value
+moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
+us."""
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
     """Return the log with errors taken out of odometry, cameras, and stamps and depths of frames.
 
-    error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it, as `later`
-    says. Otherwise a clock may move them off its ends.
+    error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it (see
+    `later`). Otherwise a clock offset may move them beyond its ends.
     """
     path, odometry = log.robot_path if stay else None, log.odometry
     if odometry is not None:
@@ -34,7 +35,7 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
 
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
-    """Return the odometry with its ways and its turns corrected. Its first pose stays."""
+    """Return the odometry with the lengths and the turns of its steps corrected. Its first pose stays."""
     return Trajectory(odometry.stamps, CorrectablePath(odometry).poses(error))
 
 
@@ -76,15 +77,16 @@ class CorrectablePath:
 
 
 class OdometryCorrection:
-    """Corrects odometry pose by pose, while it comes, as `corrected_odometry` does for a whole path. The first pose stays.
+    """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose stays.
 
-    A session corrects every pose, and this takes a fraction of the time that a path of two poses takes.
+    A session corrects every pose. For a single pose, this takes a fraction of the time of `corrected_odometry`.
     """
 
     def __init__(
         self, error: Mapping[str, float], said: Trajectory | None = None, corrected: Trajectory | None = None
     ) -> None:
-        """Start a correction by errors, by their names. It continues the corrected path after that of the robot."""
+        """Start a correction. error: the errors by name. said, corrected: a path as the robot sent it, and corrected. The
+        next poses continue both."""
         self._scale, self._turn_scale, self._turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
         self._stamp: float | None = None
         self._before = self._place = np.zeros(0)
@@ -118,7 +120,8 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 
 def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
-    """Return unit directions (R, 3), those of `mine` (R,) as a camera whose focal length is longer by a share sees them."""
+    """Return unit directions (R, 3). Those that `mine` (R,) marks are for a focal length that is longer by the share
+    `focal`."""
     if focal == 0:
         return directions
     longer = np.where(mine[:, None], directions * [1.0, 1.0, 1 + focal], directions)
@@ -147,7 +150,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data with errors taken out. path: where its stamps stay, as `later` says, or None."""
+    """Return a camera and its data with errors taken out. path: the path on which its stamps stay (see `later`), or None."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

@@ -1,4 +1,5 @@
-"""The shared errors that a log has, and those that a calibration file says. They are taken out where none are estimated."""
+"""The shared errors that a log can have, and those in a calibration file. The latter are taken out if they are not
+estimated."""
 
 from pathlib import Path
 
@@ -21,9 +22,9 @@ def error_names(log: Log) -> tuple[str, ...]:
 
 
 def prior_sigma(name: str, settings: Settings) -> float:
-    """Return the standard deviation of an error by the settings, 0 if they hold it.
+    """Return the prior standard deviation of an error in the settings, 0 if they hold the error.
 
-    In fixed mode the errors are estimated against the poses, from bearings. So those of odometry and of ranges are held.
+    In fixed mode, the errors are estimated from bearings and given poses. So the errors of odometry and of ranges are held.
     """
     what = kind(name)
     if settings.mode == "fixed" and (name in ODOMETRY or what == "range_scale"):
@@ -34,8 +35,8 @@ def prior_sigma(name: str, settings: Settings) -> float:
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """Return whether the shared errors of a log are estimated.
 
-    odometry: whether it is used. localized: whether there is a localisation. In fixed mode the poses must be known, so
-    plain odometry tells no error.
+    odometry: whether it is used. localized: whether there is a localisation. In fixed mode, odometry without a localisation
+    reveals no error, because the poses must be known.
     """
     use = settings.calibration.use
     if settings.mode == "fixed":
@@ -44,7 +45,7 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
 
 
 def known_errors(settings: Settings) -> Calibration | None:
-    """Return what calibration.file says of the shared errors, None without a file. ConfigError if the file is wrong."""
+    """Return the shared errors in calibration.file, None without a file. ConfigError if the file is wrong."""
     return None if settings.calibration.file is None else load_calibration(Path(settings.calibration.file))
 
 
@@ -60,8 +61,8 @@ def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Led
 def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
     """Return the log without those errors of calibration.file that the run does not estimate.
 
-    These are all errors if it estimates none, else those that the settings hold. The ledger warns of errors in the file that
-    the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
+    These are all errors in the file if the run estimates none, else only those that the settings hold. The ledger warns of
+    errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:

@@ -14,9 +14,9 @@ Length = TypeVar("Length", float, Floats)
 
 
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
-    """Return the settings of odometry whose ways are longer by the scale in these errors, and its noise with them.
+    """Return the settings with the odometry noise scaled for distances that are longer by the scale in these errors.
 
-    If the noise did not follow its ways, a smaller map would have less of it.
+    Otherwise, the noise relative to the distances would depend on the size of the map.
     """
     way = 1 + error.get("odometry.scale", 0.0)
     if way == 1:
@@ -32,16 +32,16 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), rotation first.
 
     The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, where the
-    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. Moved into base
-    at j, this covariance shows how an error of the heading shifts the later positions.
+    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. This covariance,
+    moved into base at j, shows how an error of the heading shifts the later positions.
     """
     return DriftPath(odometry).gathered(stamps, settings)
 
 
 class DriftPath:
-    """What the drift of an odometry depends on besides its noise. So drifts with other noise, or at other stamps, are quick.
+    """The steps of an odometry, from which its drift with other noise, or at other stamps, is computed quickly.
 
-    On a planar path, it has ten times fewer numbers to compute.
+    On a planar path, it computes ten times fewer numbers.
     """
 
     def __init__(self, odometry: Trajectory) -> None:
@@ -92,7 +92,7 @@ class DriftPath:
 
 
 _PLANAR = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Where the rows and columns yaw, x and y of a symmetric matrix are in its six entries."""
+"""The index of each element of a symmetric matrix (yaw, x, y) among its six distinct elements."""
 _PLANAR_TOLERANCE = 1e-6
 """The largest change (m, rad) of height, roll or pitch on a planar path, as in `geometry.is_planar`."""
 

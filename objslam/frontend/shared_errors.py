@@ -1,6 +1,6 @@
 """The measurements of a log with its shared errors taken out: the odometry's scale, clocks, and the cameras' rotations.
 
-The parameters change what was measured, never the factors that a graph makes of it.
+The parameters change the measurements, never the kind of factors that a graph makes of them.
 """
 
 from collections.abc import Mapping
@@ -56,7 +56,7 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: those that the settings do not tell, if there are such measurements."""
+        """The kinds of noise that are estimated: those that the settings leave open, if there are such measurements."""
         of, default = self.settings, Settings()
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()
@@ -70,18 +70,19 @@ class SharedErrors:
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
-        """The scales that all lengths have, so that nothing tells a common scale of them; empty if a length has none."""
+        """The scales of the measured lengths, if each length has one. Then the log cannot tell a factor common to all
+        lengths. Else empty."""
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return frozenset()
         scales = {"odometry.scale"} | ({"range_scale"} if np.isfinite(self.rays.range).any() else set())
         return frozenset(scales) if scales <= set(self.names) else frozenset()
 
     def with_noise(self, noise: NoiseFactors) -> Self:
-        """Return the same with other noise."""
+        """Return the same measurements with other noise."""
         return replace(self, noise=noise)
 
     def with_unknown_noise(self) -> Self:
-        """Return the same with all kinds of noise unknown, whatever the settings say."""
+        """Return the same measurements with all kinds of noise unknown, whatever the settings say."""
         noise = self.settings.noise.model_copy(update={"rays": True, "ranges": True, "odometry": True})
         return replace(self, settings=self.settings.model_copy(update={"noise": noise}))
 
@@ -89,8 +90,8 @@ class SharedErrors:
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.
 
-        Without odometry a clock is told by the path alone. Then its step is at least as long as two steps of the path. So
-        the noise of the poses that make a residual is not in its derivative, where it would shift the clock.
+        Without odometry, only the path reveals the offset of a clock. Then the clock's step is at least as long as two steps
+        of the path. So the noise of single poses is not in the derivative, where it would bias the offset.
         """
         steps = {**_STEPS}
         path = self.log.robot_path
@@ -113,8 +114,9 @@ class SharedErrors:
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings with the errors (P,) taken out.
 
-        The noise of ways and ranges follows their scale. Otherwise a smaller map would fit better. Keyframes stay on their
-        path: a stamp that leaves it takes the pose of the end, one in a gap the nearest pose.
+        The noise of distances and ranges follows their scale. Otherwise a smaller map would fit better. Keyframes stay on
+        their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
+        pose.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
@@ -148,7 +150,7 @@ class SharedErrors:
         """Return keyframes of `at`, with the drift at their own stamps.
 
         The clocks of several cameras can change the order of their frames. A graph keeps the order of the log, and needs
-        a drift that grows in this order. What sorts keyframes by time needs a drift that grows with time.
+        a drift that grows in this order. Code that sorts keyframes by time needs a drift that grows with time.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         if self.log.odometry is None or keyframes.drift is None:
@@ -157,7 +159,7 @@ class SharedErrors:
         return replace(keyframes, drift=drift)
 
     def with_prior(self, found: Calibration) -> Calibration:
-        """Return what was found together with what was expected of these errors before."""
+        """Return the calibration `found` with the prior of these errors."""
         return replace(found, prior_mean=self.mean, prior_covariance=self.prior)
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
@@ -165,9 +167,11 @@ class SharedErrors:
         return replace(self, keyframes=keyframes, rays=rays)
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
-        """Return keyframes and settings whose odometry has nominal noise only along, only across, only in turning, or none.
+        """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
+        turning, and not at all.
 
-        The last ones have the noise that is not the odometry's. values: (P,) the errors taken out.
+        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the errors
+        taken out.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         path = self._drift(error)
@@ -184,11 +188,12 @@ class SharedErrors:
         return found
 
     def _scaled_noise(self, error: Mapping[str, float]) -> Settings:
-        """The settings with the estimated noise, scaled as the ways are."""
+        """The settings with the estimated noise, scaled like the odometry's distances."""
         return scaled_noise(self.noise.settings(self.settings), error)
 
     def _poses(self, error: Mapping[str, float]) -> "_Poses":
-        """The poses of the keyframes. Rotations of cameras and scales of ranges do not change them, so they are kept."""
+        """The poses of the keyframes. Rotations of cameras and scales of ranges do not change the poses, so the poses are
+        kept."""
         key = *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
         return self._kept_poses.get(key, lambda: self._computed_poses(error))
 
@@ -196,7 +201,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # those of the poses, which end with the path
+        known = stamps.copy()  # the stamps of the poses, which end with the path
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)
@@ -229,7 +234,7 @@ class SharedErrors:
         return _at_stamps(path, stamps, self.settings.poses.max_gap)
 
     def _corrected(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Poses of the odometry without its errors, with ways that make up for the shrinkage of the map, as ranges do."""
+        """Poses of the odometry without its errors, with distances that compensate the shrinkage of the map, as the ranges do."""
         named = dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
         return self._correctable().poses(named, which)
 
@@ -241,7 +246,7 @@ class SharedErrors:
         return self._path[0]
 
     def _drift(self, error: Mapping[str, float]) -> DriftPath:
-        """What the drift of the odometry without its errors depends on."""
+        """The steps of the odometry without its errors, which give its drift."""
 
         def measured() -> DriftPath:
             return DriftPath(Trajectory(self._correctable().odometry.stamps, self._corrected(error)))
@@ -249,7 +254,7 @@ class SharedErrors:
         return self._kept_drift.get(self._odometry_key(error), measured)
 
     def _odometry_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
-        """The errors of the odometry, its scale with what makes up for the shrinkage of the map."""
+        """The errors of the odometry. Its scale includes the compensation of the map's shrinkage."""
         scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
         return (1 + scale) * (1 + self.noise.shrinkage) - 1, *others
 

@@ -1,4 +1,4 @@
-"""Read and write the shared errors of a robot as YAML: what `objslam calibrate` found, and what a run starts from."""
+"""Read and write the shared errors of a robot as YAML: the output of `objslam calibrate`, from which a run can start."""
 
 from pathlib import Path
 from typing import Any
@@ -38,17 +38,17 @@ def load_calibration(path: Path) -> Calibration:
         raise ConfigError(error.message, where=error.where, hint="give a file of objslam calibrate") from error
     except (yaml.YAMLError, ValueError, OSError, RecursionError, OverflowError) as error:
         what = one_line(error)[:300]
-        raise ConfigError(f"this is no calibration of shared errors: {what}", where=str(path), hint=_HINT) from error
+        raise ConfigError(f"this is not a calibration of shared errors: {what}", where=str(path), hint=_HINT) from error
 
 
 def _refuse_duplicates(node: yaml.Node | None) -> None:
-    """Raise ValueError if a mapping, or one in it, has a key twice, of which PyYAML would take the last."""
+    """Raise ValueError if a mapping, or a mapping inside it, has a key twice. PyYAML would take the last value."""
     seen = set()
     for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
         if not isinstance(key, yaml.ScalarNode):
-            raise ValueError(f"line {key.start_mark.line + 1} has a key that is no name")
+            raise ValueError(f"line {key.start_mark.line + 1} has a key that is not a name")
         if key.value in seen:
-            raise ValueError(f"{key.value} is there twice, again in line {key.start_mark.line + 1}")
+            raise ValueError(f"{key.value} occurs twice, the second time in line {key.start_mark.line + 1}")
         seen.add(key.value)
         _refuse_duplicates(value)
 
@@ -80,9 +80,9 @@ def _column(parameters: dict[Any, Any], key: str, default: float | None = None) 
         try:
             numbers.append(float(value))  # type: ignore[arg-type]
         except (TypeError, ValueError):
-            raise ValueError(f"{key} of {name} is no number") from None
+            raise ValueError(f"{key} of {name} is not a number") from None
         if isinstance(value, bool) or not np.isfinite(numbers[-1]):
-            raise ValueError(f"{key} of {name} is no finite number")
+            raise ValueError(f"{key} of {name} is not a finite number")
     return np.array(numbers)
 
 
@@ -94,7 +94,7 @@ def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Float
     try:
         matrix = np.array([[float(number) for number in row] for row in rows])
     except (TypeError, ValueError):
-        raise ValueError(f"{key} is no matrix of numbers") from None
+        raise ValueError(f"{key} is not a matrix of numbers") from None
     if (fault := covariance_fault(matrix)) is not None:
         raise ValueError(f"{key} {fault}")
     if (np.diagonal(matrix) <= 0).any():

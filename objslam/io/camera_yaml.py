@@ -33,7 +33,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a camera sits on the robot, from a file that says no more of it. name: "" if the file has no name."""
+    """The pose of a camera on the robot, from a file without the camera's calibration. name: "" if the file has no name."""
 
     name: str
     base_T_camera: Floats
@@ -54,13 +54,13 @@ def read_camera(
 def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
     """Read one camera, or several named cameras under the key `cameras`. Raises LogError with the line of an error.
 
-    Cameras of which the file says only base_T_camera are left to `read_mounts`.
+    Cameras for which the file has only base_T_camera are left to `read_mounts`.
     """
     return tuple(_read(path, keys, ledger, name) for name, keys in _sections(path) if not _only_mount(keys))
 
 
 def read_mounts(path: Path) -> tuple[Mount, ...]:
-    """Read the cameras of a file for `read_calibrations` of which it says only base_T_camera, and perhaps the name."""
+    """Read the cameras for which a file has only base_T_camera, and perhaps a name. `read_calibrations` reads the others."""
     named = [(name, keys) for name, keys in _sections(path) if _only_mount(keys)]
     return tuple(
         Mount(

@@ -86,7 +86,7 @@ def read_stamp(message: dict[str, Any]) -> float:
 
 
 def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
-    """Add a frame with its boxes. Return whether no box is cut off by the image edge (the key "whole" of the frame).
+    """Add a frame with its boxes. Return its key "whole": True if the image edge cuts no box off.
     Raises Malformed if the frame is invalid."""
     stamp = read_stamp(frame)
     boxes = _list(frame, "boxes")

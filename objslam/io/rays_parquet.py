@@ -111,9 +111,9 @@ def _column(table: Any, name: str, size: int) -> Floats:
     column = table[name].combine_chunks()
     kind = column.type if size == 1 else getattr(column.type, "value_type", pa.null())
     if not pa.types.is_floating(kind):
-        raise ValueError(f"the column {name} has not {size} numbers in a row")
+        raise ValueError(f"the column {name} does not have {size} numbers in each row")
     if size > 1 and (np.asarray(pc.list_value_length(column).fill_null(0)) != size).any():
-        raise ValueError(f"the column {name} has not {size} numbers in a row")
+        raise ValueError(f"the column {name} does not have {size} numbers in each row")
     values = np.asarray((column if size == 1 else column.flatten()).to_numpy(zero_copy_only=False), dtype=np.float64)
     return values if size == 1 else values.reshape(-1, size)
 
@@ -133,8 +133,8 @@ def _fault(rays: RaysTable) -> str | None:
     rules = (
         (valid_stamps(rays.stamp), "a wrong stamp"),
         (valid_positions(rays.origin), "a wrong origin"),
-        (np.abs((rays.direction**2).sum(axis=1) - 1) < _UNIT, "a direction that has not length 1"),
-        (angles[0] & angles[1], "a residual that is no angle"),
+        (np.abs((rays.direction**2).sum(axis=1) - 1) < _UNIT, "a direction whose length is not 1"),
+        (angles[0] & angles[1], "a residual that is not an angle"),
         ((rays.weight >= 0) & (rays.weight <= 1), "a weight outside 0 to 1"),
         (valid_depths(rays.sigma), "a sigma that is not above zero"),
         ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that cannot be"),

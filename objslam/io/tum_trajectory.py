@@ -50,7 +50,8 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
 
 
 def _read_numbers(path: Path, ledger: Ledger) -> Table:
-    """Return a table with 8 columns, also of a file with "stamp x y yaw". The first line with either number decides."""
+    """Return a table with 8 columns, also of a file with "stamp x y yaw". The first line of 8 or 4 numbers shows which form
+    the file has."""
     lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
     names = lines[0][1].split() if lines else []
     if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):

@@ -30,7 +30,7 @@ def load_summary(out: Path) -> dict[str, Any]:
 
 
 def load_evaluation(out: Path) -> dict[str, Any] | None:
-    """Read evaluation.json of the result folder `out`, None if there is none. OutputError if `eval` did not write it so."""
+    """Read evaluation.json of the result folder `out`, None if there is none. OutputError if its content is invalid."""
     file = out / files.EVALUATION
     return _load_json(file, EvaluationFile) if file.is_file() else None
 
@@ -50,7 +50,7 @@ def _load_json(file: Path, shape: type[BaseModel]) -> dict[str, Any]:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number in JSON")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def load_trajectory(out: Path) -> Trajectory:
@@ -82,7 +82,7 @@ def load_truth(path: Path) -> Truth | None:
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not a truth. To compare two results, give this file itself.
+            of its log. The objects.json of a result folder is not a truth. To compare two results, give that file itself.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """

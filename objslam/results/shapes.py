@@ -1,6 +1,7 @@
 """The shapes of summary.json and evaluation.json: which keys a command reads, and what type each has.
 
-A folder may come from somebody else, so a value of another type must end in one clear line. Other keys may hold anything.
+A folder may come from somebody else, so a value of another type must give an error of one clear line. Other keys may hold
+anything.
 """
 
 from typing import Annotated, Any, Self

@@ -15,7 +15,7 @@ from objslam.simulation.furniture import Room
 Reals = NDArray[np.floating]
 
 NEAR = 0.05  # The least depth of an object's points, m. An object with a nearer point counts as partly behind the camera.
-_NOISE = 64  # The grid points of the 3D noise along each axis. With a larger value, the noise repeats after a longer way.
+_NOISE = 64  # The grid points of the 3D noise along each axis. With a larger value, the noise repeats less often.
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 
 

@@ -193,7 +193,7 @@ def drive_room(settings: RenderSettings, seed: int) -> Room:
 
 
 def _as_detections(frames: list[TrueBoxes], stamps: Floats, labels: tuple[str, ...]) -> Detections:
-    """Turn the true boxes that count into detections with score 1 and the objects' ids as track ids."""
+    """Return the true boxes within the limits as detections, with score 1 and the objects' ids as track ids."""
     names, label = label_table(labels)
     joined = {name: np.concatenate([getattr(f, name)[f.counts] for f in frames]) for name in ("object", "box", "depth")}
     frame = np.repeat(np.arange(len(frames)), [int(f.counts.sum()) for f in frames])

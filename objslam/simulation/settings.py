@@ -92,7 +92,8 @@ class DriveSettings(CourseSettings):
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """The least number of images of all cameras in which a random object is in view, as a share of one camera's images."""
+    """The least number of views of a random object by all cameras together, as a share of the number of one camera's
+    images."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""

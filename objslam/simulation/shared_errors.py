@@ -34,7 +34,8 @@ def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
 
 
 def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajectory:
-    """The odometry whose ways, turns and turn rates err; a correction by the same values gives back the true one."""
+    """Return the odometry with wrong distances, turns and turn rates. A correction by the same values restores the true
+    odometry."""
     scale, turn_scale, turn_bias = (errors.get(f"odometry.{name}", 0.0) for name in ("scale", "turn_scale", "turn_bias"))
     plane, remainder = split_se2(odometry.poses)
     yaw, place = np.unwrap(plane[:, 2]), plane[:, :2]

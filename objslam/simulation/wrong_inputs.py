@@ -108,7 +108,7 @@ def _w_first(poses: Floats) -> Floats:
 
 
 def _frozen(begin: float) -> Mistake:
-    """Poses that stay where they are from a share of the log on."""
+    """Poses that stop changing after the share `begin` of the log."""
 
     def change(poses: Floats) -> Floats:
         first = int(begin * (len(poses) - 1))

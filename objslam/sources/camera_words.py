@@ -1,12 +1,12 @@
-"""What a camera's calibration says in words, so that a wrong one is seen at a glance."""
+"""Describe a camera's calibration in words, so that a wrong calibration is seen at a glance."""
 
 import numpy as np
 
 from objslam.core.camera import Camera, undistort
 
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
-_STEEP = 60.0  # The elevation, degrees, from which on a camera looks up or down. A larger value says so less often.
-_LEVEL = 5.0  # The elevation and tilt, degrees, that are not worth a word. A larger value leaves more of them out.
+_STEEP = 60.0  # The elevation, degrees, from which a camera counts as looking up or down. A larger value counts fewer so.
+_LEVEL = 5.0  # The elevation and tilt, degrees, up to which the text omits them. A larger value omits more of them.
 _ASPECT = 1.2  # The ratio of fx and fy above which a pixel would be odd. Real lenses stay below 1.1.
 
 
@@ -52,7 +52,7 @@ def _width(camera: Camera) -> float:
     """Return the angle, degrees, between the left and the right edge of the image, through the principal point."""
     row = camera.matrix[1, 2]
     edges, valid = undistort(camera, np.array([[-0.5, row], [camera.width - 0.5, row]]))
-    if not valid.all():  # The lens model has no inverse there.
+    if not valid.all():  # The lens model has no inverse at the edge.
         edges = np.linalg.solve(camera.matrix, np.array([[-0.5, camera.width - 0.5], [row, row], [1, 1]])).T
     angles = np.arctan2(edges[:, 0], edges[:, 2])
     return float(np.degrees(angles[1] - angles[0]))

@@ -93,7 +93,7 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def beside(path: Path) -> Iterator[Path]:
-    """Make an empty folder in the parent folder of a path, so that both are on one disk, and remove it at the end."""
+    """Make an empty folder in the parent folder of a path, and remove it at the end. It is on the same disk as the path."""
     path = Path(os.path.realpath(path))
     with no_empty_folders(path.parent):
         with _writing(path):
@@ -113,7 +113,7 @@ def check_target(path: Path, overwrite: bool) -> None:
         if not path.exists() or not any(path.iterdir()):
             return
         if not is_log_folder(path):
-            raise OutputError("the folder has files but is no log", where=str(path), hint="name a new or empty folder")
+            raise OutputError("the folder has files but is not a log", where=str(path), hint="name a new or empty folder")
         if not overwrite:
             raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
 

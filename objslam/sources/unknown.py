@@ -1,4 +1,4 @@
-"""Say what a path is that no source reads, and what to do with it."""
+"""Describe a path that no source reads, and say what to do with it."""
 
 from __future__ import annotations
 

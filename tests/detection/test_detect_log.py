@@ -113,9 +113,9 @@ def test_images_that_cannot_be_used_are_no_frames(log, detector):
     assert ledger.dropped == {
         "rgb image that cannot be decoded": 3,
         "rgb image that cannot be read": 1,
-        "rgb image that has not the camera's size": 1,
+        "rgb image that does not have the camera's size": 1,
     }
-    assert "4.png is 640x240, the camera 320x240" in ledger.examples["rgb image that has not the camera's size"][0]
+    assert "4.png is 640x240, the camera 320x240" in ledger.examples["rgb image that does not have the camera's size"][0]
     assert "2.png" in ledger.examples["rgb image that cannot be read"][0]
 
 

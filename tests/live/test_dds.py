@@ -251,7 +251,7 @@ def test_a_domain_that_cannot_be_is_wrong_use(given):
 
 @pytest.mark.parametrize("interface", ['lo"/><x', "a b", ""])
 def test_an_interface_that_cannot_be_is_wrong_use(domain, interface):
-    with pytest.raises(ConfigError, match="no network interface"):
+    with pytest.raises(ConfigError, match="not a network interface"):
         open_network(domain, interface)
 
 

@@ -125,7 +125,7 @@ def test_compressed_images_and_what_is_wrong_with_images(robot):
     assert messages.ledger.dropped == {
         "image that cannot be decoded": 3,
         "image that the detector failed on": 1,
-        "image that has not the size of its camera": 1,
+        "image that does not have the size of its camera": 1,
     }
 
 

@@ -174,7 +174,7 @@ def test_a_session_starts_from_a_calibration(log, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("more", "fault"), [((), "this file is not a journal"), (("--resume",), "cannot resume: this file is no journal")]
+    ("more", "fault"), [((), "this file is not a journal"), (("--resume",), "cannot resume: this file is not a journal")]
 )
 def test_a_file_that_is_no_journal_stays_as_it_is(log, tmp_path, more, fault):
     out = tmp_path / "out"

@@ -61,7 +61,7 @@ def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
     ("options", "code", "words"),
     [
         (["dds", "--domain", "999"], 2, "no DDS domain"),
-        (["dds", "--interface", "no such"], 2, "no network interface"),
+        (["dds", "--interface", "no such"], 2, "not a network interface"),
         (["dds", "--topic", "wheels=/odom"], 2, "is not role=/name"),
         (["rclpy"], 1, "rclpy cannot be imported"),
     ],

@@ -324,7 +324,7 @@ def test_depth_images_give_boxes_their_depth(maker):
     robot.messages.tick()
     assert len(robot.sink.detections) == 5
     assert robot.dropped == {
-        "depth image that has not the camera's size": 1,
+        "depth image that does not have the camera's size": 1,
         "depth of a frame without a depth image": 1,
     }
 

@@ -395,7 +395,7 @@ def test_a_clock_that_jumps_and_odometry_that_starts_anew(log, jump):
             session.wait(LIMIT)
             frame += 1
     accepted = session.counters.accepted()
-    assert accepted["odometry started anew"] == 1
+    assert accepted["restarts of the odometry"] == 1
     assert accepted["clock set back" if jump < 0 else "gaps of the odometry"] == 1
     off = errors(session.stop().map, log)
     assert len(off) >= 10

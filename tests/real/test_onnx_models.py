@@ -79,4 +79,4 @@ def test_a_log_of_the_photographs(detectors, onnx_dir, tmp_path):
     detections = log.cameras[0].detections
     assert detections.frame_stamps.tolist() == [1.0]  # person.jpg has another size
     assert {detections.label_names[i] for i in detections.label} == CONTENT["dog.jpg"]
-    assert ledger.dropped == {"rgb image that has not the camera's size": 1}
+    assert ledger.dropped == {"rgb image that does not have the camera's size": 1}

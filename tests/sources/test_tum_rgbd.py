@@ -110,7 +110,7 @@ def test_depth_images_that_cannot_be_used(numbered):
     assert np.isnan(detections.depths).all()
     assert ledger.dropped == {
         "depth image that cannot be decoded": 1,
-        "depth image that has not the camera's size, or colour": 1,
+        "depth image that is in colour or does not have the camera's size": 1,
         "depth of a frame without a depth image": 1,
     }
 

@@ -63,8 +63,8 @@ Push = Callable[[Sink], bool]
 def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
     """Yield the events of a log in time order: the time, s, whether the event is a frame, and the push of the event.
 
-    The time of an event is its stamp. But the time of a frame is the stamp of the first pose that is not older, and the
-    frame follows this pose. So no frame waits for a pose (live.max_lag).
+    The time of an event is its stamp, except for a frame. A frame directly follows the first pose at or after its stamp, and
+    has the time of this pose. So no frame waits for a pose (live.max_lag).
     """
     settings = settings or Settings()
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []  # stamps, rank at the same stamp, push by index

@@ -1,4 +1,4 @@
-"""Calibrate a session while it runs: when a worker estimates the shared errors, and when the map takes up what it found."""
+"""Calibrate a session while it runs: when a worker estimates the shared errors, and when the estimate corrects the map."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ _GROWTH = 1.5
 """The growth factor of keyframes between two calibrations. A larger factor calibrates more rarely. With any factor above 1,
 the work of all calibrations together grows linearly with the session."""
 _DELAY = 0.15
-"""The keyframes from the start of a calibration until the map takes it up, as a share of all keyframes. With a larger share,
-more sessions take it up at the same keyframe, however fast the machine is. But the map is corrected later."""
+"""The keyframes from the start of a calibration until it corrects the map, as a share of all keyframes. With a larger share,
+the keyframe of the correction depends less on the speed of the machine, but the correction is later."""
 _CHANGED = 1.0
-"""The change of an error, in standard deviations, from which the map is corrected. With a larger value it is rarer."""
+"""The change of an error, in standard deviations, from which the map is corrected. With a larger value, corrections are
+rarer."""
 
 
 def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which the errors that the session cannot observe stay at their values `now` (P,).
 
-    The others get what is most probable then. Else noise would move the map to and fro with each calibration.
+    The other errors get their most probable values, given the values `now`. Otherwise, noise would move the map with each
+    calibration.
     """
     stay = found.sigma > OBSERVABLE * found.prior
     if not stay.any():
@@ -50,7 +52,8 @@ class Calibrator:
     """Decides after each keyframe whether a calibration begins or takes effect.
 
     A calibration begins at fixed numbers of keyframes, and takes effect a fixed share of keyframes later, or as soon as the
-    worker is done. What takes effect is recorded with the number of keyframes, so that a resumed session does the same.
+    worker is done. Each calibration that takes effect is recorded with the number of keyframes, so that a resumed session
+    does the same.
     """
 
     def __init__(
@@ -71,17 +74,17 @@ class Calibrator:
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Take up these calibrations, and begin no others until `begin`."""
+        """Apply these calibrations of a journal when they are due, and start no others until `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:
-        """Go on after a resumed journal. A calibration that had no effect yet begins anew."""
+        """Continue after the journal of a resumed session. A calibration that has not taken effect starts again."""
         self._replaying = False
         if self._asked is not None:
             self._worker = Worker(self._asked[1])
 
     def after_keyframe(self) -> bool:
-        """Begin a calibration or take one up, if it is time, and return whether the map was corrected."""
+        """Start or apply a calibration if it is due, and return whether the map was corrected."""
         number, changed = self._mapper.state.next_id.keyframe, False
         while self._known and self._known[0].keyframe <= number:
             self._take_up(self._known.popleft().calibration)
@@ -116,7 +119,7 @@ class Calibrator:
             self._worker = Worker(request)
 
     def _finish(self, number: int) -> bool:
-        """Take up the worker's calibration if it is time and it differs from the present one. Return whether it was."""
+        """Apply the worker's calibration if it is due and differs from the present one. Return whether it was applied."""
         worker, m = self._worker, self._mapper.state
         assert worker is not None
         assert self._asked is not None

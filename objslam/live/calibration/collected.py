@@ -15,13 +15,13 @@ from objslam.mapping.alternation import seen_something
 
 @dataclass(frozen=True)
 class Collected:
-    """What a session has collected, as offline mapping takes it.
+    """The data that a session has collected, in the form of offline mapping.
 
-    keyframes: in time order, as they were measured. rays: theirs, as they were measured. association: of the rays. ids: (N,)
-    of the objects in the session. map_T_camera, positions: (K, 4, 4), (N, 3) its estimate. log: the paths and cameras.
-    errors: the same keyframes and rays as a function of the shared errors, None if neither errors nor noise are estimated.
-    theta: (P,) the values by which the session corrects its measurements. Errors that the session takes out but does not
-    estimate are taken out here.
+    keyframes: in time order, as they were measured. rays: those of the keyframes, as they were measured. association: that
+    of the rays. ids: (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's
+    estimate. log: the paths and cameras. errors: the same keyframes and rays as a function of the shared errors, None if
+    neither errors nor noise are estimated. theta: (P,) the values by which the session corrects its measurements. Errors
+    that the session takes out but does not estimate are already taken out of the keyframes, rays and log.
     """
 
     keyframes: Keyframes
@@ -87,12 +87,13 @@ def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> S
 
 
 def corrections(m: MapState, errors: SharedErrors) -> Floats:
-    """Return the values (P,) by which a session corrects its measurements, and the expected value of all others."""
+    """Return the values (P,) of the errors: those that a session takes out of its measurements, and the expected values of
+    others."""
     return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
 
 
 def as_measured(m: MapState, rows: Ints) -> Keyframes:
-    """Return the keyframes in these rows (n,), with the stamps and mounts that came. The rest depends on the paths."""
+    """Return the keyframes in these rows (n,), with their stamps and mounts as received."""
     return replace(m.keyframe_arrays(rows), stamps=m.keyframes.sent[rows], base_T_camera=m.keyframes.mount[rows])
 
 
@@ -115,9 +116,9 @@ def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
 
 
 def recorded_log(m: MapState, name: str, keyframes: Keyframes) -> Log:
-    """Return the paths and cameras of a session as they came, without its detections.
+    """Return the paths and cameras of a session as received, without its detections.
 
-    keyframes: as they were measured. The poses of moving cameras are known at these.
+    keyframes: as they were measured. They give the poses of moving cameras.
     """
     return Log(
         name=name,

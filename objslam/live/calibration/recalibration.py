@@ -53,7 +53,7 @@ def recalibrate(m: MapState, calibration: Calibration) -> None:
 
 
 def _remeasure_keyframes(m: MapState) -> None:
-    """Correct cameras, the path, and stamps, mounts and poses of the keyframes."""
+    """Correct the cameras, the path, and the stamps, mounts and poses of the keyframes."""
     k = m.keyframes
     every = np.arange(len(k))
     log = recorded_log(m, "live", as_measured(m, every))
@@ -99,7 +99,8 @@ def _ratio(m: MapState, before: dict[str, float], name: str) -> float:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before. An object takes the drift of the keyframe whose drift it had.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object stays with the keyframe whose drift it
+    had.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])
@@ -108,7 +109,7 @@ def _carried(m: MapState, drifted: Floats) -> Floats:
 
 
 def _shift_times(m: MapState, times: Floats) -> None:
-    """Shift the stamps of landmarks and tracks as those of the keyframes, which were `times` (K,) before."""
+    """Shift the stamps of landmarks and tracks as those of the keyframes. times: (K,) s, the keyframes' stamps before."""
     order = np.argsort(times, kind="stable")
     shift = (m.keyframes.stamp - times)[order]
 
@@ -147,8 +148,7 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 def _solve(m: MapState) -> None:
     """Move the estimate to the corrected measurements, at once or over the next keyframes.
 
-    The rays are tested again at the next full solve and not now. Until the map has settled, those of one object may seem to
-    be of two.
+    The next full solve tests the rays again. Until the map has settled, the rays of one object may seem to be of two.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

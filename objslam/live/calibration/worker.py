@@ -28,7 +28,7 @@ _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_TH
 
 @dataclass(frozen=True)
 class Request:
-    """What a calibration starts from. theta: (P,) the errors now. map_T_camera: (K, 4, 4) poses of its keyframes."""
+    """The input of a calibration. theta: (P,) the errors now. map_T_camera: (K, 4, 4) poses of its keyframes."""
 
     errors: SharedErrors
     theta: Floats
@@ -64,7 +64,7 @@ class Worker:
         self._process: subprocess.Popen[bytes] | None = None
         package = str(Path(__file__).parents[3])
         paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-        with suppress(OSError):  # then there is no answer, which `result` says
+        with suppress(OSError):  # `result` then returns None
             self._process = subprocess.Popen(
                 [sys.executable, "-m", __name__],
                 stdin=subprocess.PIPE,

@@ -111,7 +111,7 @@ def _settings(interface: str | None) -> tuple[str, str]:
     except ValueError:
         if not re.fullmatch(r"[A-Za-z0-9_.:@-]{1,32}", interface):
             hint = "choose from the list of `ip address`"
-            raise ConfigError(f"{interface[:40]!r} is no network interface", where="--interface", hint=hint) from None
+            raise ConfigError(f"{interface[:40]!r} is not a network interface", where="--interface", hint=hint) from None
         named = f'name="{interface}"'
     return f"the interface {interface}", f"<General><Interfaces><NetworkInterface {named}/></Interfaces></General>"
 

@@ -13,14 +13,14 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts kept per camera. With more, frames of a camera on an arm may come later. They cost memory.
+_MOUNTS = 4096  # The mounts kept per camera. More accept later frames of a camera on an arm, and cost memory.
 
 
 @dataclass(frozen=True)
 class FrameView:
     """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4).
 
-    mount: (4, 4) base_T_camera as it came, with its shared errors.
+    mount: (4, 4) base_T_camera as received, with its shared errors.
     """
 
     camera: int
@@ -49,7 +49,7 @@ class BearingExtractor:
         m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Add a mount: a pose of a camera on the robot from a stamp on."""
+        """Add a mount: the pose of a camera on the robot, which holds from its stamp."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:

@@ -18,7 +18,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, because frames wait in a queue. A longer time costs memory.
+_KEPT = 3.0  # The time beyond live.max_late for which poses are kept, s, because frames wait in a queue. More costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
@@ -39,7 +39,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """One stretch of a path, placed on the course. drift: (6, 6), what the course adds to the drift of the path."""
+    """One stretch of a path, placed on the course. drift: (6, 6) the drift that the course adds to that of the path."""
 
     stretch: int
     start_T_path: Floats
@@ -49,7 +49,8 @@ class _Piece:
 class Course:
     """The paths of odometry and localisation, and the course that they form.
 
-    driven, localized: the whole odometry and localisation, as they came. odometry has its shared errors taken out.
+    driven, localized: the whole odometry and localisation, as received. odometry: the newest odometry, without its shared
+    errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:
@@ -147,7 +148,7 @@ class Course:
         return stretch is not None and (goes_on or localization.newest >= odometry.stretch_begin)
 
     def place(self, stamp: float, keyframes: KeyframeTable, before: int | None) -> Placed | None:
-        """Return the pose of a frame. None if no path covers its stamp, or if it is late and would need a new piece.
+        """Return the pose of a frame. None if no path covers its stamp, or if the frame is late and would need a new piece.
 
         before: the row of the last keyframe before the frame.
         """
@@ -198,7 +199,7 @@ class Course:
     def _lay(
         self, stretch: int, start_T_base: Floats, drift: Floats, pose: Floats, own: Floats, noise: tuple[float, float]
     ) -> _Piece:
-        """Return the piece of the course whose path has `pose` (4, 4) where the course has start_T_base (4, 4).
+        """Return the piece of the course that puts `pose` (4, 4) of the path at start_T_base (4, 4) on the course.
 
         own: (6, 6) drift of the path at `pose`. drift: (6, 6) drift of the course at start_T_base. noise: (rad, m) by which
         the two poses may differ.

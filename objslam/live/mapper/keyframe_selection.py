@@ -7,7 +7,7 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10  # The keyframes while the cameras stand. More keyframes average the detector's noise, but cost time.
+_STANDING = 10  # The keyframes of a camera that stands still. More keyframes average the detector's noise, but cost time.
 
 
 class KeyframeSelector:
@@ -20,7 +20,8 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether the camera stands still, there are enough keyframes since, and they show all labels `shown`."""
+        """Return whether the camera stands still, and the keyframes since it stopped are enough and show all labels
+        `shown`."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
@@ -36,7 +37,8 @@ class KeyframeSelector:
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, keyframes count anew."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the count of keyframes
+        restarts."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

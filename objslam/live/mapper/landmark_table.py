@@ -14,11 +14,11 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # The information (m^-2) added to each landmark, as parallel rays give too little. More makes it too certain.
+_HELD = 1e-4  # The information (m^-2) added to each landmark. Parallel rays give too little. More makes it too certain.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
-_FURTHER = 1.1  # The factor on its largest observed distance up to which a landmark is expected. More counts more misses.
-_NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has it, and -1 means that there is none.
+_FURTHER = 1.1  # A landmark is expected up to this factor times its largest observed distance. More counts more misses.
+_NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 
 class LandmarkTable(GrowingTable):

@@ -14,7 +14,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 _JUMP = np.radians(2.0)  # The residual (rad) that shows that a loop closes. With a larger angle, the map settles later.
-_TRACKS = 4096  # The detector tracks whose landmark is stored. More help if a track id comes back after a long time.
+_TRACKS = 4096  # The detector tracks whose landmark is stored. With more, a track id is recognised after a longer absence.
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import skew
 
 HORIZON = 0.06
-"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark that is 5 m away by
-0.3 m, and a neighbour may be so near. A larger drift trusts single boxes for longer."""
+"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark at 5 m by 0.3 m,
+which may be the distance to a neighbour. A larger drift trusts single boxes for longer."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks match again. A larger value matches more.
 
 

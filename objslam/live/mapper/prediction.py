@@ -12,7 +12,8 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The keyframes between two slow queries of the covariance. Odometry adds to it in between, so more make it larger."""
+"""The keyframes between two slow queries of the covariance. Between two queries, the odometry adds to the covariance. More
+keyframes make it larger."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: number of frames with both landmarks. apart: set when a pair is tested and not merged, to a fifth of the number
+    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, a fifth of the number
     of frames with its less seen landmark.
     """
 
@@ -91,8 +91,8 @@ class MapState:
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
     the course. rng: seeded by the settings.
     given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
-    as they came, and without their errors. errors: by name, what is taken out of all measurements. calibration: their
-    estimate.
+    the cameras as received, and without their errors. errors: by name, the errors that are taken out of all measurements.
+    calibration: the estimate of these errors.
     """
 
     settings: Settings

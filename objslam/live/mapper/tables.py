@@ -10,8 +10,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.types import Trajectory
 
 _MOST_POSES = 131_072
-"""The most poses of a path that are kept before some are left out: 11 minutes at 200 Hz. A larger number keeps old paths
-finer, and takes 136 bytes a pose."""
+"""The number of poses of a path above which some are dropped: 11 minutes at 200 Hz. A larger number keeps old paths finer,
+and takes 136 bytes a pose."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -71,8 +71,8 @@ class GrowingTable:
 class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
-    Above _MOST_POSES, some are left out, evenly over time, so that a long session takes little memory. The poses that stay
-    are never so far apart that a gap seems to be between them. max_gap: s, the shortest gap.
+    Above _MOST_POSES, some are dropped, evenly over time, so that a long session takes little memory. The time between the
+    poses that stay is always shorter than a gap. max_gap: s, the shortest gap.
     """
 
     stamp: Floats = column(np.float64)
@@ -107,7 +107,7 @@ class KeyframeTable(GrowingTable):
     """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
     camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
-    sent, mount: stamp and base_T_camera as they came. stamp and base_T_camera have the shared errors taken out.
+    sent, mount: stamp and base_T_camera as received. stamp and base_T_camera have the shared errors taken out.
     """
 
     id: Ints = column(np.int64)

@@ -19,8 +19,8 @@ AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share 
 SLACK = 0.02  # The error (m) between poses on one stretch. A larger error accepts rays that pass a point less closely.
 _AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
 _AGAIN = 1.2  # The growth factor of the rays or the spread after which a track is tried again. A smaller factor costs time.
-_EARLY = 0.4  # The share of joint.min_parallax_deg that suffices for a certain position. More makes landmarks later.
-_SURE = 0.05  # The largest sigma of a certain position, as a share of its distance. More makes more false landmarks.
+_EARLY = 0.4  # The share of joint.min_parallax_deg that suffices if the position is certain. More makes landmarks later.
+_SURE = 0.05  # A position is certain if its sigma is below this share of its distance. More makes more false landmarks.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
@@ -78,9 +78,11 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 def fit_if_observable(
     obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
 ) -> PointFit | None:
-    """Triangulate rays in map. None for too few inliers, for an uncertain position, or for low parallax without ranges.
+    """Triangulate rays in map. Return None if there are too few inliers, the position is uncertain, or the parallax is low
+    without ranges.
 
-    least: least number of inliers. share: least share of inliers. early: accept less parallax for a certain position.
+    least: least number of inliers. share: least share of inliers. early: whether less parallax suffices if the position is
+    certain.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:

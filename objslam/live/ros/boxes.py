@@ -85,7 +85,7 @@ class DepthImages:
             self._drop("depth image that cannot be decoded", f"{place}: {error}")
             return depths
         if image.shape != (camera.height, camera.width):
-            self._drop("depth image that has not the camera's size", place)
+            self._drop("depth image that does not have the camera's size", place)
             return depths
         for index in np.flatnonzero(np.isfinite(boxes.boxes).all(axis=1)).tolist():
             depths[index] = box_depth(image, boxes.boxes[index]) / DEPTH_SCALE

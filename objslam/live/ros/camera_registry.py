@@ -33,8 +33,9 @@ _MAX_CAMERAS = 64  # The most cameras that are kept. It bounds the memory.
 class _Known:
     """A calibrated camera.
 
-    source: the frame of its CameraInfo, "" if a file gives the calibration. frame: its frame in tf. frame_T_camera: (4, 4)
-    its optical frame in `frame`. placed: whether a file gives base_T_camera. pushed: the last pushed base_T_camera.
+    source: the tf frame in its CameraInfo, "" if a file gives the calibration. frame: the camera's tf frame. frame_T_camera:
+    (4, 4) the pose of its optical frame in `frame`. placed: whether a file gives base_T_camera. pushed: the last
+    base_T_camera that was pushed.
     """
 
     camera: Camera
@@ -113,7 +114,7 @@ class Cameras:
         camera, name = known.camera, known.camera.name
         if boxes.size is not None and boxes.size != (camera.width, camera.height):
             size = f"{boxes.size[0]}x{boxes.size[1]}, not {camera.width}x{camera.height}"
-            self._drop("image that has not the size of its camera", f"{boxes.place}: {size}")
+            self._drop("image that does not have the size of its camera", f"{boxes.place}: {size}")
             return ""
         place = camera.base_T_camera
         if not known.placed:
@@ -180,7 +181,8 @@ class Cameras:
     def _source(self, boxes: Boxes, waited: float) -> str | None:
         """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
 
-        It is the frame of the boxes. After a while without a CameraInfo of this frame, that of the closest topic is used.
+        It is the frame of the boxes. After a while without a CameraInfo of this frame, the CameraInfo of the closest topic
+        is used.
         """
         if boxes.frame in self._infos:
             return boxes.frame

@@ -29,7 +29,7 @@ from objslam.sources.ros_bag.options import RosOptions
 if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
-_GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value starts a robot without one later.
+_GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value delays the start of a robot without one.
 _LONGEST = 160  # The most letters of the place of a drop in the ledger. It keeps lines readable.
 _MAX_TRACKS = 100_000  # The most track names that are kept. It bounds the memory.
 

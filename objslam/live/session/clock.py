@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from objslam.sources.journal.records import PathKind
 
 _SURE = 5  # The consecutive older poses that show that the clock was set back. A larger number is surer, but slower.
-_BACK = 0.5  # The least step back of a clock that is set back, s. With a smaller step, a pose is late instead.
+_BACK = 0.5  # The least step back that counts as a clock set back, s. With a smaller step, a pose counts as late.
 _LEAP = 60.0  # The least step ahead that a second pose must confirm, s. A smaller step lets a wrong stamp cost less.
 _KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
@@ -27,9 +27,10 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a new pose's stamp in session time, None if it has none, and whether the clock was set back.
+        """Return a new pose's stamp in session time, or None, and whether the clock was set back.
 
-        A pose that is late or repeated has none. A pose that leaps ahead has none either, until the next pose confirms it.
+        The stamp is None for a pose that is late or repeated. It is also None for a pose that leaps ahead, unless the
+        previous pose leapt as well.
         """
         time = stamp + self.shift
         if self.newest + _LEAP < time and math.isfinite(self.newest):
@@ -55,7 +56,7 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return any other stamp in session time. Of all shifts, the newest that gives `oldest` to `latest` is used."""
+        """Return any other stamp in session time. The newest shift that puts it between `oldest` and `latest` is used."""
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:
                 return stamp + shift

@@ -79,9 +79,9 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
-    """Return the recorded path at its full rate, corrected as the keyframes at `stamps` (K,) were to map_T_base (K, 4, 4).
+    """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,) with map_T_base (K, 4, 4).
 
-    It follows the odometry, where there is one, because the localisation jitters.
+    It follows the odometry, if there is one, because the localisation jitters.
     """
     way = log.odometry or log.localization
     assert way is not None  # without a path there is no keyframe
@@ -133,7 +133,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
     few = association.count and len(rays) <= settings.live.reassociate
     if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return first
-    other_ledger = Ledger()  # Of a second solve, because the session may have rejected rays early and for good.
+    other_ledger = Ledger()  # For a second solve, because the session may have rejected rays early and for good.
     try:
         other = solved(other_ledger, None)
     except SolveError:

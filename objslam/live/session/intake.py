@@ -27,11 +27,11 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1  # The allowed step, m, beyond the way at live.max_speed. A larger value takes more restarts for motion.
+_JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # The most that odometry restarted in a gap differs from zero, m and rad. A larger value detects more restarts.
-_FAR = 0.1  # The least difference from zero, m and rad, before such a gap. A larger value takes more restarts for motion.
+_ZERO = 0.05  # The size of a pose, m and rad, below which odometry restarted in a gap. A larger value detects more restarts.
+_FAR = 0.1  # The least size of the pose before such a gap, m and rad. A larger value takes more restarts for motion.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
@@ -206,7 +206,7 @@ class Intake:
         if gap > self._settings.poses.max_gap and max(_size(odom_T_base)) < _ZERO:
             jumped |= max(_size(inverse(self._start_T_odom) @ last.pose)) > _FAR
         if jumped:
-            self.counters.accept("odometry started anew")
+            self.counters.accept("restarts of the odometry")
             self._start_T_odom = last.pose @ inverse(odom_T_base)
             self._note()
             return np.asarray(self._start_T_odom @ odom_T_base)

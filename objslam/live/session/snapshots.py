@@ -176,7 +176,7 @@ def _rms_deg(obs: Observations, position: Floats) -> float:
 
 
 def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent: Floats) -> Floats:
-    """Return by how much (3, 3) m^2 the offsets of boxes widen a covariance, with the share of the settings.
+    """Return the covariance (3, 3), m^2, that the box offsets add to a position. The settings give the offsets' share.
 
     at: the rows of the object's rays. obs: these rays in the map.
     """

@@ -50,4 +50,5 @@ KNOWN: dict[str, tuple[str, ...]] = {
     "vision_msgs/msg/Detection3DArray": (VISION_MSGS_3D,),
     "apriltag_msgs/msg/AprilTagDetectionArray": (_array("apriltag_msgs/AprilTagDetection", _TAG),),
 }
-"""The possible definitions of each type. A message fits only one of them, because a definition must use all its bytes."""
+"""The possible definitions of each type. A message fits only one of them, because a definition must use all bytes of the
+message."""

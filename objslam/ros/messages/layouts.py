@@ -45,7 +45,7 @@ _FIELDS: dict[str, dict[str, str]] = {
 
 
 def missing_field(store: Typestore, type_: str) -> str | None:
-    """Return the first field that objslam reads of a type and that its definition in a store lacks; None if it has all.
+    """Return the first field of a type that objslam reads and the definition in a store lacks. None if it lacks none.
 
     A field counts as missing if it has another type. Types that objslam does not read, and boxes, have no missing field.
     """

@@ -61,8 +61,8 @@ class _Edge:
 class TfTree:
     """The tree of coordinate frames. A pose a_T_b transforms b coordinates to a coordinates.
 
-    A frame with several parents keeps the parent with the most transforms. Of equal timestamps, the last transform is used.
-    Methods raise LogError if two frames are not connected or the tree has a cycle.
+    A frame with several parents keeps the parent with the most transforms. Of transforms with equal timestamps, the last is
+    used. Methods raise LogError if two frames are not connected or the tree has a cycle.
     """
 
     def __init__(self, rows: TfRows, ledger: Ledger) -> None:

@@ -131,7 +131,7 @@ def set_aside(file: Path) -> Path | None:
 
     The new name is journal.1.objslam, or has the next free number. If there is no journal, or one without messages, nothing
     is renamed and None is returned.
-    Raises OutputError if another session writes the journal, the file is no journal, or it cannot be renamed.
+    Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
     """
     with _refusals("set the journal aside", file):
         if not file.is_file():
@@ -179,14 +179,14 @@ def is_journal(path: Path) -> bool:
 
 
 def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
-    """Read the messages of a journal in order. Raises LogError if it is no journal.
+    """Read the messages of a journal in order. Raises LogError if it is not a journal.
 
     Records of other versions of objslam are dropped and counted. If a record is damaged or incomplete, the journal is not
     read further, and the rest is dropped and counted once.
     """
     file = _file(path)
     if not is_journal(path):
-        raise LogError("this is no journal", where=str(path))
+        raise LogError("this is not a journal", where=str(path))
     with file.open("rb") as stream:
         for content in _records(stream):
             try:
@@ -199,7 +199,8 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
 
 
 def calibrations(file: Path) -> Iterator[CalibrationMessage]:
-    """Read only the calibrations of the journal `file`. Each takes effect at a keyframe, whose frame may come before it."""
+    """Read only the calibrations of the journal `file`. A calibration may come later in the file than the keyframe at which
+    it takes effect."""
     with file.open("rb") as stream:
         for content in _records(stream):
             if content.startswith(CALIBRATION_KIND):
@@ -258,7 +259,7 @@ def _end_of_records(file: Path) -> int:
     if file.stat().st_size == 0:
         return 0
     if not is_journal(file):
-        raise OutputError("cannot resume: this file is no journal", where=str(file), hint="leave out --resume")
+        raise OutputError("cannot resume: this file is not a journal", where=str(file), hint="leave out --resume")
     with file.open("rb") as stream:
         for _ in _records(stream):
             pass

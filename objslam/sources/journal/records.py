@@ -26,7 +26,7 @@ from objslam.errors import LogError
 PathKind = Literal["odometry", "localization"]
 
 _POSE = struct.Struct("<c13d")  # The bytes of a pose message: its kind, its stamp and the upper three rows of the matrix.
-_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the same, then the length of the camera's name.
+_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: those of a pose message, then the camera name's length.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
@@ -114,7 +114,7 @@ class NoteMessage:
 class CalibrationMessage:
     """The shared errors that a session takes out of its map and of all later messages.
 
-    keyframe: the number of keyframes that the map had before it took them out.
+    keyframe: the number of keyframes that the map had before the session took the errors out.
     """
 
     keyframe: int
@@ -167,7 +167,7 @@ def _read_mount(data: bytes) -> MountMessage:
     _, stamp, *rows, length = _MOUNT.unpack_from(data)
     name = data[_MOUNT.size :]
     if len(name) != length:
-        raise ValueError("the camera's name has not the length that the record states")
+        raise ValueError("the camera's name does not have the length that the record states")
     return MountMessage(_stamp(stamp), _name(name.decode()), _pose([*rows, 0.0, 0.0, 0.0, 1.0]))
 
 

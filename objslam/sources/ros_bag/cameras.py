@@ -77,9 +77,10 @@ def find_cameras(
 def build_camera(
     topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger, mounts: Sequence[Mount] = ()
 ) -> tuple[Camera, Trajectory | None]:
-    """Build a camera from its topics. Returns it with base_T_camera over time, or None if the camera does not move on base.
+    """Build a camera from its topics. Returns it with base_T_camera over time, which is None if the camera does not move on
+    base.
 
-    mounts: base_T_camera of cameras with a CameraInfo, from a file. They count in place of tf.
+    mounts: base_T_camera of cameras with a CameraInfo, from a file. They replace the poses from tf.
     Raises LogError if the calibration is missing or tf does not connect base with the camera.
     """
     given = topics.calibration

@@ -55,7 +55,8 @@ def is_stamped(path: Path) -> bool:
 
 
 def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()) -> Log:
-    """Read the numbered layout. A file whose name begins with n belongs to the n-th pose line, from 0, without comments.
+    """Read the numbered layout. A file whose name begins with the number n belongs to pose line n. The count starts at 0 and
+    skips comments.
 
     Without camera.yaml, the calibration is that of freiburg3. Files without a pose, and further files with the same number,
     are dropped and counted. Raises LogError if the poses or the boxes are unusable.
