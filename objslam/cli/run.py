@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
     from objslam.core.types import Log
-    from objslam.mapping.progress import Progress
 
 _COLUMNS: Final[dict[str, Callable[[MapObject], str]]] = {
     "id": lambda o: str(o.id),
@@ -72,13 +71,11 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
     """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log."""
     import time
 
-    from objslam.mapping import pipeline
+    from objslam.api.mapping import map_log
     from objslam.output.result_folder import write_result
 
     with progress_bar() as show:
-        if detector is not None:
-            log = find_boxes(log, detector, settings, ledger, show)
-        result = pipeline.run(log, settings, ledger, show)
+        result, log = map_log(log, settings, ledger, detector, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
         removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
@@ -86,14 +83,6 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
     say_result(result, f", {settings.mode} mode; {times}", out, removed)
-
-
-def find_boxes(log: Log, detector: Path, settings: Settings, ledger: Ledger, show: Progress) -> Log:
-    """Return the log with the boxes that a detector finds in its images, or found in an earlier run."""
-    from objslam.detection import default_cache, detect_log, load_detector
-
-    network = load_detector(detector, settings.detector)
-    return detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:

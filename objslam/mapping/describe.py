@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from objslam import __version__
 from objslam.association.observations import extents
 from objslam.config import Settings
 from objslam.core.arrays import Floats
@@ -123,7 +122,7 @@ def summarise(
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
-    packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
+    packages = ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,
         "log_path": None if path is None else str(path),
@@ -153,7 +152,6 @@ def summarise(
         "iterations": estimate.iterations,
         "seconds": seconds,
         "versions": {
-            "objslam": __version__,
             "python": platform.python_version(),
             **{package: importlib.metadata.version(package) for package in packages},
         },
