@@ -35,7 +35,7 @@ class Session(LiveSession):
 
     settings: as in `objslam.run`; the mode is always joint. journal: a file that keeps every accepted message, so that a
     killed program loses nothing. resume: whether to continue an existing journal. patient: whether frames of any age are
-    accepted, for data that come faster or slower than they were taken.
+    accepted, for a program that waits for the session (`wait`) now and then, such as a replay.
     """
 
     def __init__(
