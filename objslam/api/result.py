@@ -12,7 +12,9 @@ import numpy as np
 from objslam.api.inputs import Trajectory
 from objslam.core import types
 from objslam.core.result import RunResult
+from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
+from objslam.mapping.checks.assessment import Assessment
 from objslam.results.object_map import ObjectMap
 
 
@@ -90,6 +92,14 @@ class Result:
         return write_result(self._run.result, to, truth, detected=log.cameras if log and self._run.detected else ())
 
     @property
+    def assessment(self) -> Assessment:
+        """What to think of the result, with the reasons. OutputError for a result of an older version."""
+        found = self.summary.get("assessment")
+        if found is None:
+            raise OutputError("this result is from an older version, which judged nothing", hint="run again")
+        return Assessment(found["level"], tuple(found["reasons"]))
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """The warnings of the run, one line each."""
         return tuple(self.summary.get("warnings", ()))
@@ -100,4 +110,5 @@ class Result:
         return dict(self.summary.get("dropped", {}))
 
     def __repr__(self) -> str:
-        return f"Result: {len(self.poses)} poses, {len(self.rays)} rays\n{self.objects!r}"
+        judged = f"verdict: {self.assessment}\n" if "assessment" in self.summary else ""
+        return f"Result: {len(self.poses)} poses, {len(self.rays)} rays\n{judged}{self.objects!r}"

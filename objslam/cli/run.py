@@ -99,6 +99,8 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
         f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}"
     )
+    judged = result.summary["assessment"]
+    say(" ".join([f"verdict: {judged['level']}.", *judged["reasons"]]))
     if removed:
         say(f"removed the older result from {out}: {', '.join(removed)}")
     say(f"wrote {out}")

@@ -8,6 +8,8 @@ from objslam.core.camera import Camera, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
+CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
+"""The reason to drop a box whose centre is wrong, because it ends at the image's edge."""
 MAX_OF_LABEL = 1000
 """The most boxes that are used of one label in one frame. A larger number takes more memory and time in a crowd."""
 
@@ -104,7 +106,7 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     if of.border >= 0 and not whole:
         border = np.maximum(of.border, of.border_share * (high - low))
         cut = (low <= border) | (high >= size - 1 - border)
-        wrong["boxes cut off by the image's edge (rays.border, rays.border_share)"] = cut.any(axis=1)
+        wrong[CUT_OFF] = cut.any(axis=1)
     left = np.ones(len(boxes), dtype=bool)
     for reason, bad in wrong.items():
         ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}", of=len(boxes))

@@ -120,6 +120,7 @@ def write_report(
         histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
         trends=trends(rays),
         calibration=summary.get("calibration"),
+        assessment=summary.get("assessment"),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
