@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from objslam.cli.console import console, progress_bar, report, say
-from objslam.cli.options import CalibrationFile, Config, DetectorModel, Mode, Out, Set, settings_of, with_options
+from objslam.cli.options import (
+    CalibrationFile,
+    Config,
+    DetectorModel,
+    Json,
+    Mode,
+    Out,
+    Quiet,
+    Set,
+    settings_of,
+    with_options,
+)
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
@@ -56,6 +67,8 @@ def run(
     options: SourceOptions,
     detector: DetectorModel = None,
     calibration: CalibrationFile = None,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Map the objects of a log and write a result folder."""
     from objslam.core.diagnostics import Ledger
@@ -64,11 +77,22 @@ def run(
     settings = settings_of(mode, config, set_, calibration)
     ledger = Ledger()
     with output_folder(out):
-        run_log(read(log, ledger, options), settings, ledger, out, detector)
+        tell = _say_nothing if quiet else _say_json if json else say_result
+        run_log(read(log, ledger, options), settings, ledger, out, detector, tell)
 
 
-def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
-    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log."""
+def run_log(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    out: Path,
+    detector: Path | None = None,
+    tell: Callable[[RunResult, str, Path, tuple[str, ...]], None] | None = None,
+) -> None:
+    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log.
+
+    tell: prints the summary; `say_result` by default.
+    """
     import time
 
     from objslam.api.mapping import map_log
@@ -82,7 +106,22 @@ def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: P
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
-    say_result(result, f", {settings.mode} mode; {times}", out, removed)
+    (tell or say_result)(result, f", {settings.mode} mode; {times}", out, removed)
+
+
+def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
+    """Take the place of `say_result` with --quiet."""
+
+
+def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
+    """Take the place of `say_result` with --json: print the objects, the summary and the names of the files."""
+    import json
+
+    from objslam.io.objects_json import dump_objects
+    from objslam.results.files import dump_json
+
+    objects = json.loads(dump_objects(result.map))["objects"]
+    say(dump_json({"out": str(out), "removed": removed, "objects": objects, "summary": result.summary}), end="")
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
