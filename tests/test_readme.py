@@ -161,6 +161,7 @@ def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
     for mode in ("fixed", "joint"):
         evaluation = json.loads((played / "demo_boxes" / mode / "evaluation.json").read_text())
         row = table[mode]
+        assert row[4] in README  # its line of numbers is that of the table
         assert row[2] == f"{evaluation['matched']} / {evaluation['matched'] + evaluation['missed']}"
         assert row[3] == str(evaluation["false"])
         assert abs(float(row[4].removesuffix(" m")) - evaluation["position_rmse"]) < 0.002

@@ -316,6 +316,18 @@ def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
     assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) == 16
 
 
+def test_another_log_in_the_place_of_the_runs_is_noticed(mapped: Path) -> None:
+    listed = (mapped / "log" / "rgb.txt").read_text()
+    later = re.sub(r"^(\d+)", lambda stamp: str(int(stamp[0]) + 5000), listed, flags=re.MULTILINE)
+    (mapped / "log" / "rgb.txt").write_text(later)
+    page = Page(write_report(mapped / "out"))
+    assert not pictures(page)
+    assert "is it the log of this run?" in page.all_text
+    (mapped / "log" / "rgb.txt").unlink()
+    images = json.loads((mapped / "out" / "summary.json").read_text())["counts"]["images"]
+    assert f"has no images, but the log of the run had {images}" in Page(write_report(mapped / "out")).all_text
+
+
 def test_no_file_outside_the_log_is_shown(mapped: Path) -> None:
     listed = (mapped / "log" / "rgb.txt").read_text()
     (mapped / "log" / "rgb.txt").write_text(re.sub(r"rgb/", "../images/", listed))
