@@ -1,4 +1,4 @@
-"""What README.md says is what happens: its blocks marked `# runs` run, its commands exist, its tables are true."""
+"""What README.md and docs/ say is what happens: blocks run in their order, commands exist, tables are true."""
 
 from __future__ import annotations
 
@@ -25,34 +25,77 @@ from objslam.config import Settings, load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-MARK = "# runs"  # the first line of a block that needs no data of others
+BLOCK = re.compile(
+    r"^( *)(<!-- not run: (?P<why>[^\n]+?) -->\n *)?```(?P<language>\w+)\n(?P<body>.*?)^\1```$", re.MULTILINE | re.DOTALL
+)
+"""A fenced block. A comment before it, which the reader does not see, says why it cannot run here."""
+
+
+def in_order(nav: Any) -> list[str]:
+    """The pages of a table of contents."""
+    if isinstance(nav, str):
+        return [nav]
+    return [page for entry in (nav.values() if isinstance(nav, dict) else nav) for page in in_order(entry)]
+
+
+def pages() -> dict[str, str]:
+    """The text of README and of each page of docs/, in the order in which a reader meets them."""
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8").replace("!!python/name:", ""))["nav"]
+    files = [ROOT / "README.md", *(ROOT / "docs" / name for name in in_order(nav))]
+    return {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in files}
+
+
+PAGES = pages()
+TEXT = "\n".join(PAGES.values())
 
 
 def blocks(language: str) -> list[str]:
     """The fenced blocks of a language, without their indentation."""
-    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", README, re.MULTILINE | re.DOTALL)
-    return [textwrap.dedent(text) for _, text in found]
+    return [textwrap.dedent(found["body"]) for found in BLOCK.finditer(TEXT) if found["language"] == language]
 
 
 def marked() -> list[tuple[str, str]]:
-    """(language, text) of every block that is marked to run, in the order of the page."""
-    found = re.findall(r"^( *)```(bash|python)\n(.*?)^\1```$", README, re.MULTILINE | re.DOTALL)
-    texts = [(language, textwrap.dedent(text)) for _, language, text in found]
-    return [(language, text) for language, text in texts if text.startswith(MARK)]
+    """(language, text) of every block of commands that runs here, in the order of the pages."""
+    return [
+        (found["language"], textwrap.dedent(found["body"]))
+        for found in BLOCK.finditer(TEXT)
+        if found["language"] in ("bash", "python") and not found["why"]
+    ]
 
 
 def commands() -> list[list[str]]:
     """Every `objslam ...` of the blocks and of the text, as arguments."""
     lines = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("objslam ")]
-    lines += re.findall(r"`(objslam [^`]+)`", README)
+    lines += re.findall(r"`(objslam [^`]+)`", TEXT)
     return [shlex.split(line.split(" > ")[0])[1:] for line in lines]
 
 
 def rows(first: str) -> list[list[str]]:
     """The cells of the table whose first column is called so."""
-    table = re.search(rf"^\| {first} \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", README, re.MULTILINE)
+    table = re.search(rf"^\| {first} \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     assert table
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table[1].splitlines()]
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a page's headings: small letters, hyphens for blanks, no other signs."""
+    prose = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\]\(.*?\)|\[", "", one).lower()).replace(" ", "-") for one in headings}
+
+
+def dead_links(file: Path) -> list[str]:
+    """The relative links of a page whose file or anchor is not there."""
+    text = file.read_text(encoding="utf-8")
+    dead = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^ *```.*?^ *```$", "", text, flags=re.MULTILINE | re.DOTALL)):
+        if "://" in link:
+            continue
+        name, _, anchor = link.partition("#")
+        target = file.parent / name if name else file
+        if not target.is_file() or (anchor and anchor not in anchors(target.read_text(encoding="utf-8"))):
+            dead.append(link)
+    return dead
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +126,7 @@ def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
         assert (played / result / "map.png").is_file()
         assert (played / result / "recording.rrd").is_file()
     (cup,) = json.loads((played / "my_map" / "objects.json").read_text())["objects"]
-    shown = json.loads(blocks("json")[0])
+    (shown,) = (o for o in map(json.loads, blocks("json")) if "existence" in o)
     assert set(cup) == set(shown)
     assert cup["status"] == shown["status"]
     np.testing.assert_allclose(cup["position"], shown["position"], atol=0.005)
@@ -109,9 +152,8 @@ def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
     assert written <= fields
     assert fields - written <= {"ray"}  # no object was unresolved
     results = {file.name for name in ("demo_boxes/joint", "my_map") for file in (played / name).iterdir()}
-    section = README.partition("## What comes out")[2]
     for name in results:
-        assert f"`{name}`" in section, name
+        assert f"`{name}`" in PAGES["docs/results.md"], name
 
 
 def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
@@ -119,6 +161,7 @@ def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
     for mode in ("fixed", "joint"):
         evaluation = json.loads((played / "demo_boxes" / mode / "evaluation.json").read_text())
         row = table[mode]
+        assert row[4] in README  # its line of numbers is that of the table
         assert row[2] == f"{evaluation['matched']} / {evaluation['matched'] + evaluation['missed']}"
         assert row[3] == str(evaluation["false"])
         assert abs(float(row[4].removesuffix(" m")) - evaluation["position_rmse"]) < 0.002
@@ -145,10 +188,54 @@ def test_the_settings_have_the_defaults_that_are_shown(row: list[str]) -> None:
     assert yaml.safe_load(row[1]) == value
 
 
-def test_what_is_linked_or_named_is_there() -> None:
-    links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
-    named = re.findall(r"\b(?:configs|tools|objslam)/[\w/]+\.\w+", README)
-    assert links
+MARKDOWN = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+
+
+@pytest.mark.parametrize("file", MARKDOWN, ids=lambda file: file.name)
+def test_no_link_is_dead(file: Path) -> None:
+    assert dead_links(file) == []
+
+
+def test_a_dead_link_and_a_dead_anchor_are_found(tmp_path: Path) -> None:
+    (tmp_path / "b.md").write_text("# A heading, with `code`\n```\n# no heading\n[no](link.md)\n```\n")
+    page = tmp_path / "a.md"
+    page.write_text(
+        "[1](b.md) [2](c.md) [3](b.md#a-heading-with-code) [4](b.md#no-heading) [5](https://x.y/z.md) [6](#none)"
+    )
+    assert dead_links(page) == ["c.md", "b.md#no-heading", "#none"]
+
+
+def test_what_is_named_is_there() -> None:
+    named = re.findall(r"\b(?:configs|tools|objslam|examples)/[\w/]+\.\w+", TEXT)
     assert named
-    for name in links + named:
+    for name in named:
         assert (ROOT / name).is_file(), name
+
+
+def test_every_page_is_in_the_table_of_contents() -> None:
+    assert {f"docs/{file.name}" for file in (ROOT / "docs").glob("*.md")} == set(PAGES) - {"README.md"}
+
+
+def test_the_readme_is_one_screen_of_text() -> None:
+    assert len(README.splitlines()) <= 250
+    assert len(README.encode()) <= 12_000
+
+
+def test_the_pages_build_strictly(tmp_path: Path) -> None:
+    for package in ("mkdocs", "material", "mkdocstrings_handlers"):
+        pytest.importorskip(package)
+    words = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "-f",
+        str(ROOT / "mkdocs.yml"),
+        "-d",
+        str(tmp_path),
+    ]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 'id="objslam.Result.save"' in (tmp_path / "python" / "index.html").read_text("utf-8")

@@ -9,4 +9,5 @@ unset PYTHONPATH         # a sourced ROS would bring its own pytest plugins
 .venv/bin/ruff check --quiet
 .venv/bin/ruff format --check --quiet
 .venv/bin/mypy --no-error-summary
+.venv/bin/mypy --no-error-summary --strict examples/*.py
 exec .venv/bin/pytest -q -n 2 "$@"

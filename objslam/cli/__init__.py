@@ -10,6 +10,7 @@ from objslam.cli.config import config_dump
 from objslam.cli.console import say
 from objslam.cli.convert import convert
 from objslam.cli.demo import demo
+from objslam.cli.detect import detect
 from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
@@ -37,6 +38,7 @@ app.command()(demo)
 app.command()(convert)
 app.command()(info)
 app.command()(doctor)
+app.command()(detect)
 app.command()(export)
 config_app = typer.Typer(no_args_is_help=True, help="Print the settings.")
 config_app.command("dump")(config_dump)

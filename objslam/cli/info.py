@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import report, say
-from objslam.cli.options import with_options
-from objslam.sources import SourceOptions, choose, read
+from objslam.cli.options import Json, with_options
+from objslam.sources import Source, SourceOptions, choose, read
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.core.camera import Camera
+    from objslam.sources.ros_bag.info import BagInfo
     from objslam.sources.summary import Contents, Timing
 
 _EPOCH = 1e8  # Larger timestamps (s) count from 1970, because no drive takes 3 years. No recording is older than 1973.
@@ -27,34 +29,47 @@ def info(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A ROS bag, a log folder, or another recording.")],
     *,
     options: SourceOptions,
+    json: Json = False,
 ) -> None:
     """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
     from objslam.core.diagnostics import Ledger
+    from objslam.mapping.checks.boxes import check_boxes, check_stamps
+    from objslam.results.files import dump_json
+    from objslam.sources.ros_bag.info import describe
     from objslam.sources.summary import contents
 
     kind = choose(source, options.format)
     if kind.name == "ros":
-        _show_bag(source, options)
+        bag = describe(source, options)
+        say(dump_json(asdict(bag)), end="") if json else _show_bag(bag)
         return
     ledger = Ledger()
-    _show_log(contents(read(source, ledger, options)), kind.name)
+    log = read(source, ledger, options)
+    for finding in (check_stamps(log), *check_boxes(log)):
+        if finding is not None:
+            ledger.warn(finding.message)
+    found = contents(log)
+    say(dump_json({"kind": kind.name, **asdict(found), "warnings": ledger.lines()}), end="") if json else _show_log(
+        found, kind
+    )
     report(ledger)
 
 
-def _show_log(found: Contents, kind: str) -> None:
+def _show_log(found: Contents, kind: Source) -> None:
+    from objslam.sources.summary import in_words
+
     starts, ends = ([getattr(s.timing, end) for s in found.streams] for end in ("start", "end"))
     begin = min(starts, default=0.0)
-    say(f"{found.name}: {kind}; {_span(begin, max(ends, default=0.0))}")
+    say(f"{found.name}: {kind.name}; {_span(begin, max(ends, default=0.0))}")
+    for line in in_words(found):
+        say(line)
     rows = [(s.role, str(s.timing.count), *_numbers(s.timing, begin), s.detail) for s in found.streams]
     _table(("role", *_NUMERIC, "what"), rows)
     _show_cameras(found.cameras)
     _list("missing for a run", found.missing, "nothing is missing for a run")
 
 
-def _show_bag(source: Path, options: SourceOptions) -> None:
-    from objslam.sources.ros_bag.info import describe
-
-    bag = describe(source, options)
+def _show_bag(bag: BagInfo) -> None:
     files = f"{len(bag.files)} file{'s' if len(bag.files) > 1 else ''}"
     lost = f" ({bag.lost} lost)" if bag.lost else ""
     say(f"{bag.name}: {bag.format}, {files}, {bag.messages} messages{lost}; {_span(bag.start, bag.end)}")
@@ -78,13 +93,14 @@ def _show_bag(source: Path, options: SourceOptions) -> None:
 
 
 def _show_cameras(cameras: Iterable[Camera]) -> None:
+    from objslam.core.camera import spoken_name
     from objslam.sources.camera_words import doubts_of, view_of
 
     for camera in cameras:
         fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
         say(
-            f"camera {camera.name}: {camera.width}x{camera.height}, f {fx:.1f} {fy:.1f} px, {camera.distortion_model}, "
-            f"at {_place(camera.base_T_camera)} in base: {view_of(camera)}"
+            f"{spoken_name(camera.name)}: {camera.width}x{camera.height}, f {fx:.1f} {fy:.1f} px, "
+            f"{camera.distortion_model}, at {_place(camera.base_T_camera)} in base: {view_of(camera)}"
         )
         for doubt in doubts_of(camera):
             say(f"warning: {doubt}", stderr=True)

@@ -119,7 +119,7 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
 
 def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:
     """Read a recording to replay. A detector finds its boxes first. LogError if the recording has no boxes then."""
-    from objslam.cli.run import find_boxes
+    from objslam.api.mapping import find_boxes
     from objslam.core.diagnostics import Ledger
     from objslam.errors import LogError
     from objslam.sources import read

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
 from collections.abc import Callable
@@ -16,6 +17,20 @@ from objslam.sources.options import DETECTOR, Option, flags
 if TYPE_CHECKING:
     from objslam.config import Settings
 
+
+def one_of(*choices: str) -> Callable[[str], str]:
+    """Return a parser for an option with few values. A wrong value is a usage error that names the closest value."""
+
+    def parse(given: str) -> str:
+        if given in choices:
+            return given
+        meant = difflib.get_close_matches(given, choices, 1)
+        question = f" (did you mean {meant[0]}?)" if meant else ""
+        raise typer.BadParameter(f"{given!r} is none of {', '.join(choices)}{question}")
+
+    return parse
+
+
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder for the result.")]
 Config = Annotated[
     Path | None, typer.Option("--config", help="YAML file with settings, or the name of ready settings, such as odometry.")
@@ -23,12 +38,19 @@ Config = Annotated[
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting. May be repeated.")]
 Mode = Annotated[
     Literal["fixed", "joint"] | None,
-    typer.Option("--mode", help="fixed (the default): keep the poses. joint: estimate poses and objects together."),
+    typer.Option(
+        "--mode",
+        parser=one_of("fixed", "joint"),
+        metavar="[fixed|joint]",
+        help="fixed (the default): keep the poses. joint: estimate poses and objects together.",
+    ),
 ]
 Align = Annotated[
     Literal["auto", "none", "se2", "sim2", "se3", "sim3"],
     typer.Option(
         "--align",
+        parser=one_of("auto", "none", "se2", "sim2", "se3", "sim3"),
+        metavar="[auto|none|se2|sim2|se3|sim3]",
         help="Align the map with the truth. se2, se3: a rigid motion in the plane or in space. sim2, sim3: also a scale. "
         "auto: none if a localisation fixed the map's frame, else se2, or se3 if the path is not planar.",
     ),
@@ -37,6 +59,8 @@ Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
+Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print warnings and errors only.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs in place of text.")]
 CalibrationFile = Annotated[
     Path | None, typer.Option("--calibration", help="File of `objslam calibrate` with the robot's shared errors.")
 ]

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from objslam.cli.console import console, progress_bar, report, say
-from objslam.cli.options import CalibrationFile, Config, DetectorModel, Mode, Out, Set, settings_of, with_options
+from objslam.cli.options import (
+    CalibrationFile,
+    Config,
+    DetectorModel,
+    Json,
+    Mode,
+    Out,
+    Quiet,
+    Set,
+    settings_of,
+    with_options,
+)
 from objslam.sources import SourceOptions, read
 
 if TYPE_CHECKING:
@@ -21,7 +32,6 @@ if TYPE_CHECKING:
     from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
     from objslam.core.types import Log
-    from objslam.mapping.progress import Progress
 
 _COLUMNS: Final[dict[str, Callable[[MapObject], str]]] = {
     "id": lambda o: str(o.id),
@@ -57,6 +67,8 @@ def run(
     options: SourceOptions,
     detector: DetectorModel = None,
     calibration: CalibrationFile = None,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Map the objects of a log and write a result folder."""
     from objslam.core.diagnostics import Ledger
@@ -65,35 +77,51 @@ def run(
     settings = settings_of(mode, config, set_, calibration)
     ledger = Ledger()
     with output_folder(out):
-        run_log(read(log, ledger, options), settings, ledger, out, detector)
+        tell = _say_nothing if quiet else _say_json if json else say_result
+        run_log(read(log, ledger, options), settings, ledger, out, detector, tell)
 
 
-def run_log(log: Log, settings: Settings, ledger: Ledger, out: Path, detector: Path | None = None) -> None:
-    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log."""
+def run_log(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    out: Path,
+    detector: Path | None = None,
+    tell: Callable[[RunResult, str, Path, tuple[str, ...]], None] | None = None,
+) -> None:
+    """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log.
+
+    tell: prints the summary; `say_result` by default.
+    """
     import time
 
-    from objslam.mapping import pipeline
+    from objslam.api.mapping import map_log
     from objslam.output.result_folder import write_result
 
     with progress_bar() as show:
-        if detector is not None:
-            log = find_boxes(log, detector, settings, ledger, show)
-        result = pipeline.run(log, settings, ledger, show)
+        result, log = map_log(log, settings, ledger, detector, show)
         show("writing", 0, 0)
         begin = time.perf_counter()
         removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
-    say_result(result, f", {settings.mode} mode; {times}", out, removed)
+    (tell or say_result)(result, f", {settings.mode} mode; {times}", out, removed)
 
 
-def find_boxes(log: Log, detector: Path, settings: Settings, ledger: Ledger, show: Progress) -> Log:
-    """Return the log with the boxes that a detector finds in its images, or found in an earlier run."""
-    from objslam.detection import default_cache, detect_log, load_detector
+def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
+    """Take the place of `say_result` with --quiet."""
 
-    network = load_detector(detector, settings.detector)
-    return detect_log(log, network, settings, ledger, cache=default_cache(), progress=show)
+
+def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
+    """Take the place of `say_result` with --json: print the objects, the summary and the names of the files."""
+    import json
+
+    from objslam.io.objects_json import dump_objects
+    from objslam.results.files import dump_json
+
+    objects = json.loads(dump_objects(result.map))["objects"]
+    say(dump_json({"out": str(out), "removed": removed, "objects": objects, "summary": result.summary}), end="")
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
@@ -110,6 +138,8 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
         f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}"
     )
+    judged = result.summary["assessment"]
+    say(" ".join([f"verdict: {judged['level']}.", *judged["reasons"]]))
     if removed:
         say(f"removed the older result from {out}: {', '.join(removed)}")
     say(f"wrote {out}")

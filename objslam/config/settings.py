@@ -1,7 +1,7 @@
 """The class of all settings. Settings are loaded from a YAML file and from overrides, and are written as YAML."""
 
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -64,6 +64,23 @@ def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> 
             raise ConfigError(f"the value of --set {text!r} is not YAML") from error
         _validate(data, f"--set {text}")
     return _validate(data, "settings")
+
+
+def change_settings(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+    """Return settings with other values. A key is dotted, as "rays.pixel_sigma", or a section with a mapping of its values.
+    A ConfigError names the key and the problem."""
+    data = settings.model_dump(exclude_unset=True)
+    _change(data, [], changes)
+    return _validate(data, "settings")
+
+
+def _change(data: dict[str, Any], above: list[str], changes: Mapping[str, Any]) -> None:
+    for key, value in changes.items():
+        keys = above + (key.split(".") if isinstance(key, str) else [key])
+        if isinstance(value, Mapping):
+            _change(data, keys, value)
+        else:
+            _put(data, keys, value)
 
 
 def dump_settings(settings: Settings) -> str:

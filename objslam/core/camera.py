@@ -111,6 +111,11 @@ class Camera:
         return max(abs(float(np.where(outside, turned * (1 - cos), triangles).sum())), _LEAST)
 
 
+def spoken_name(name: str) -> str:
+    """Return the name of a camera in a message: "camera front", and "camera" for a camera that is called camera."""
+    return name if name == "camera" else f"camera {name}"
+
+
 def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
     """Return for each of the raw pixels (N, 2) the unit direction (N, 3) in the camera frame, and whether it is valid (N,).
 

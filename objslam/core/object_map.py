@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,16 @@ from objslam.core.statistics import SAME_POINT
 Status = Literal["ok", "unresolved"]
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
+_SHOWN = 20  # The most objects in the text of a map. A larger number makes it longer.
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows and columns of the covariance in a row.
+
+COLUMNS: dict[str, str] = {
+    **{"id": "int64", "label": "string", "status": "string"},
+    **dict.fromkeys(("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "float64"),
+    **{"rays": "int64", "frames": "int64"},
+    **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
+}
+"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +58,36 @@ class MapObject:
         """Standard deviation of the position along its least certain direction, m. None without a covariance."""
         return None if self.covariance is None else float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]))
 
+    def row(self) -> dict[str, Any]:
+        """Return the values of the object by the names of `COLUMNS`. An unknown value is None."""
+        covariance = [None] * 6 if self.covariance is None else [float(self.covariance[at]) for at in _UPPER_TRIANGLE]
+        values = (
+            *(self.id, self.label, self.status, *self.position.tolist(), *covariance, self.rays, self.frames),
+            *(
+                self.parallax_deg,
+                self.rms_deg,
+                *(self.extent or (None, None)),
+                self.first_seen,
+                self.last_seen,
+                self.existence,
+            ),
+        )
+        known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
+        return dict(zip(COLUMNS, known, strict=True))
+
+    def __str__(self) -> str:
+        x, y, z = self.position
+        place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m" if self.sigma is not None else self.status
+        sigma = "" if self.sigma is None else f", sigma {self.sigma:.3f} m"
+        return f"{self.label} #{self.id} {place}{sigma}, {self.rays} rays"
+
 
 @dataclass(frozen=True)
 class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
-    Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to ignore heights.
+    A map is a sequence of its objects. Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to
+    ignore heights.
     """
 
     objects: tuple[MapObject, ...]
@@ -60,6 +95,42 @@ class ObjectMap:
 
     def __len__(self) -> int:
         return len(self.objects)
+
+    def __iter__(self) -> Iterator[MapObject]:
+        return iter(self.objects)
+
+    @overload
+    def __getitem__(self, index: int) -> MapObject: ...
+    @overload
+    def __getitem__(self, index: slice) -> Self: ...
+    def __getitem__(self, index: int | slice) -> MapObject | Self:
+        """Return the object at a place in the map, counted from 0, or a map of a range of them. `by_id` looks for an id."""
+        return replace(self, objects=self.objects[index]) if isinstance(index, slice) else self.objects[index]
+
+    def __repr__(self) -> str:
+        lost = len(self) - len(self.resolved())
+        head = f"ObjectMap of {len(self)} objects ({lost} unresolved) in the frame {self.frame!r}"
+        more = [f"  ... and {len(self) - _SHOWN} more"] if len(self) > _SHOWN else []
+        return "\n".join([head, *(f"  {o}" for o in self.objects[:_SHOWN]), *more])
+
+    def by_id(self, number: int) -> MapObject:
+        """Return the object with an id. KeyError if there is none."""
+        for one in self.objects:
+            if one.id == number:
+                return one
+        raise KeyError(f"the map has no object with the id {number}")
+
+    @property
+    def positions(self) -> Floats:
+        """(N, 3) m, the positions of all objects. That of an unresolved object is a guess on its ray, or NaN."""
+        return np.array([o.position for o in self.objects], dtype=np.float64).reshape(-1, 3)
+
+    @property
+    def covariances(self) -> Floats:
+        """(N, 3, 3) m^2, the covariances of all objects, NaN for unresolved ones."""
+        unknown = np.full((3, 3), np.nan)
+        found = [unknown if o.covariance is None else o.covariance for o in self.objects]
+        return np.array(found, dtype=np.float64).reshape(-1, 3, 3)
 
     def resolved(self) -> tuple[MapObject, ...]:
         """Return the objects with a reliable position."""

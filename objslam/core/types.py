@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
 
 MAX_BOXES = 10_000
 """The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
@@ -141,6 +142,7 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
+    reading: what was dropped while the log was read, None if nobody kept account of it.
     """
 
     name: str
@@ -149,6 +151,7 @@ class Log:
     localization: Trajectory | None = None
     truth: Truth | None = None
     path: Path | None = None
+    reading: Ledger | None = None
 
     @property
     def robot_path(self) -> Trajectory | None:

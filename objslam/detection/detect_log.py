@@ -13,7 +13,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Array, Floats
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, spoken_name
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Images, Log, label_table
 from objslam.detection.cache import DetectionCache, Entry
@@ -73,7 +73,7 @@ def detect_log(
             cameras.append(camera_log)
             continue
         if camera_log.detections is not None:
-            ledger.warn(f"camera {camera_log.camera.name}: the boxes of the detector replace the boxes of the log")
+            ledger.warn(f"{spoken_name(camera_log.camera.name)}: the boxes of the detector replace the boxes of the log")
         if camera_log.depth is not None and settings.depth.use:
             progress("depths at the boxes", 0, 0)
             detections = depths_at_boxes(detections, camera_log.depth, camera_log.camera, ledger)

@@ -3,11 +3,13 @@
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
-from objslam.core.camera import Camera, undistort
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
+CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
+"""The reason to drop a box whose centre is wrong, because it ends at the image's edge."""
 MAX_OF_LABEL = 1000
 """The most boxes that are used of one label in one frame. A larger number takes more memory and time in a crowd."""
 
@@ -31,7 +33,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
         boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
-        kept, directions, angle_sigma = box_rays(boxes.boxes, boxes.scores, camera, settings, ledger, boxes.whole)
+        measured = boxes.boxes, boxes.scores, boxes.stamps
+        kept, directions, angle_sigma = box_rays(*measured, camera, settings, ledger, boxes.whole)
         boxes = boxes.take(kept)
         few = surest(boxes.frame, boxes.label, boxes.scores, camera, ledger)
         boxes, directions, angle_sigma = boxes.take(few), directions[few], angle_sigma[few]
@@ -58,18 +61,19 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 
 
 def box_rays(
-    boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
+    boxes: Floats, scores: Floats, stamps: Floats | float, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
 ) -> tuple[Ints, Floats, Floats]:
     """Return the indices (n,) of the usable boxes (M, 4) px of a camera, and the rays through their centres.
 
     A ray has a unit direction (n, 3) in the camera frame and a standard deviation (n,) rad. The ledger counts the other
-    boxes. `whole` is explained in `types.Detections`.
+    boxes. stamps: (M,) s, or the one stamp of all. `whole` is explained in `types.Detections`.
     """
-    kept = _usable(boxes, scores, camera, settings, ledger, whole)
+    kept = _usable(boxes, scores, stamps, camera, settings, ledger, whole)
     boxes = boxes[kept]
     directions, valid = undistort(camera, (boxes[:, :2] + boxes[:, 2:]) / 2)
     if not valid.all():
-        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), f"camera {camera.name}")
+        bad = np.isin(np.arange(len(scores)), kept[~valid])
+        ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), _where(camera, stamps, bad))
         kept, boxes, directions = kept[valid], boxes[valid], directions[valid]
     return kept, directions, _angle_sigma(camera, directions, boxes, settings)
 
@@ -88,12 +92,14 @@ def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Led
     rank = np.arange(count) - np.flatnonzero(first)[np.cumsum(first) - 1]
     kept = np.sort(order[rank < MAX_OF_LABEL])
     ledger.drop(
-        f"boxes beyond the {MAX_OF_LABEL} surest of their label in a frame", count - len(kept), f"camera {camera.name}"
+        f"boxes beyond the {MAX_OF_LABEL} surest of their label in a frame", count - len(kept), spoken_name(camera.name)
     )
     return kept
 
 
-def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, ledger: Ledger, whole: bool) -> Ints:
+def _usable(
+    boxes: Floats, scores: Floats, stamps: Floats | float, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
+) -> Ints:
     of, size = settings.rays, camera.size
     low, high = boxes[:, :2], boxes[:, 2:]
     centre = (low + high) / 2
@@ -104,12 +110,21 @@ def _usable(boxes: Floats, scores: Floats, camera: Camera, settings: Settings, l
     if of.border >= 0 and not whole:
         border = np.maximum(of.border, of.border_share * (high - low))
         cut = (low <= border) | (high >= size - 1 - border)
-        wrong["boxes cut off by the image's edge (rays.border, rays.border_share)"] = cut.any(axis=1)
+        wrong[CUT_OFF] = cut.any(axis=1)
     left = np.ones(len(boxes), dtype=bool)
     for reason, bad in wrong.items():
-        ledger.drop(reason, int((left & bad).sum()), f"camera {camera.name}", of=len(boxes))
+        bad = left & bad
+        ledger.drop(reason, int(bad.sum()), _where(camera, stamps, bad), of=len(boxes))
         left &= ~bad
     return np.flatnonzero(left)
+
+
+def _where(camera: Camera, stamps: Floats | float, bad: Bools) -> str | None:
+    """Return the camera and the stamp of the first bad box; None if all boxes are good."""
+    if not bad.any():
+        return None
+    first = float(np.broadcast_to(stamps, len(bad))[np.argmax(bad)])
+    return f"{spoken_name(camera.name)}, stamp {first:.3f}"
 
 
 def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Settings) -> Floats:

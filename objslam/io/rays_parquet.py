@@ -3,7 +3,7 @@
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,11 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.validity import MAX_POSITION, box_rules, valid_depths, valid_positions, valid_stamps
 from objslam.errors import OutputError, first_line
 from objslam.io.atomic_files import encode
+from objslam.io.tables import arrow_table, to_pandas
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
 
 _NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
@@ -40,41 +45,43 @@ class RaysTable:
     def __len__(self) -> int:
         return len(self.object)
 
+    def to_arrow(self) -> "pa.Table":
+        """Return the rays as a pyarrow table with the columns of rays.parquet. Object -1 and NaN residuals become null."""
+        import pyarrow as pa
+
+        return arrow_table(
+            {
+                "stamp": self.stamp,
+                "object": pa.array(self.object, mask=self.object < 0),
+                "origin": self.origin,
+                "direction": self.direction,
+                "residual": pa.array(self.residual, mask=np.isnan(self.residual)),
+                "weight": self.weight,
+                "label": pa.array(self.label, type=pa.string()),
+                "score": self.score,
+                "camera": pa.array(self.camera, type=pa.string()),
+                "box": self.box,
+                "sigma": self.sigma,
+                "residual_before": pa.array(self.residual_before, mask=np.isnan(self.residual_before)),
+                "image": self.image,
+                "speed": self.speed,
+                "turn_rate": self.turn_rate,
+            }
+        )
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the rays as a pandas data frame. ObjslamError if pandas is not installed."""
+        return to_pandas(self.to_arrow())
+
 
 def dump_rays(rays: RaysTable) -> bytes:
     """Return the content of rays.parquet. Object -1 and NaN residuals become null. Raises OutputError for invalid text."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    def lists(rows: Floats) -> pa.Array:
-        return pa.FixedSizeListArray.from_arrays(pa.array(rows.ravel()), rows.shape[1])
-
-    def texts(names: Any) -> pa.Array:
-        for name in set(names):
-            encode(name)
-        return pa.array(names, type=pa.string())
-
-    table = pa.table(
-        {
-            "stamp": pa.array(rays.stamp),
-            "object": pa.array(rays.object, mask=rays.object < 0),
-            "origin": lists(rays.origin),
-            "direction": lists(rays.direction),
-            "residual": pa.array(rays.residual, mask=np.isnan(rays.residual)),
-            "weight": pa.array(rays.weight),
-            "label": texts(rays.label),
-            "score": pa.array(rays.score),
-            "camera": texts(rays.camera),
-            "box": lists(rays.box),
-            "sigma": pa.array(rays.sigma),
-            "residual_before": pa.array(rays.residual_before, mask=np.isnan(rays.residual_before)),
-            "image": lists(rays.image),
-            "speed": pa.array(rays.speed),
-            "turn_rate": pa.array(rays.turn_rate),
-        }
-    )
+    for name in {*rays.label, *rays.camera}:
+        encode(name)
     buffer = io.BytesIO()
-    pq.write_table(table, buffer)
+    pq.write_table(rays.to_arrow(), buffer)
     return buffer.getvalue()
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from objslam import __version__
 from objslam.association.observations import extents
 from objslam.config import Settings
 from objslam.core.arrays import Floats
@@ -19,11 +18,21 @@ from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
 from objslam.mapping.alternation import Solution
+from objslam.mapping.checks.assessment import assess, evidence_of
+from objslam.mapping.checks.residuals import misses
 
 
-def make_result(solution: Solution, objects: ObjectMap, residual: Floats, **more: Any) -> RunResult:
-    """Return the result of a solution that `describe` described. more: the fields that the solution does not tell."""
+def make_result(
+    solution: Solution, objects: ObjectMap, residual: Floats, summary: dict[str, Any], settings: Settings, **more: Any
+) -> RunResult:
+    """Return the result of a solution that `describe` described, and judge it in the summary.
+
+    more: the fields that the solution does not tell.
+    """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
+    missed = misses(objects, keyframes, rays, solution.association, residual, settings)
+    judged: dict[str, Any] = {"residual_times": None if np.isnan(missed) else round(missed, 3)}
+    judged["assessment"] = assess(evidence_of(summary, missed)).to_dict()
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     return RunResult(
         map=objects,
@@ -37,6 +46,8 @@ def make_result(solution: Solution, objects: ObjectMap, residual: Floats, **more
         weight=estimate.weight,
         trace=solution.trace,
         calibration=estimate.calibration,
+        summary={**summary, **judged},
+        settings=settings,
         **more,
     )
 
@@ -123,7 +134,7 @@ def summarise(
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
-    packages = ("gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
+    packages = ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,
         "log_path": None if path is None else str(path),
@@ -153,7 +164,6 @@ def summarise(
         "iterations": estimate.iterations,
         "seconds": seconds,
         "versions": {
-            "objslam": __version__,
             "python": platform.python_version(),
             **{package: importlib.metadata.version(package) for package in packages},
         },

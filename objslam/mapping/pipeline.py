@@ -24,6 +24,7 @@ from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
 from objslam.mapping.checks.shared_errors import uncorrected
+from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
@@ -50,6 +51,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
         frames = build_keyframes(log, settings, ledger)
+        if sideways := lies_on_its_side(frames):
+            ledger.warn(sideways)
         rays = build_rays(log, frames, settings, ledger)
     if len(rays) == 0:
         say(diagnosis, ledger)

@@ -1,6 +1,7 @@
 """The result folder: the functions that write its files, clear it, and replace an older result by a new result."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -85,6 +86,13 @@ def write_result(
     return replace_files(out, _FILES, _writers(result, truth, detected))
 
 
+def copy_result(folder: Path, out: Path) -> tuple[str, ...]:
+    """Copy the files of a result into the folder `out`, as `write_result` writes them there, and return the same."""
+    prepare_output(out)
+    found = [name for name in _FILES.names(folder) if (folder / name).is_file()]
+    return replace_files(out, _FILES, {name: partial(shutil.copyfile, folder / name) for name in found})
+
+
 def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
@@ -105,7 +113,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
         files.OBJECTS: lambda file: file.write_bytes(encode(dump_objects(result.map))),
         files.TRAJECTORY: partial(write_trajectory, Trajectory(stamps, result.map_T_base[first])),
         files.PATH: partial(write_trajectory, result.path_after),
-        files.RAYS: lambda file: file.write_bytes(dump_rays(_rays_table(result))),
+        files.RAYS: lambda file: file.write_bytes(dump_rays(rays_table(result))),
         files.CONFIG: lambda file: file.write_bytes(encode(dump_settings(result.settings))),
         files.SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),
     }
@@ -139,7 +147,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
     return writers
 
 
-def _rays_table(result: RunResult) -> RaysTable:
+def rays_table(result: RunResult) -> RaysTable:
     """Return the content of rays.parquet. Each ray has the id of its object in objects.json, or -1 without an object."""
     rays, keyframes = result.rays, result.keyframes
     ids = np.array([*(o.id for o in result.map.objects), -1], dtype=np.int64)

@@ -1,12 +1,19 @@
 """The map of objects for users of the package. It can be loaded and saved."""
 
+from __future__ import annotations
+
 from os import PathLike
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from objslam.core import object_map
 from objslam.io.atomic_files import write_file
 from objslam.io.objects_json import dump_objects, read_objects
+from objslam.io.tables import arrow_table, to_pandas
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
 
 
 class ObjectMap(object_map.ObjectMap):
@@ -23,3 +30,16 @@ class ObjectMap(object_map.ObjectMap):
     def save(self, file: str | PathLike[str]) -> None:
         """Write the map as JSON. `load` returns the same map, bit by bit. OutputError if the file cannot be written."""
         write_file(Path(file), dump_objects(self).encode())
+
+    def to_arrow(self) -> pa.Table:
+        """Return a pyarrow table with one row for each object. `core.object_map.COLUMNS` names the columns."""
+        import pyarrow as pa
+
+        rows = [o.row() for o in self.objects]
+        return arrow_table(
+            {name: pa.array([row[name] for row in rows], pa.type_for_alias(t)) for name, t in object_map.COLUMNS.items()}
+        )
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the objects as a pandas data frame. ObjslamError if pandas is not installed."""
+        return to_pandas(self.to_arrow())

@@ -54,8 +54,17 @@ def _refuse_constant(name: str) -> None:
 
 
 def load_trajectory(out: Path) -> Trajectory:
-    """Read the poses map_T_base of the result folder `out`. OutputError names a missing file or a malformed line."""
-    file, ledger = _existing(out, files.TRAJECTORY), Ledger()
+    """Read map_T_base at each keyframe of the result folder `out`. OutputError names a missing file or malformed line."""
+    return _load_poses(_existing(out, files.TRAJECTORY))
+
+
+def load_path(out: Path) -> Trajectory:
+    """Read map_T_base at each pose of the recorded path. The errors are those of `load_trajectory`."""
+    return _load_poses(_existing(out, files.PATH))
+
+
+def _load_poses(file: Path) -> Trajectory:
+    ledger = Ledger()
     try:
         trajectory = read_trajectory(file, ledger)
     except LogError as error:

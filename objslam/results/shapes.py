@@ -4,7 +4,7 @@ A folder may come from somebody else, so a value of another type must give an er
 anything.
 """
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -29,6 +29,11 @@ class _Calibration(_Shape):
     traded_off: list[list[str]] = []
 
 
+class _Assessment(_Shape):
+    level: Literal["good", "check", "bad"]
+    reasons: list[str] = []
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
@@ -47,6 +52,7 @@ class Summary(_Shape):
     seconds: dict[str, _Number] = {}
     versions: dict[str, str] = {}
     warnings: list[str] = []
+    assessment: _Assessment | None = None
 
 
 class _Match(_Shape):

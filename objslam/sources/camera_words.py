@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from objslam.core.camera import Camera, undistort
+from objslam.core.camera import Camera, spoken_name, undistort
 
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
 _STEEP = 60.0  # The elevation, degrees, from which a camera counts as looking up or down. A larger value counts fewer so.
@@ -30,12 +30,13 @@ def doubts_of(camera: Camera) -> list[str]:
     doubts = []
     if np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6):
         doubts.append(
-            f"camera {camera.name}: base_T_camera has no rotation. That is right if the poses are those of the camera's "
-            "optical frame (z forward). On a robot, a camera that looks ahead has rotation_xyzw [-0.5, 0.5, -0.5, 0.5]"
+            f"{spoken_name(camera.name)}: base_T_camera has no rotation. That is right if the poses are those of the "
+            "camera's optical frame (z forward). On a robot, a camera that looks ahead has "
+            "rotation_xyzw [-0.5, 0.5, -0.5, 0.5]"
         )
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     if max(fx, fy) > _ASPECT * min(fx, fy):
-        doubts.append(f"camera {camera.name}: fx {fx:g} px and fy {fy:g} px differ, although pixels are nearly square")
+        doubts.append(f"{spoken_name(camera.name)}: fx {fx:g} px and fy {fy:g} px differ, although pixels are nearly square")
     return doubts
 
 

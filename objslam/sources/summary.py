@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, spoken_name
 from objslam.core.types import Detections, Images, Log, Trajectory
 
 FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
@@ -66,7 +66,7 @@ def contents(log: Log) -> Contents:
             _images(f"{name}depth", camera_log.depth),
             _path(f"{name}camera_poses", camera_log.mount),
         ]
-        where, frames = f"camera {camera_log.camera.name}", np.zeros(0)
+        where, frames = spoken_name(camera_log.camera.name), np.zeros(0)
         if camera_log.detections is not None:
             frames = camera_log.detections.frame_stamps
         elif camera_log.rgb is not None:
@@ -79,6 +79,23 @@ def contents(log: Log) -> Contents:
         streams.append(_path("truth", log.truth.trajectory))
     cameras = tuple(camera_log.camera for camera_log in log.cameras)
     return Contents(log.name, tuple(stream for stream in streams if stream), cameras, tuple(missing))
+
+
+def in_words(found: Contents) -> list[str]:
+    """Describe the streams of a log in sentences: the drive, and what each camera saw."""
+    by_role = {stream.role: stream for stream in found.streams}
+    path = by_role.get("localization") or by_role.get("odometry")
+    said = []
+    if path is not None:
+        source = " and ".join(name for name in ("odometry", "localization") if name in by_role)
+        said.append(f"The robot drives {path.detail} in {path.timing.end - path.timing.start:.1f} s, by {source}.")
+    for camera in found.cameras:
+        name = f"{camera.name}." if len(found.cameras) > 1 else ""
+        boxes, images = by_role.get(f"{name}detections"), by_role.get(f"{name}image")
+        seen = [boxes.detail + f" in {boxes.timing.count} frames"] if boxes else []
+        seen += [f"{images.timing.count} images"] if images else []
+        said.append(f"The {spoken_name(camera.name)} has {' and '.join(seen) or 'neither boxes nor images'}.")
+    return said
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:

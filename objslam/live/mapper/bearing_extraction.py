@@ -60,7 +60,9 @@ class BearingExtractor:
         base_T_camera = self._map.cameras[number].base_T_camera
         if held is not None:
             base_T_camera = corrected_mount(mount, errors, frame.camera) if errors else mount
-        kept, direction, sigma = box_rays(frame.boxes, frame.scores, camera, settings, self._ledger, frame.whole)
+        kept, direction, sigma = box_rays(
+            frame.boxes, frame.scores, frame.stamp, camera, settings, self._ledger, frame.whole
+        )
         for name in sorted(set(frame.labels) - self._label_number.keys()):
             self._label_number[name] = len(self._labels)
             self._labels.append(name)

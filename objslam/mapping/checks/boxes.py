@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, spoken_name
 from objslam.core.types import Detections, Log
 from objslam.mapping.checks.finding import Finding
 
@@ -67,7 +67,7 @@ def check_boxes(log: Log) -> list[Finding]:
 
 
 def _judge(found: Detections, camera: Camera) -> Iterator[Finding]:
-    boxes, name = found.boxes, f"boxes of camera {camera.name}"
+    boxes, name = found.boxes, f"boxes of {spoken_name(camera.name)}"
     size = f"{camera.width} x {camera.height} px"
     if (boxes.max(axis=1) <= 1.5).mean() > _PART:
         yield Finding("boxes 0..1", f"the {name} lie between 0 and 1: they are probably shares of the image, not px")

@@ -3,7 +3,7 @@
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import ObjectMap
 from objslam.core.statistics import RAYLEIGH_MEDIAN
 from objslam.core.types import Association, Keyframes, Rays
@@ -18,6 +18,31 @@ _SIGMAS = 3.0
 _MEDIAN_SIGMA = 0.72
 """The standard deviation of the multiple from one ray, 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
 median m. That from n independent rays is smaller by the root of n."""
+
+
+def misses(
+    objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, residual: Floats, settings: Settings
+) -> float:
+    """Return the median residual of the objects that are ok, as a multiple of the noise that counts for it; NaN without.
+
+    At fixed poses, the noise of the localisation counts too. residual: (R,) rad between each ray and its object.
+    """
+    held = _held(objects, association)
+    if not held.any():
+        return float("nan")
+    angle, place = pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)
+    origins, _ = rays.in_map(keyframes.map_T_camera)
+    positions = np.array([one.position for one in objects.objects])
+    distance = np.linalg.norm(positions[association.object[held]] - origins[held], axis=1)
+    promised = np.hypot(angle[held], place / np.maximum(distance, 1e-9))
+    return float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
+
+
+def _held(objects: ObjectMap, association: Association) -> Bools:
+    """Return the rays (R,) of objects that are ok."""
+    ok = np.array([one.status == "ok" for one in objects.objects] + [False])
+    held: Bools = ok[association.object]  # -1, no object, indexes the last
+    return held
 
 
 def check_residuals(
@@ -35,16 +60,10 @@ def check_residuals(
     residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
     All rays of an object count, also rejected ones. Rays of one keyframe share the error of its pose, so they count as one.
     """
-    ok = np.array([one.status == "ok" for one in objects.objects] + [False])
-    held = ok[association.object]  # -1, no object, indexes the last
+    held = _held(objects, association)
     if not held.any():
         return None
-    angle, place = pose_noise(rays, keyframes, settings)
-    origins, _ = rays.in_map(keyframes.map_T_camera)
-    positions = np.array([one.position for one in objects.objects])
-    distance = np.linalg.norm(positions[association.object[held]] - origins[held], axis=1)
-    promised = np.hypot(angle[held], place / np.maximum(distance, 1e-9))
-    times = float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
+    times = misses(objects, keyframes, rays, association, residual, settings)
     independent = len(np.unique(rays.keyframe[held]))
     if times - _SIGMAS * _MEDIAN_SIGMA / np.sqrt(independent) < _MOST:
         return None

@@ -2,6 +2,7 @@
 
 import colorsys
 from collections import Counter
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -63,7 +64,12 @@ def captions(objects: ObjectMap) -> list[str]:
 
 def label_colours(objects: ObjectMap) -> dict[str, tuple[float, float, float]]:
     """Return a colour (r, g, b in [0, 1]) for each label. Text in this colour on white has a contrast of at least 4.5."""
-    names = sorted({o.label for o in objects.objects})
+    return colours_of([o.label for o in objects.objects])
+
+
+def colours_of(labels: Sequence[str]) -> dict[str, tuple[float, float, float]]:
+    """Return a colour for each label, as `label_colours` does."""
+    names = sorted(set(labels))
     return {name: _colour(i / len(names), i) for i, name in enumerate(names)}
 
 

@@ -57,7 +57,10 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
     except ObjslamError as error:
         return {}, f"The log cannot be read again: {error}"
     images = {c.camera.name: c.rgb for c in cameras if c.rgb is not None}
-    return images, None if images else "The log has no images."
+    if images:
+        return images, None
+    had = "" if count is None else f", but the log of the run had {count}: name that one with objslam report --log LOG"
+    return {}, f"The log at {log} has no images{had}."
 
 
 def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:

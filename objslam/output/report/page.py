@@ -91,6 +91,8 @@ def write_report(
     images = _on_one_clock(images, summary.get("calibration"))
     wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
+    if images and len(wanted) and not pictures:
+        no_images = "No image of the log can be read at the times of the boxes: is it the log of this run?"
     crops_of = {number: [pictures[i] for i in index.tolist() if i in pictures] for number, index in chosen.items()}
     begin = float(rays.stamp.min()) if len(rays) else 0.0
     cards = _cards(objects, rays, crops_of, errors, begin)
@@ -120,6 +122,7 @@ def write_report(
         histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
         trends=trends(rays),
         calibration=summary.get("calibration"),
+        assessment=summary.get("assessment"),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, spoken_name
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 from objslam.ros.messages.topic_types import COMPRESSED, TRANSFORMS
@@ -109,7 +109,7 @@ def _missing(assembly: Assembly) -> tuple[str, ...]:
     paths = () if found is None else (found.localization, found.odometry)
     path = next((one for one in paths if one is not None), None)
     for topics, camera, _ in assembly.cameras:
-        where, frames = f"camera {camera.name}", topics.detections or topics.image
+        where, frames = spoken_name(camera.name), topics.detections or topics.image
         if topics.detections is None:
             missing.append(f"{where}: no detections; {FIND_BOXES}")
         if frames is not None:

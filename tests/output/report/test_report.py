@@ -200,6 +200,17 @@ def test_without_a_truth_there_is_no_error(tmp_path: Path) -> None:
     assert "Evaluation" not in page.text["h2"]
 
 
+@pytest.mark.parametrize(("level", "said"), [("good", "Good."), ("check", "Look closer."), ("bad", "Do not use this map.")])
+def test_the_verdict_stands_at_the_top(tmp_path: Path, level: str, said: str) -> None:
+    result, _ = synthetic_result(np.array([[2.0, 3.0, 0.5]]), ["cup"], keyframes=10, settings=QUICK)
+    judged = {"level": level, "reasons": [EVIL[0], "Drive around things."]}
+    write_result(dataclasses.replace(result, summary={**result.summary, "assessment": judged}), tmp_path)
+    page = write_report(tmp_path).read_text("utf-8")
+    Page(tmp_path / "report.html")
+    top = page[page.index("<header>") : page.index('<ul class="tiles">')]
+    assert f"<b>{said}</b> &lt;script&gt;alert(1)&lt;/script&gt; Drive around things." in top
+
+
 def test_an_empty_map(tmp_path: Path) -> None:
     result, _ = synthetic_result(np.zeros((0, 3)), [], keyframes=10, settings=QUICK)
     write_result(dataclasses.replace(result, map=ObjectMap(())), tmp_path)
@@ -303,6 +314,18 @@ def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
     assert not pictures(page)
     assert f"No pictures. The log is not at {mapped / 'log'} any more" in page.all_text
     assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) == 16
+
+
+def test_another_log_in_the_place_of_the_runs_is_noticed(mapped: Path) -> None:
+    listed = (mapped / "log" / "rgb.txt").read_text()
+    later = re.sub(r"^(\d+)", lambda stamp: str(int(stamp[0]) + 5000), listed, flags=re.MULTILINE)
+    (mapped / "log" / "rgb.txt").write_text(later)
+    page = Page(write_report(mapped / "out"))
+    assert not pictures(page)
+    assert "is it the log of this run?" in page.all_text
+    (mapped / "log" / "rgb.txt").unlink()
+    images = json.loads((mapped / "out" / "summary.json").read_text())["counts"]["images"]
+    assert f"has no images, but the log of the run had {images}" in Page(write_report(mapped / "out")).all_text
 
 
 def test_no_file_outside_the_log_is_shown(mapped: Path) -> None:

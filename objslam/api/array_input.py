@@ -1,0 +1,60 @@
+"""Arrays of a user become the arrays of the data types. A wrong value raises ValueError and names its row."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.geometry import lift_se2, pose_from_quaternion
+from objslam.core.validity import rigid_poses, valid_pose_rows, valid_stamps
+
+
+def as_poses(values: ArrayLike) -> Floats:
+    """Return poses (N, 4, 4) from rows (N, 3) x, y, yaw, rows (N, 7) x, y, z, qx, qy, qz, qw, or matrices (N, 4, 4).
+
+    Units are m and rad. ValueError if the shape is another, or if a pose is not finite and rigid.
+    """
+    given = np.asarray(values, dtype=np.float64)
+    if given.shape[1:] == (4, 4):
+        poses, good = rigid_poses(given)
+    elif given.shape[1:] == (7,):
+        good = valid_pose_rows(given)
+        rows = np.where(good[:, None], given, [0, 0, 0, 0, 0, 0, 1.0])
+        poses = pose_from_quaternion(rows[:, :3], rows[:, 3:])
+    elif given.shape[1:] == (3,):
+        poses, good = rigid_poses(lift_se2(given))
+    else:
+        raise ValueError(f"poses are (N, 3) x, y, yaw, (N, 7) x, y, z, qx, qy, qz, qw, or (N, 4, 4), got {given.shape}")
+    _all_good(good, "pose", "is not finite, too far away or not rigid")
+    return poses
+
+
+def as_pose(values: ArrayLike) -> Floats:
+    """Return one pose (4, 4), from what `as_poses` takes for one row."""
+    return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
+
+
+def as_stamps(values: ArrayLike) -> Floats:
+    """Return stamps (N,), s. ValueError if they are not finite, or do not increase."""
+    stamps = np.asarray(values, dtype=np.float64)
+    if stamps.ndim != 1:
+        raise ValueError(f"stamps are (N,) seconds, got the shape {stamps.shape}")
+    _all_good(valid_stamps(stamps), "stamp", "is not a finite number of seconds")
+    _all_good(np.diff(stamps, prepend=-np.inf) > 0, "stamp", "is not later than the one before it")
+    return stamps
+
+
+def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
+    """Return one number for each box (M,) from one list for each frame. Without `values`, all are `unknown`."""
+    if values is None:
+        return np.full(sum(counts), unknown)
+    lists = [np.asarray(one, dtype=np.float64).reshape(-1) for one in values]
+    if [len(one) for one in lists] != list(counts):
+        raise ValueError(f"{name} needs one list for each frame, with one number for each of its boxes")
+    return np.concatenate([*lists, np.zeros(0)])
+
+
+def _all_good(good: Bools, what: str, fault: str) -> None:
+    if not good.all():
+        raise ValueError(f"{what} {int(np.argmin(good))} {fault}")

@@ -1,0 +1,158 @@
+"""The data of a user: logs, detections and trajectories made from arrays. Their base classes are in `core.types`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from objslam.api.array_input import as_poses, as_stamps, per_box
+from objslam.core import types
+from objslam.core.camera import Camera
+from objslam.core.geometry import quaternion
+from objslam.core.validity import box_rules, camera_fault, is_name, valid_depths
+from objslam.io.tables import arrow_table, to_pandas
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+_COLUMNS = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # The columns of a table of poses, s and m.
+
+
+class Trajectory(types.Trajectory):
+    """Poses of one coordinate frame in another over time. stamps: (N,) s, increasing. poses: (N, 4, 4)."""
+
+    @classmethod
+    def from_arrays(cls, stamps: ArrayLike, poses: ArrayLike) -> Self:
+        """Make a trajectory from stamps (N,), s, and poses.
+
+        poses: (N, 3) x, y, yaw, (N, 7) x, y, z, qx, qy, qz, qw, or (N, 4, 4), in m and rad. ValueError names a wrong row.
+        """
+        return cls(as_stamps(stamps), as_poses(poses))
+
+    def to_arrow(self) -> pa.Table:
+        """Return a pyarrow table with the columns stamp, x, y, z, qx, qy, qz, qw."""
+        turns = quaternion(self.poses) if len(self) else np.zeros((0, 4))
+        values = np.column_stack([self.stamps, self.poses[:, :3, 3], turns])
+        return arrow_table(dict(zip(_COLUMNS, values.T.copy(), strict=True)))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the poses as a pandas data frame. ObjslamError if pandas is not installed."""
+        return to_pandas(self.to_arrow())
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Trajectory of 0 poses"
+        way = float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
+        return f"Trajectory of {len(self)} poses over {self.stamps[-1] - self.stamps[0]:.1f} s and {way:.1f} m"
+
+
+class Detections(types.Detections):
+    """All boxes of one camera."""
+
+    @classmethod
+    def from_frames(
+        cls,
+        stamps: ArrayLike,
+        boxes: Sequence[ArrayLike],
+        labels: Sequence[Sequence[str]],
+        scores: Sequence[ArrayLike] | None = None,
+        *,
+        depths: Sequence[ArrayLike] | None = None,
+        track_ids: Sequence[ArrayLike] | None = None,
+        whole: bool = False,
+    ) -> Self:
+        """Make detections from one list for each of F frames. A frame without a box has empty lists.
+
+        stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names.
+        scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where unknown.
+        track_ids: for each frame B integers, -1 where unknown. whole: whether the image's edge cuts no box off.
+        ValueError names what is wrong.
+        """
+        frames = [np.asarray(one, dtype=np.float64).reshape(-1, 4) for one in boxes]
+        counts = [len(one) for one in frames]
+        times = as_stamps(stamps)
+        if len(frames) != len(times):
+            raise ValueError(f"boxes needs one list for each stamp, got {len(frames)} for {len(times)}")
+        if [len(one) for one in labels] != counts:
+            raise ValueError("labels needs one list for each frame, with one name for each of its boxes")
+        if max(counts, default=0) > types.MAX_BOXES:
+            raise ValueError(f"a frame has more than {types.MAX_BOXES} boxes")
+        corners, score = np.concatenate([*frames, np.zeros((0, 4))]), per_box(scores, counts, 1.0, "scores")
+        names, depth = [name for one in labels for name in one], per_box(depths, counts, np.nan, "depths")
+        named = np.array([is_name(name) for name in names], dtype=bool)
+        known = np.isnan(depth) | valid_depths(depth)
+        frame = np.repeat(np.arange(len(frames)), counts)
+        for good, reason in (*box_rules(corners, score, named), (known, "box with a depth that is not above zero")):
+            if not good.all():
+                raise ValueError(f"frame {frame[np.argmin(good)]}: {reason}")
+        table, label = types.label_table(names)
+        tracks = np.maximum(per_box(track_ids, counts, -1, "track_ids"), -1).astype(np.int64)
+        return cls(times, frame, corners, label, score, depth, tracks, table, whole)
+
+    def __repr__(self) -> str:
+        return f"Detections: {len(self)} boxes of {len(self.label_names)} labels in {len(self.frame_stamps)} frames"
+
+
+class Log(types.Log):
+    """The log of a robot: its cameras with their boxes or images, and its odometry, its localisation or both."""
+
+    @classmethod
+    def from_arrays(
+        cls,
+        cameras: Camera | Sequence[Camera],
+        detections: types.Detections | Sequence[types.Detections],
+        *,
+        odometry: tuple[ArrayLike, ArrayLike] | types.Trajectory | None = None,
+        localization: tuple[ArrayLike, ArrayLike] | types.Trajectory | None = None,
+        name: str = "log",
+    ) -> Self:
+        """Make a log from arrays. A path is a `Trajectory`, or the stamps and poses of `Trajectory.from_arrays`.
+
+        cameras, detections: one of each, or as many of one as of the other. odometry: odom_T_base. localization: map_T_base.
+        At least one of the two is needed. ValueError names what is wrong.
+        """
+        lenses = [cameras] if isinstance(cameras, Camera) else list(cameras)
+        boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
+        if len(lenses) != len(boxes):
+            raise ValueError(f"each camera needs its detections, got {len(lenses)} cameras and {len(boxes)} detections")
+        if odometry is None and localization is None:
+            raise ValueError("a log needs odometry, localization or both")
+        for camera in lenses:
+            if (fault := camera_fault(camera)) is not None:
+                raise ValueError(f"camera {camera.name!r} {fault}")
+        views = tuple(types.CameraLog(camera, found) for camera, found in zip(lenses, boxes, strict=True))
+        return cls(name, views, _path(odometry), _path(localization))
+
+    def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
+        """Return the log with other boxes: those of its only camera, or those of each camera by its name.
+
+        ValueError if the names are not those of the cameras.
+        """
+        names = [camera.camera.name for camera in self.cameras]
+        found = {names[0]: detections} if isinstance(detections, types.Detections) and len(names) == 1 else detections
+        if isinstance(found, types.Detections) or set(found) != set(names):
+            raise ValueError(f"the boxes must be those of the cameras {', '.join(names)}, by their names")
+        return replace(self, cameras=tuple(replace(one, detections=found[one.camera.name]) for one in self.cameras))
+
+    def __repr__(self) -> str:
+        paths = [f"{name} of {len(path)} poses" for name, path in self._paths().items() if path is not None]
+        cameras = [f"camera {c.camera.name}: {_content(c)}" for c in self.cameras]
+        return f"Log {self.name!r}: {'; '.join([*paths, *cameras])}"
+
+    def _paths(self) -> dict[str, types.Trajectory | None]:
+        return {"odometry": self.odometry, "localisation": self.localization}
+
+
+def _path(given: tuple[ArrayLike, ArrayLike] | types.Trajectory | None) -> types.Trajectory | None:
+    return given if given is None or isinstance(given, types.Trajectory) else Trajectory.from_arrays(*given)
+
+
+def _content(camera: types.CameraLog) -> str:
+    boxes = None if camera.detections is None else f"{len(camera.detections)} boxes"
+    images = None if camera.rgb is None else f"{len(camera.rgb.paths)} images"
+    return " and ".join(part for part in (boxes, images) if part) or "nothing"

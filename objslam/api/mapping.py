@@ -1,0 +1,108 @@
+"""Read a recording and map it, in one call each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import fields
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from objslam.api.inputs import Log
+from objslam.api.result import Result
+from objslam.config import Settings, load_settings
+from objslam.config.presets import find_config
+from objslam.config.settings import change_settings
+from objslam.core import types
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.errors import ConfigError
+from objslam.mapping.progress import Progress
+from objslam.sources import SourceOptions
+from objslam.sources import read as read_recording
+
+Given = Settings | Mapping[str, Any] | str | PathLike[str] | None
+"""Settings as a user gives them: a mapping of changes, the name of ready settings, a YAML file, or None for the defaults."""
+
+_LOG = logging.getLogger("objslam")
+
+
+def read(path: str | PathLike[str], **options: Any) -> Log:
+    """Read a log folder, a ROS bag, or another recording that `objslam info` knows.
+
+    options: the options of the recording's kind, by the names of their flags in Python, such as `robot=1` for --robot 1 and
+    `label="cup"` for --label cup (`objslam.sources.SourceOptions` lists them). What is dropped is logged as a warning, and
+    the log keeps account of it in `reading`. LogError if the recording cannot be read, ConfigError for a wrong option.
+    """
+    known = [field.name for field in fields(SourceOptions)]
+    if unknown := [name for name in options if name not in known]:
+        raise ConfigError(f"there is no option {unknown[0]!r} of a recording", hint=f"there are {', '.join(known)}")
+    ledger = Ledger()
+    found = read_recording(Path(path), ledger, SourceOptions(**options))
+    _tell(ledger.lines())
+    return Log(**{**vars(found), "reading": ledger})
+
+
+def run(
+    log: types.Log,
+    settings: Given = None,
+    *,
+    detector: str | PathLike[str] | None = None,
+    progress: Progress = lambda stage, done, total: None,
+    **changes: Any,
+) -> Result:
+    """Map the objects of a log.
+
+    Args:
+        log: what `read` or `Log.from_arrays` returned. It is not changed.
+        settings: changes of the defaults, as {"mode": "joint", "rays.pixel_sigma": 2}; or a YAML file, or the name of ready
+            settings such as "odometry".
+        detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
+        progress: is told the stage's name, the work done, and the total work, 0 if that is unknown.
+        changes: more changes, which win over `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
+    Raises:
+        LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.
+        DetectorError: the model cannot be used.
+    """
+    chosen = settings_of(settings, changes)
+    ledger, told = Ledger(), []
+    if log.reading is not None:
+        ledger.add(log.reading)
+        told = ledger.lines()
+    model = None if detector is None else Path(detector)
+    mapped, log = map_log(log, chosen, ledger, model, progress)
+    _tell(line for line in ledger.lines() if line not in told)
+    return Result.of(mapped, log, detected=model is not None)
+
+
+def map_log(
+    log: types.Log, settings: Settings, ledger: Ledger, detector: Path | None, progress: Progress
+) -> tuple[RunResult, types.Log]:
+    """Return the result of a run, and the log with the boxes that the `detector` found, if there is one."""
+    from objslam.mapping import pipeline
+
+    if detector is not None:
+        log = find_boxes(log, detector, settings, ledger, progress)
+    return pipeline.run(log, settings, ledger, progress), log
+
+
+def find_boxes(log: types.Log, detector: Path, settings: Settings, ledger: Ledger, progress: Progress) -> types.Log:
+    """Return the log with the boxes that a detector finds in its images, or found in an earlier run."""
+    from objslam.detection import default_cache, detect_log, load_detector
+
+    network = load_detector(detector, settings.detector)
+    return detect_log(log, network, settings, ledger, cache=default_cache(), progress=progress)
+
+
+def settings_of(given: Given, changes: Mapping[str, Any]) -> Settings:
+    """Return the settings that a user gives, with changes. ConfigError names a wrong key or value."""
+    if isinstance(given, Mapping):
+        return change_settings(change_settings(Settings(), given), changes)
+    base = given if isinstance(given, Settings) else load_settings(None if given is None else find_config(Path(given)))
+    return change_settings(base, changes)
+
+
+def _tell(lines: Any) -> None:
+    for line in lines:
+        _LOG.warning("%s", line)

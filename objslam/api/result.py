@@ -1,0 +1,114 @@
+"""The result of a run for users: the map, the path and the rays, from memory or from a result folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from objslam.api.inputs import Trajectory
+from objslam.core import types
+from objslam.core.result import RunResult
+from objslam.errors import OutputError
+from objslam.io.rays_parquet import RaysTable
+from objslam.mapping.checks.assessment import Assessment
+from objslam.results.object_map import ObjectMap
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What the writer of a result folder needs. detected: whether a detector found the boxes of the log."""
+
+    result: RunResult
+    log: types.Log | None
+    detected: bool
+
+
+@dataclass(frozen=True)
+class Result:
+    """The result of a run.
+
+    objects: the map. poses: map_T_base at each camera frame that had a usable box. path: map_T_base at the full rate of the
+    log. rays: all rays, with their objects and residuals. summary: the content of summary.json. folder: where the result
+    was loaded from, None for a result from memory.
+    """
+
+    objects: ObjectMap
+    poses: Trajectory
+    path: Trajectory
+    rays: RaysTable
+    summary: dict[str, Any]
+    folder: Path | None = None
+    _run: _Run | None = field(default=None, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, result: RunResult, log: types.Log | None = None, *, detected: bool = False) -> Self:
+        """Return the result of a mapping. log: the log that it mapped. detected: whether a detector found its boxes."""
+        from objslam.output.result_folder import rays_table
+
+        stamps, first = np.unique(result.keyframes.stamps, return_index=True)
+        return cls(
+            ObjectMap(result.map.objects, result.map.frame),
+            Trajectory(stamps, result.map_T_base[first]),
+            Trajectory(result.path_after.stamps, result.path_after.poses),
+            rays_table(result),
+            result.summary,
+            _run=_Run(result, log, detected),
+        )
+
+    @classmethod
+    def load(cls, folder: str | PathLike[str]) -> Self:
+        """Load a result folder. OutputError names what is missing or damaged."""
+        from objslam.results import read
+
+        at = Path(folder)
+        poses, path = read.load_trajectory(at), read.load_path(at)
+        return cls(
+            ObjectMap.load(at),
+            Trajectory(poses.stamps, poses.poses),
+            Trajectory(path.stamps, path.poses),
+            read.load_rays(at),
+            read.load_summary(at),
+            at,
+        )
+
+    def save(self, folder: str | PathLike[str]) -> tuple[str, ...]:
+        """Write the result folder as `objslam run` does, in the place of an older result. A loaded result is copied.
+
+        Return the names of the older result's files that were deleted and not replaced. OutputError if the folder cannot be
+        written, or if it holds a log or files that no run wrote.
+        """
+        from objslam.output.result_folder import copy_result, write_result
+
+        to = Path(folder)
+        if self._run is None:
+            assert self.folder is not None  # a result is from memory or from a folder
+            return copy_result(self.folder, to)
+        log = self._run.log
+        truth = None if log is None else log.truth
+        return write_result(self._run.result, to, truth, detected=log.cameras if log and self._run.detected else ())
+
+    @property
+    def assessment(self) -> Assessment:
+        """What to think of the result, with the reasons. OutputError for a result of an older version."""
+        found = self.summary.get("assessment")
+        if found is None:
+            raise OutputError("this result is from an older version, which judged nothing", hint="run again")
+        return Assessment(found["level"], tuple(found["reasons"]))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The warnings of the run, one line each."""
+        return tuple(self.summary.get("warnings", ()))
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many data were dropped, by reason."""
+        return dict(self.summary.get("dropped", {}))
+
+    def __repr__(self) -> str:
+        judged = f"verdict: {self.assessment}\n" if "assessment" in self.summary else ""
+        return f"Result: {len(self.poses)} poses, {len(self.rays)} rays\n{judged}{self.objects!r}"

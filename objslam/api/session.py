@@ -1,0 +1,87 @@
+"""A session for programs that push live data into it, without any middleware."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from numpy.typing import ArrayLike
+
+from objslam.api.array_input import as_pose
+from objslam.api.mapping import Given, settings_of
+from objslam.api.result import Result
+from objslam.core.arrays import Floats
+from objslam.core.snapshot import Snapshot
+from objslam.live.session.session import Session as LiveSession
+from objslam.results.object_map import ObjectMap
+
+
+class Session(LiveSession):
+    """A map that grows while data are pushed, in a thread of its own.
+
+    Use it in a `with` block: it starts the session, and ends it. Push cameras first, then poses and boxes, from any thread.
+    A push returns False if the message is dropped; `snapshot().dropped` counts the reasons. `result` ends the session and
+    solves the whole map once more.
+
+        with objslam.Session() as session:
+            session.push_camera(camera)
+            session.push_odometry(10.0, [0.0, 0.0, 0.0])
+            session.push_detections(10.0, "front", [[205, 207, 226, 232]], ["cup"], [0.9])
+            print(session.snapshot().map)
+            result = session.result()
+
+    settings: as in `objslam.run`; the mode is always joint. journal: a file that keeps every accepted message, so that a
+    killed program loses nothing. resume: whether to continue an existing journal. patient: whether frames of any age are
+    accepted, for a program that waits for the session (`wait`) now and then, such as a replay.
+    """
+
+    def __init__(
+        self,
+        settings: Given = None,
+        *,
+        journal: str | PathLike[str] | None = None,
+        resume: bool = False,
+        name: str = "live",
+        patient: bool = False,
+        **changes: Any,
+    ) -> None:
+        chosen = settings_of(settings, {**changes, "mode": "joint"})
+        super().__init__(chosen, None if journal is None else Path(journal), resume, name, patient)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.abort()
+
+    def push_odometry(self, stamp: float, odom_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
+        """Push odom_T_base at a stamp, s: x, y, yaw, or x, y, z, qx, qy, qz, qw, or (4, 4), in m and rad."""
+        return super().push_odometry(stamp, _pose(odom_T_base), covariance)
+
+    def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
+        """Push map_T_base of a localisation at a stamp, s, as `push_odometry` takes it."""
+        return super().push_localization(stamp, _pose(map_T_base), covariance)
+
+    def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
+        """Push base_T_camera of a camera that moves on the robot, as `push_odometry` takes a pose."""
+        return super().push_mount(stamp, camera, _pose(base_T_camera))
+
+    def snapshot(self) -> Snapshot:
+        """Return the present map, path and counts. It takes milliseconds."""
+        found = super().snapshot()
+        return replace(found, map=ObjectMap(found.map.objects, found.map.frame))
+
+    def result(self) -> Result:
+        """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped."""
+        return Result.of(self.stop())
+
+
+def _pose(values: ArrayLike) -> Any:
+    """Return a pose (4, 4), or the values as they are if they are no pose, because the session counts what it refuses."""
+    try:
+        return as_pose(values)
+    except (TypeError, ValueError):
+        return values

@@ -1,0 +1,35 @@
+"""Tables for users: pyarrow always, pandas if it is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from objslam.errors import ObjslamError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+
+def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
+    """Return a pyarrow table. A column is an array, or (R, k) numbers, whose cells become lists of k numbers."""
+    import pyarrow as pa
+
+    def column(values: Any) -> Any:
+        if isinstance(values, np.ndarray) and values.ndim == 2:
+            return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        return values
+
+    return pa.table({name: column(values) for name, values in columns.items()})
+
+
+def to_pandas(table: pa.Table) -> pd.DataFrame:
+    """Return a pyarrow table as a pandas data frame. ObjslamError if pandas is not installed."""
+    try:
+        import pandas  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ObjslamError("pandas is not installed", hint="pip install pandas, or use to_arrow()") from error
+    return table.to_pandas()

@@ -1,0 +1,124 @@
+"""What to think of a result, in a few sentences. The judgement looks at numbers only, so it is the same for every driver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from objslam.frontend.bearings import CUT_OFF
+
+Level = Literal["good", "check", "bad"]
+
+_MISSES = 1.5
+"""The residuals, as a multiple of the noise that counts for them, above which a result needs a look. At 1.5, more than half
+of their variance is unexplained. A larger value says so less often."""
+_CUT = 1 / 3
+"""The share of the boxes that the image's edge cuts off, above which a result needs a look. In the demo's rooms a tenth is
+usual. A larger value says so less often."""
+_UNEXPLAINED = 0.25
+"""The share of the rays that belong to no object, above which a result needs a look. A tenth is usual, from false boxes and
+moving things. A larger value says so less often."""
+_FEW = 60
+"""The number of rays below which a result needs a look. The checks of the input refuse to judge fewer boxes. A larger value
+says so more often."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The numbers that the judgement looks at.
+
+    resolved, unresolved: how many objects have a place, and how many have none. boxes: the boxes of the log. cut: those that
+    the image's edge cuts off. rays: the boxes that were used. unexplained: those of no object. misses: the median residual
+    as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's frame. planar:
+    whether the path is planar. findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
+    """
+
+    resolved: int
+    unresolved: int
+    boxes: int
+    cut: int
+    rays: int
+    unexplained: int
+    misses: float
+    odometry_frame: bool = False
+    planar: bool = True
+    findings: tuple[str, ...] = ()
+    spoilt: bool = False
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """A level and its reasons, one sentence each.
+
+    good: use the map. check: look at the reasons first. bad: do not use the map.
+    """
+
+    level: Level
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return " ".join([f"{self.level}.", *self.reasons])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what summary.json holds."""
+        return {"level": self.level, "reasons": list(self.reasons)}
+
+
+def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
+    """Return the evidence that the summary of a run holds. misses: as in `Evidence`."""
+    counts, findings = summary["counts"], summary.get("wrong_input", [])
+    return Evidence(
+        resolved=counts["objects"] - counts["unresolved"],
+        unresolved=counts["unresolved"],
+        boxes=counts.get("detections", 0),
+        cut=summary["dropped"].get(CUT_OFF, 0),
+        rays=counts["rays"],
+        unexplained=counts["rays_unexplained"],
+        misses=misses,
+        odometry_frame=summary["map_frame"] == "odometry",
+        planar=summary["planar"],
+        findings=tuple(finding["name"] for finding in findings),
+        spoilt=any(finding["spoils_positions"] for finding in findings),
+    )
+
+
+def assess(e: Evidence) -> Assessment:
+    """Judge a result. The first reasons weigh most."""
+    bad, check = _bad(e), _check(e)
+    level: Level = "bad" if bad else "check" if check else "good"
+    them = "it" if e.resolved == 1 else "them"
+    good = f"{_objects(e.resolved)}, and the rays miss {them} about as far as the settings say, or less."
+    frame = "The map lies in the frame of the odometry: `objslam eval` needs --align " + ("se2." if e.planar else "se3.")
+    return Assessment(level, tuple(bad or check or [good]) + ((frame,) if e.odometry_frame and not bad else ()))
+
+
+def _bad(e: Evidence) -> list[str]:
+    if e.spoilt:
+        return ["The input is wrong, and the warnings say how."]
+    if not e.resolved:
+        return ["No object has a place. Drive around things, so that they are seen from more than one side."]
+    return []
+
+
+def _check(e: Evidence) -> list[str]:
+    found = []
+    if e.findings:
+        found.append(f"The input has an error that the warnings explain ({', '.join(e.findings)}).")
+    elif e.misses > _MISSES:
+        found.append(
+            f"The rays miss their objects {e.misses:.1f} times as far as the settings say, so poses, clock, calibration or "
+            "boxes are worse than that."
+        )
+    if e.cut > _CUT * e.boxes:
+        found.append(f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off.")
+    if e.unexplained > _UNEXPLAINED * e.rays:
+        found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
+    if e.unresolved > e.resolved:
+        found.append(f"Only {e.resolved} of {e.resolved + e.unresolved} objects have a place. Drive around the others.")
+    if e.rays < _FEW:
+        found.append(f"Only {e.rays} boxes were used, which is too few to notice wrong input.")
+    return found
+
+
+def _objects(count: int) -> str:
+    return f"{count} object{'' if count == 1 else 's'}"

@@ -1,0 +1,85 @@
+"""The scripts in examples/ run, and print what they promise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from small_log import small_log
+from waiting import LIMIT
+
+from objslam.sources.log_folder import write_log_folder
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log, its result, and a log that has images of one red thing in place of boxes."""
+    at = tmp_path_factory.mktemp("examples")
+    log = small_log(missed=0.0, false=0.0)
+    write_log_folder(log, at / "log")
+    write_log_folder(log, at / "red")
+    boxes = log.cameras[0].detections
+    assert boxes is not None
+    (at / "red" / "detections.jsonl").unlink()
+    (at / "red" / "rgb").mkdir()
+    lines = []
+    for k, stamp in enumerate(boxes.frame_stamps):
+        image = np.full((480, 640, 3), 90, dtype=np.uint8)
+        mine = boxes.boxes[(boxes.frame == k) & (boxes.label == boxes.label_names.index("cup"))]
+        for x1, y1, x2, y2 in mine.round().astype(int):
+            cv2.rectangle(image, (x1, y1), (x2 - 1, y2 - 1), (0, 0, 220), -1)
+        cv2.imwrite(str(at / "red" / "rgb" / f"{k}.png"), image)
+        lines.append(f"{float(stamp)!r} rgb/{k}.png\n")
+    (at / "red" / "rgb.txt").write_text("".join(lines))
+    return at
+
+
+def play(name: str, *arguments: Path) -> str:
+    words = [sys.executable, str(EXAMPLES / f"{name}.py"), *map(str, arguments)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_example_is_played_here() -> None:
+    text = Path(__file__).read_text("utf-8")
+    names = sorted(file.stem for file in EXAMPLES.glob("*.py"))
+    assert len(names) == 6
+    for name in names:
+        assert f'play("{name}"' in text
+
+
+def test_a_folder_becomes_a_result_that_answers(folder: Path) -> None:
+    said = play("map_folder", folder / "log", folder / "out")
+    assert "ObjectMap of 4 objects (0 unresolved)" in said
+    answers = play("query_result", folder / "out")
+    assert "nearest to the origin: plant" in answers
+    assert "cov_xy" in answers
+
+
+def test_arrays_become_the_cup_of_the_readme() -> None:
+    assert "cup #0 at (2.511, 0.503, 0.400) m, sigma 0.345 m, 5 rays" in play("from_arrays")
+
+
+def test_pushed_data_become_a_map(folder: Path) -> None:
+    assert "ObjectMap of 4 objects (0 unresolved)" in play("live_session", folder / "log")
+
+
+def test_boxes_of_another_detector_become_a_map(folder: Path) -> None:
+    said = play("own_detector", folder / "red")
+    assert "ObjectMap of 1 objects" in said
+    place: Any = [float(x) for x in said.split("at (")[1].split(")")[0].split(",")]
+    np.testing.assert_allclose(place, (1.0, 0.5, 0.5), atol=0.05)
+
+
+def test_shared_errors_go_from_one_run_to_the_next(folder: Path) -> None:
+    said = play("settings_and_calibration", folder / "log", folder / "calibrated")
+    assert "odometry.scale: " in said
+    assert "ObjectMap of 4 objects (0 unresolved)" in said

@@ -1,0 +1,90 @@
+"""What a program reads of the commands: --json, --quiet, and usage errors that say what was meant."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from small_log import small_log
+from waiting import LIMIT
+
+from objslam.sources.log_folder import write_log_folder
+
+LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs") / "small"
+    write_log_folder(small_log(), folder)
+    return folder
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-m", "objslam", *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
+
+
+def test_a_run_in_json_is_its_files(log: Path, tmp_path: Path) -> None:
+    done = call("run", log, "-o", tmp_path / "out", "--json", *LEAN)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["objects"] == json.loads((tmp_path / "out" / "objects.json").read_text())["objects"]
+    written = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert told["summary"] == written
+    assert told["out"] == str(tmp_path / "out")
+
+
+def test_a_quiet_run_prints_warnings_only(log: Path, tmp_path: Path) -> None:
+    done = call("run", log, "-o", tmp_path / "out", "--quiet", *LEAN, "--set", "rays.border=100")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert "warning: dropped" in done.stderr
+    assert "camera left, stamp 1700000" in done.stderr
+    assert (tmp_path / "out" / "summary.json").is_file()
+
+
+def test_a_run_ends_with_its_verdict(log: Path, tmp_path: Path) -> None:
+    lines = call("run", log, "-o", tmp_path / "out", *LEAN).stdout.splitlines()
+    assert lines[-2].startswith("verdict: good. 4 objects")
+    assert lines[-1] == f"wrote {tmp_path / 'out'}"
+
+
+def test_info_tells_in_words_and_in_json(log: Path) -> None:
+    words = call("info", log).stdout
+    assert "The robot drives 16.3 m in 15.8 s, by odometry and localization." in words
+    assert "The camera left has 284 boxes of 4 labels in 80 frames." in words
+    told = json.loads(call("info", log, "--json").stdout)
+    assert told["kind"] == "log"
+    assert told["missing"] == []
+    assert told["cameras"][0]["width"] == 640
+    assert {stream["role"]: stream["timing"]["count"] for stream in told["streams"]}["detections"] == 80
+
+
+def test_info_sees_boxes_that_are_fractions(log: Path, tmp_path: Path) -> None:
+    write_log_folder(small_log(), tmp_path / "log")
+    frames = [json.loads(line) for line in (log / "detections.jsonl").read_text().splitlines()]
+    for frame in frames:
+        frame["boxes"] = [[x1 / 640, y1 / 480, x2 / 640, y2 / 480] for x1, y1, x2, y2 in frame["boxes"]]
+    (tmp_path / "log" / "detections.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
+    assert "they are probably shares of the image, not px" in call("info", tmp_path / "log").stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("run", "LOG", "--mode", "jont"), "joint"),
+        (("eval", "OUT", "--align", "s2"), "se2"),
+        (("run", "LOG", "--mode", "x"), ""),
+    ],
+)
+def test_a_mistyped_choice_says_what_is_meant(arguments: tuple[str, ...], meant: str) -> None:
+    done = call(*arguments)
+    assert done.returncode == 2
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert "is none of" in said
+    assert "Value error" not in said
+    assert ("did you mean" in said) == bool(meant)
+    assert not meant or f"did you mean {meant}?" in said

@@ -1,0 +1,63 @@
+"""The command `objslam detect` on one photo: the boxes are those that are in it, and the picture shows them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_models import scene, tiny_model
+from waiting import LIMIT
+
+BOXES = {"red": (100, 120, 180, 200), "green": (300, 60, 380, 180), "blue": (420, 300, 560, 380)}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A model and a photo of three rectangles."""
+    at = tmp_path_factory.mktemp("detect")
+    model = tiny_model(at / "tiny.onnx", "yolov8", metadata={"names": {0: "red", 1: "green", 2: "blue"}})
+    cv2.imwrite(str(at / "photo.png"), scene(list(BOXES.values())))
+    return model, at / "photo.png"
+
+
+def detect(*arguments: object) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-m", "objslam", "detect", *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
+
+
+def test_the_boxes_are_told_and_drawn(files: tuple[Path, Path], tmp_path: Path) -> None:
+    done = detect(*files, "-o", tmp_path / "out.png")
+    assert done.returncode == 0, done.stderr
+    assert "yolov8 layout" in done.stdout
+    assert "3 boxes" in done.stdout
+    drawn, photo = cv2.imread(str(tmp_path / "out.png")), cv2.imread(str(files[1]))
+    assert drawn is not None
+    assert photo is not None
+    changed = np.argwhere((drawn != photo).any(axis=2))[:, ::-1]
+    for x1, y1, x2, y2 in BOXES.values():  # a corner of each box is drawn, its middle is not
+        assert (np.abs(changed - (x2, y2)).max(axis=1) <= 3).any()
+        assert not (np.abs(changed - ((x1 + x2) // 2, (y1 + y2) // 2)).max(axis=1) <= 3).any()
+
+
+def test_json_has_every_box(files: tuple[Path, Path]) -> None:
+    told = json.loads(detect(*files, "--json").stdout)
+    assert told["image"] == [640, 480]
+    found = {one["label"]: one["box"] for one in told["boxes"]}
+    assert set(found) == set(BOXES)
+    for label, box in BOXES.items():
+        np.testing.assert_allclose(found[label], box, atol=2)
+
+
+@pytest.mark.parametrize(("model", "photo", "word"), [("none.onnx", "photo.png", "none.onnx"), ("m", "no.txt", "no image")])
+def test_what_is_wrong_is_one_line(files: tuple[Path, Path], tmp_path: Path, model: str, photo: str, word: str) -> None:
+    (tmp_path / "no.txt").write_text("text")
+    place = files[1].parent if photo == "photo.png" else tmp_path
+    done = detect(tmp_path / model, place / photo)
+    assert done.returncode == 1
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert word in done.stderr

@@ -1,0 +1,79 @@
+"""The verdict on a result: each reason appears when its cause is there, and only then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_log import small_log
+
+import objslam
+from objslam.frontend.bearings import CUT_OFF
+from objslam.mapping.checks.assessment import Evidence, assess
+from objslam.simulation import PoseNoise
+
+GOOD = Evidence(resolved=12, unresolved=1, boxes=1000, cut=100, rays=900, unexplained=90, misses=1.0)
+QUIET = {"output": {"recording": False, "picture": False}}
+
+
+def test_a_usual_result_is_good() -> None:
+    found = assess(GOOD)
+    assert found.level == "good"
+    assert str(found) == "good. 12 objects, and the rays miss them about as far as the settings say, or less."
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "reason"),
+    [
+        ({"spoilt": True, "findings": ("clock",)}, "bad", "The input is wrong, and the warnings say how."),
+        ({"resolved": 0}, "bad", "No object has a place. Drive around things"),
+        ({"findings": ("rays miss",)}, "check", "The input has an error that the warnings explain (rays miss)."),
+        ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
+        ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
+        ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
+        ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
+        ({"rays": 20, "unexplained": 0}, "check", "Only 20 boxes were used, which is too few to notice wrong input."),
+    ],
+)
+def test_each_cause_has_its_reason(changes: dict[str, object], level: str, reason: str) -> None:
+    found = assess(replace(GOOD, **changes))  # type: ignore[arg-type]
+    assert found.level == level
+    assert len(found.reasons) == 1
+    assert found.reasons[0].startswith(reason)
+
+
+def test_reasons_add_up_and_a_bad_result_says_only_why() -> None:
+    both = assess(replace(GOOD, misses=2.0, cut=500))
+    assert len(both.reasons) == 2
+    assert len(assess(replace(GOOD, misses=2.0, cut=500, spoilt=True)).reasons) == 1
+
+
+@pytest.mark.parametrize(("planar", "align"), [(True, "se2"), (False, "se3")])
+def test_a_map_in_the_odometrys_frame_says_how_to_compare_it(planar: bool, align: str) -> None:
+    found = assess(replace(GOOD, odometry_frame=True, planar=planar))
+    assert found.level == "good"
+    assert found.reasons[-1].endswith(f"--align {align}.")
+
+
+@pytest.mark.parametrize(("sigma", "level"), [(2.0, "good"), (0.8, "check")])
+def test_a_run_knows_how_far_its_rays_miss(sigma: float, level: str) -> None:
+    """The boxes err by 2 px, and the settings say `sigma`. Nothing else errs, so the multiple is known."""
+    log = small_log(localization=PoseNoise(xy=1e-6, yaw=1e-6), missed=0.0, false=0.0)
+    changes = {"rays.pixel_sigma": sigma, "rays.box_sigma": 0.0, "localization.xy": 1e-4, "localization.yaw": 1e-4}
+    changes |= {"association.method": "by_label", "checks.use": False}
+    found = objslam.run(log, {**QUIET, **changes})
+    np.testing.assert_allclose(found.summary["residual_times"], 2.0 / sigma, rtol=0.1)
+    assert found.assessment.level == level
+
+
+def test_a_run_from_odometry_says_how_to_compare_it() -> None:
+    joint = objslam.run(small_log(), QUIET, mode="joint", poses={"use": "odometry"})
+    assert "--align se2" in str(joint.assessment)
+
+
+def test_boxes_at_the_edge_are_told() -> None:
+    cut = objslam.run(small_log(), QUIET, rays={"border": 150})
+    dropped, boxes = cut.dropped[CUT_OFF], cut.summary["counts"]["detections"]
+    assert dropped > boxes / 3
+    assert f"{100 * dropped / boxes:.0f} % of the boxes were dropped" in str(cut.assessment)
