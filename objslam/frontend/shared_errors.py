@@ -60,9 +60,10 @@ class SharedErrors:
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()
         ranged = bool(np.isfinite(self.rays.range).any())
+        told = any(one.camera.depth_noise is not None for one in self.log.cameras)
         kinds = {
             "rays": (of.noise.rays, of.rays == default.rays, of.joint.factor == "bearing"),
-            "ranges": (of.noise.ranges, of.depth == default.depth, ranged),
+            "ranges": (of.noise.ranges, of.depth == default.depth and not told, ranged),
             "odometry": (of.noise.odometry, of.odometry == default.odometry, True),
         }
         return frozenset(k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use))

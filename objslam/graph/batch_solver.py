@@ -196,7 +196,7 @@ def _share_bias(rays: Rays, association: Association, settings: Settings) -> Ray
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()
-    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * settings.depth.bias**2)
+    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * rays.range_bias[ranged] ** 2)
     return replace(rays, range_sigma=sigma)
 
 
