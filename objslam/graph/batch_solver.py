@@ -71,6 +71,7 @@ def solve_fixed(
         covariance = np.full((association.count, 3, 3), np.nan)
         covariance[held] = np.linalg.inv(information[held])
         covariance *= widening(distance / across, landmark, association.count)[:, None, None]
+        covariance += _of_range_bias(covariance, n, along * np.nan_to_num(some.range_bias), landmark)
     return Estimate(
         map_T_base=keyframes.map_T_base,
         positions=positions,
@@ -188,6 +189,17 @@ def solve_joint(
         calibration=calibration if calibration is not None and calibration.names else None,
         noise=None if errors is None else errors.noise,
     )
+
+
+def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:
+    """Return what the bias that all ranges of an object share adds to its covariance (N, 3, 3).
+
+    directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times one sigma of the bias.
+    """
+    pull = np.zeros(covariance.shape[:2])
+    np.add.at(pull, landmark, strength[:, None] * directions)
+    shift = (covariance @ pull[..., None])[..., 0]
+    return shift[:, :, None] * shift[:, None, :]
 
 
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
