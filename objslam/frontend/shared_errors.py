@@ -17,7 +17,7 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.frontend.corrected_log import ODOMETRY, corrected_mount, corrected_odometry, later, refocused, take_out, turns
-from objslam.frontend.known_errors import error_names, estimates, known_errors, prior_sigma
+from objslam.frontend.known_errors import estimates, known_errors, possible, prior_sigma
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
 
@@ -276,7 +276,7 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
             "odometry": keyframes.odom_T_base is not None,
             "": np.isfinite(rays.range).any(),  # range_scale belongs to no part
         }
-        names = tuple(n for n in error_names(log) if measured[n.rpartition(".")[0]] and prior_sigma(n, settings) > 0)
+        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0]])
     mean = np.zeros(len(names))
     prior = np.diag([prior_sigma(name, settings) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
