@@ -71,6 +71,7 @@ def synthetic_result(
         sigma=np.full(count, 0.005),
         range=np.full(count, np.nan),
         range_sigma=np.full(count, np.nan),
+        range_bias=np.full(count, np.nan),
         label=label,
         score=np.full(count, 0.9),
         box=np.tile([10.0, 10.0, 40.0, 40.0], (count, 1)),

@@ -1,10 +1,13 @@
 """The noise of a log's measurements, as factors on the noise in the settings."""
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
 
 from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera
 from objslam.core.types import Rays
 
 
@@ -26,8 +29,8 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the noise of odometry and ranges multiplied. `rays_with_noise` has that of rays."""
-        of, depth = nominal.odometry, nominal.depth
+        """Return the settings with the noise of the odometry multiplied. `rays_with_noise` has that of rays and ranges."""
+        of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
             "xy_per_rad": of.xy_per_rad * self.along,
@@ -37,18 +40,16 @@ class NoiseFactors:
             "yaw_per_rad": of.yaw_per_rad * self.turning,
             "floor_yaw": of.floor_yaw * self.turning,
         }
-        ranges = {
-            "sigma": depth.sigma * self.ranges,
-            "sigma_per_m": depth.sigma_per_m * self.ranges,
-            "bias": depth.bias * self.range_bias,
-        }
-        return nominal.model_copy(
-            update={"odometry": of.model_copy(update=odometry), "depth": depth.model_copy(update=ranges)}
-        )
+        return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with their noise multiplied."""
-        return replace(nominal, sigma=nominal.sigma * self.rays, range_sigma=nominal.range_sigma * self.ranges)
+        """Return rays with their noise, and that of their ranges, multiplied."""
+        return replace(
+            nominal,
+            sigma=nominal.sigma * self.rays,
+            range_sigma=nominal.range_sigma * self.ranges,
+            range_bias=nominal.range_bias * self.range_bias,
+        )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
         """Return whether all factors agree with those of another within a relative tolerance."""
@@ -62,3 +63,15 @@ class NoiseFactors:
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
+
+
+def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
+    """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
+
+    camera: (n,) the index of each range's camera. A camera that tells the noise of its depths has that one. The others have
+    the noise of the settings.
+    """
+    of = settings.depth
+    told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]
+    sigma, per_m, bias = np.array(told, dtype=np.float64).reshape(-1, 3)[camera].T
+    return sigma + per_m * ranges, bias

@@ -217,8 +217,9 @@ class Rays:
 
     keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, in the camera frame. sigma: (R,) rad, the
     nominal noise: the standard deviation of the angle along each of the two axes across the ray. range: (R,) m along the
-    ray, NaN if unknown. range_sigma: (R,) m. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id:
-    (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the origin.
+    ray, NaN if unknown. range_sigma: (R,) m. range_bias: (R,) m, the standard deviation of the error that all ranges of an
+    object share. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id: (R,) -1 if unknown.
+    offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the origin.
     """
 
     keyframe: Ints
@@ -226,6 +227,7 @@ class Rays:
     sigma: Floats
     range: Floats
     range_sigma: Floats
+    range_bias: Floats
     label: Ints
     score: Floats
     box: Floats

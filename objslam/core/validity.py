@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.camera import COEFFICIENTS, Camera
+from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 
 MAX_POSITION = 1e7
 """The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is further from the
@@ -127,7 +127,17 @@ def camera_fault(camera: Camera) -> str | None:
         return "with an unknown lens model"
     if camera.base_T_camera.shape != (4, 4) or not rigid_poses(camera.base_T_camera[None])[1][0]:
         return "whose mount is not a rigid pose"
-    return None if 0 < camera.depth_scale < math.inf else "whose depth scale is not above zero"
+    if not 0 < camera.depth_scale < math.inf:
+        return "whose depth scale is not above zero"
+    if camera.depth_noise is not None and not _possible(camera.depth_noise):
+        return "whose depth noise is not a finite sigma above zero, and sigma_per_m and bias of at least zero"
+    return None
+
+
+def _possible(noise: RangeNoise) -> bool:
+    numbers = (noise.sigma, noise.sigma_per_m, noise.bias)
+    plain = all(isinstance(n, int | float | np.number) and math.isfinite(n) for n in numbers)
+    return plain and noise.sigma > 0 and noise.sigma_per_m >= 0 and noise.bias >= 0
 
 
 def is_name(value: object) -> bool:

@@ -6,6 +6,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import range_noise
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
@@ -46,12 +47,16 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     if not settings.depth.use:
         depth = np.full(len(depth), np.nan)
     ranges = (depth / direction[:, 2])[order]
+    range_sigma, range_bias = range_noise(
+        ranges, keyframes.camera[keyframe[order]], [one.camera for one in log.cameras], settings
+    )
     return Rays(
         keyframe=keyframe[order],
         direction=direction[order],
         sigma=sigma[order],
         range=ranges,
-        range_sigma=settings.depth.sigma + settings.depth.sigma_per_m * ranges,
+        range_sigma=range_sigma,
+        range_bias=range_bias,
         label=label[order],
         score=score[order],
         box=box[order],

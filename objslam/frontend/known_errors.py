@@ -3,6 +3,8 @@ estimated."""
 
 from pathlib import Path
 
+import numpy as np
+
 from objslam.config import Settings
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
@@ -40,8 +42,21 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """
     use = settings.calibration.use
     if settings.mode == "fixed":
-        return use is True and localized
+        return use is not False and localized
     return odometry if use == "auto" else use
+
+
+def possible(log: Log, settings: Settings) -> list[str]:
+    """Return the names of the errors of a log that the settings do not hold.
+
+    A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
+    place are no errors, unless settings.calibration.use is true.
+    """
+    asked = settings.calibration.use is True
+    base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
+    mounted = (*AXES, "x", "y", "z")
+    names = [n for n in error_names(log) if prior_sigma(n, settings) > 0]
+    return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
 
 
 def known_errors(settings: Settings) -> Calibration | None:
@@ -71,11 +86,9 @@ def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
         raise ConfigError(f"it fits nothing in the log {log.name}: {', '.join(known.names)}", where=file, hint=_parts(log))
     warn_of_others(known, log, settings, ledger)
     estimated = estimates(settings, log.odometry is not None, log.localization is not None)
-    held = {
-        name: value
-        for name, value in zip(known.names, known.values.tolist(), strict=True)
-        if name in names and not (estimated and prior_sigma(name, settings) > 0)
-    }
+    sought = set(possible(log, settings)) if estimated else set()
+    values = zip(known.names, known.values.tolist(), strict=True)
+    held = {name: value for name, value in values if name in names and name not in sought}
     return take_out(log, held)
 
 

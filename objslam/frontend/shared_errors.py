@@ -17,7 +17,7 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, corrected_mount, later, refocused, take_out
-from objslam.frontend.known_errors import error_names, estimates, known_errors, prior_sigma
+from objslam.frontend.known_errors import estimates, known_errors, possible, prior_sigma
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
 
@@ -61,9 +61,10 @@ class SharedErrors:
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()
         ranged = bool(np.isfinite(self.rays.range).any())
+        told = any(one.camera.depth_noise is not None for one in self.log.cameras)
         kinds = {
             "rays": (of.noise.rays, of.rays == default.rays, of.joint.factor == "bearing"),
-            "ranges": (of.noise.ranges, of.depth == default.depth, ranged),
+            "ranges": (of.noise.ranges, of.depth == default.depth and not told, ranged),
             "odometry": (of.noise.odometry, of.odometry == default.odometry, True),
         }
         return frozenset(k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use))
@@ -234,7 +235,7 @@ class SharedErrors:
         return _at_stamps(path, stamps, self.settings.poses.max_gap)
 
     def _corrected(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Poses of the odometry without its errors, with distances that compensate the shrinkage of the map, as the ranges do."""
+        """Poses of the odometry without its errors. Its distances compensate the shrinkage of the map, as the ranges do."""
         named = dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
         return self._correctable().poses(named, which)
 
@@ -286,7 +287,7 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
             "odometry": keyframes.odom_T_base is not None,
             "": np.isfinite(rays.range).any(),  # range_scale belongs to no part
         }
-        names = tuple(n for n in error_names(log) if measured[n.rpartition(".")[0]] and prior_sigma(n, settings) > 0)
+        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0]])
     mean = np.zeros(len(names))
     prior = np.diag([prior_sigma(name, settings) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None

@@ -73,6 +73,7 @@ def solve_fixed(
         covariance = np.full((association.count, 3, 3), np.nan)
         covariance[held] = np.linalg.inv(information[held])
         covariance *= widening(distance / across, landmark, association.count)[:, None, None]
+        covariance += _of_range_bias(covariance, n, along * np.nan_to_num(some.range_bias), landmark)
     return Estimate(
         map_T_base=keyframes.map_T_base,
         positions=positions,
@@ -195,13 +196,24 @@ def solve_joint(
     )
 
 
+def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:
+    """Return what the bias that all ranges of an object share adds to its covariance (N, 3, 3).
+
+    directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times one sigma of the bias.
+    """
+    pull = np.zeros(covariance.shape[:2])
+    np.add.at(pull, landmark, strength[:, None] * directions)
+    shift = (covariance @ pull[..., None])[..., 0]
+    return shift[:, :, None] * shift[:, None, :]
+
+
 def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
     # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()
-    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * settings.depth.bias**2)
+    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * rays.range_bias[ranged] ** 2)
     return replace(rays, range_sigma=sigma)
 
 

@@ -54,5 +54,6 @@ def _triangulate(
         seed=settings.seed,
         ranges=rays.range if np.isfinite(rays.range).any() else None,
         range_sigma=rays.range_sigma,
+        range_bias=rays.range_bias,
         position_sigma=place,
     )

@@ -7,9 +7,9 @@ The whole graph is solved each time that it has doubled. All these solves togeth
 import gtsam
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.graph.assembly import Measurements
-from objslam.graph.optimizers import Optimum, build_graph, indeterminate, levenberg_marquardt
+from objslam.graph.optimizers import Optimum, build_graph, levenberg_marquardt
 from objslam.graph.variables import L0, LETTER, X0, keyframes_in, landmarks_in
 
 _WINDOW = 60
@@ -18,6 +18,10 @@ On the MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps.
 _GROWTH = 2.0
 """The growth of the graph since its last whole solve at which it is solved as a whole again. A larger factor is faster. A
 smaller one corrects earlier what windows neglect: errors of what they hold are correlated, and a loop bends old poses."""
+_AT_CAMERA = 1e-3
+"""The distance (m) from a camera below which a landmark is at the camera, which no object is. The information of a bearing
+grows with the inverse square of the distance, so that nearer landmarks make the linear system singular. A larger distance
+also takes real landmarks out. The solver put landmarks there on real drives whose clocks were 0.2 s apart."""
 
 
 class SlidingWindow:
@@ -63,6 +67,7 @@ class SlidingWindow:
     def solve(self) -> Optimum:
         """Solve the window, or the whole graph if it has grown enough or is complete. Then move the window on.
 
+        A landmark that ends at a camera leaves the graph. Its position is NaN then, and new rays may find it again.
         SolveError if the linear system is indeterminate, or if the cost is not finite.
         """
         if self.end >= _GROWTH * self._solved or self.end == len(self.map_T_camera):
@@ -73,8 +78,21 @@ class SlidingWindow:
         keyframes, poses = keyframes_in(optimum.values)
         landmarks, points = landmarks_in(optimum.values)
         self.map_T_camera[keyframes], self.positions[landmarks] = poses, points
+        self._take_out(landmarks[_at_a_point(points, poses[:, :3, 3])])
         self._move(max(self.end - _WINDOW, self._begin))
         return optimum
+
+    def _take_out(self, landmarks: Ints) -> None:
+        """Take landmarks (n,) and their factors out of the graph."""
+        if not len(landmarks):
+            return
+        out = set((L0 + landmarks).tolist())
+        self._factors = [[one for one in factors if out.isdisjoint(one.keys())] for factors in self._factors]
+        for key in out:
+            self._weak.pop(key, None)
+            self._held.pop(key, None)
+            self._values.erase(key)
+        self.positions[landmarks] = np.nan
 
     def _graph(self, begin: int, end: int) -> gtsam.NonlinearFactorGraph:
         """Return the graph of the keyframes from `begin` to `end` - 1, with the priors of its variables."""
@@ -87,7 +105,8 @@ class SlidingWindow:
     def _move(self, begin: int) -> None:
         """Let the window begin at another keyframe. The marginals of what leaves become the priors of what stays.
 
-        Landmarks that leave keep their marginal until they are seen again. SolveError if a marginal is indeterminate.
+        Landmarks that leave keep their marginal until they are seen again. If what leaves does not tell its marginals, the
+        window stays, and becomes longer. A later solve raises SolveError if the whole graph does not tell them either.
         """
         if begin == self._begin:
             return
@@ -98,9 +117,17 @@ class SlidingWindow:
         try:
             marginals = gtsam.Marginals(leaving, self._values.extract(keys))
             self._held |= {key: _prior(key, self._values, marginals.marginalCovariance(key)) for key in kept}
-        except RuntimeError as error:
-            raise indeterminate(error) from error
+        except RuntimeError:  # GTSAM's only sign of an indeterminate system
+            return
         self._begin = begin
+
+
+def _at_a_point(positions: Floats, points: Floats) -> Bools:
+    """Return which positions (N, 3) are at one of the points (K, 3), K > 0."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(points).query(positions)
+    return np.asarray(distance < _AT_CAMERA)
 
 
 def _is_landmark(key: int) -> bool:

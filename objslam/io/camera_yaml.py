@@ -4,7 +4,7 @@ The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import get_args
 
@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from objslam.core.arrays import Floats
-from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel
+from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel, RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.validity import MAX_SIDE, camera_fault, valid_positions
@@ -105,9 +105,11 @@ def _read(
     sees_size = _text(path, top["sees_size"], "sees_size") if "sees_size" in top else "true"
     if sees_size not in ("true", "false"):
         raise _error(path, top["sees_size"], f"sees_size must be true or false, not {sees_size[:40]!r}")
+    noise = _depth_noise(path, top["depth_noise"]) if "depth_noise" in top else None
     if name is None:
         name = _text(path, top["camera_name"], "camera_name") if "camera_name" in top else "camera"
-    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees_size == "true")
+    sees = sees_size == "true"
+    camera = Camera(name, width, height, matrix, model, distortion, base_T_camera, depth_scale, sees, noise)
     if (fault := camera_fault(camera)) is not None:
         raise LogError(f"camera {fault}: a number is too large or too small", where=str(path))
     return Calibration(camera, placed)
@@ -132,6 +134,7 @@ def write_camera(camera: Camera, path: Path) -> None:
         "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
         "depth_scale": float(camera.depth_scale),
         **({} if camera.sees_size else {"sees_size": False}),
+        **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
     path.write_text(text, encoding="utf-8")
@@ -250,6 +253,17 @@ def _distortion(path: Path, top: _Mapping) -> tuple[DistortionModel, Floats]:
         counts = " or ".join(map(str, COEFFICIENTS[model]))
         raise _error(path, data, f"{model} takes {counts} distortion_coefficients, got {len(values)}")
     return model, values
+
+
+def _depth_noise(path: Path, node: yaml.Node) -> RangeNoise:
+    told = _mapping(path, node, "depth_noise")
+    noise = {}
+    for key in (one.name for one in fields(RangeNoise)):
+        noise[key] = _number(path, _get(path, told, key, "depth_noise.", node), f"depth_noise.{key}")
+        if noise[key] < 0 or (key == "sigma" and noise[key] == 0):
+            least = "above zero" if key == "sigma" else "at least zero"
+            raise _error(path, told[key], f"depth_noise.{key} must be {least}", "metres, and metres per metre")
+    return RangeNoise(**noise)
 
 
 def _pose(path: Path, node: yaml.Node) -> Floats:

@@ -27,6 +27,8 @@ _ROUNDS = 8
 """The most rounds of association and calibration. More rounds are slower. Two or three are usual."""
 _SAME = 0.2
 """The change of the shared errors, in standard deviations, below which they have converged. A larger one ends sooner."""
+_EXPLAINED = 0.5
+"""The share of rays below which an association explains too few. A larger share tries another association more often."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,8 @@ def calibrate_fixed(
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
         association = now.associate(noise_of_errors(every, calibration))
+        if (plain := _explains_far_more(now, association)) is not None:
+            association = plain
         rounds.append({"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
@@ -125,6 +129,19 @@ def calibrate_fixed(
     now = at.without(errors, calibration.values)
     estimate = now.solve(association, trace, _parameters(calibration))
     return now, association, _with_covariance(estimate, found), rounds
+
+
+def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
+    """Return the association without shared errors, None if it does not explain far more rays than that with them, `wide`.
+
+    What the errors can be is many times the noise of a ray. On a short drive among many objects of one label, nothing can
+    be told apart then. Errors that are small enough not to matter leave objects to be found without them.
+    """
+    explained = (wide.object >= 0).sum()
+    if explained > _EXPLAINED * len(wide.object):
+        return None
+    plain = at.associate()
+    return plain if (plain.object >= 0).sum() > explained / _EXPLAINED else None
 
 
 def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:

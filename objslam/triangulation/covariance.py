@@ -37,17 +37,20 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     return xp.where(regular[:, None, None], result, xp.nan)
 
 
-def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor) -> tuple[Tensor, Tensor]:
+def fuse_ranges(
+    bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor, range_bias: Tensor
+) -> tuple[Tensor, Tensor]:
     """Fuse the rays in `use` (R,) with their ranges (R,) m, and return points (N, 3) m and covariances (N, 3, 3) m^2.
 
     It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
-    range gets NaN. The loss is squared across the rays, because their outliers are already removed. It is Cauchy's along the
-    rays, because a range may belong to the background. `association.refinement.refine` is robust in both directions and
-    gives no covariance.
+    range gets NaN. All ranges of an object share an error with the standard deviation range_bias (R,) m. It moves the point
+    along the rays and enters the covariance. The loss is squared across the rays, because their outliers are already
+    removed. It is Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is
+    robust in both directions and gives no covariance.
     """
     xp = module_of(ranges)
     rays, count = bundle.select(use), len(bundle.number)
-    ranges, range_sigma = ranges[use], range_sigma[use]
+    ranges, range_sigma, range_bias = ranges[use], range_sigma[use], range_bias[use]
     known = xp.isfinite(ranges)
     typical = object_median(ranges[known], rays.index[known], count)
     usual = xp.where(known, ranges, typical[rays.index])
@@ -84,10 +87,15 @@ def fuse_ranges(bundle: Bundle, use: Tensor, ranges: Tensor, range_sigma: Tensor
         point = solve(across_matrix + along(robust) + empty, target)
     # Ranges that scatter by more than their sigma count less.
     scatter = object_median(abs(residual)[known], rays.index[known], count) / NORMAL_MEDIAN
-    along_matrix = along(robust / (scatter**2).clip(min=1)[rays.index])
+    strength_along = robust / (scatter**2).clip(min=1)[rays.index]
+    along_matrix = along(strength_along)
     factor = _variance_factor(length(lines.offset(point)) / s, rays, 2)
     inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
     regular &= has
+    # The point moves by `shift` if all ranges of its object are too long by one sigma of their bias.
+    bias = xp.where(known, range_bias, 0.0)
+    shift = (inverse @ lines.sum((strength_along * bias)[:, None] * rays.direction)[:, :, None])[:, :, 0]
+    inverse = inverse + shift[:, :, None] * shift[:, None, :]
     return xp.where(regular[:, None], point, xp.nan), xp.where(regular[:, None, None], inverse, xp.nan)
 
 

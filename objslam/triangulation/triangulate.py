@@ -61,6 +61,7 @@ def triangulate(
     seed: int = 0,
     ranges: ArrayLike | None = None,
     range_sigma: ArrayLike | None = None,
+    range_bias: ArrayLike = 0.0,
     position_sigma: float = 0.0,
 ) -> Triangulation:
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
@@ -76,6 +77,7 @@ def triangulate(
         object_index: (R,) the object of each ray, -1 for none, of `count` objects.
         sigma: (R,) or one number, rad, the noise of a ray's angle along each perpendicular axis.
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
+        range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
     Raises:
         ValueError: the arrays do not fit together or are not finite.
@@ -83,14 +85,17 @@ def triangulate(
     """
     m, n, index = _rays(origins, directions, object_index, count)
     noise = _positive(sigma, len(m), "sigma")
-    known = spread = None
+    known = spread = shared = None
     if ranges is not None:
         if range_sigma is None:
             raise ValueError("ranges need their range_sigma")
         known = _vector(ranges, len(m), "ranges")
         spread = _positive(range_sigma, len(m), "range_sigma", known)
+        shared = np.broadcast_to(np.asarray(range_bias, dtype=np.float64), (len(m),))
+        if not (shared[np.isfinite(known)] >= 0).all():
+            raise ValueError("range_bias must be at least 0")
     with array_backend(settings.device, len(m) >= _LARGE) as backend:
-        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, known, spread, backend)
+        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, known, spread, shared, backend)
 
 
 def _triangulate(
@@ -104,6 +109,7 @@ def _triangulate(
     seed: int,
     ranges: Floats | None,
     range_sigma: Floats | None,
+    range_bias: Floats | None,
     backend: Backend,
 ) -> Triangulation:
     """Triangulate checked rays, as `triangulate` does."""
@@ -128,12 +134,12 @@ def _triangulate(
         return is_resolved(sigma, reach, counts, angle, ranged, settings) & spread_of.lies_ahead(bundle, use, point)
 
     carried = resolved(point, covariance, xp.zeros_like(by_chance))
-    if ranges is not None and range_sigma is not None:
-        spread = as_tensor(range_sigma[where], backend)
+    if ranges is not None and range_sigma is not None and range_bias is not None:
+        spread, bias = (as_tensor(one[where], backend) for one in (range_sigma, range_bias))
         measured = as_tensor(np.where(ranges > 0, ranges, np.nan)[where], backend)
-        fused, fused_covariance = spread_of.fuse_ranges(bundle, use, measured, spread)
+        fused, fused_covariance = spread_of.fuse_ranges(bundle, use, measured, spread, bias)
         ranged = xp.isfinite(measured)
-        one_range = spread_of.object_median(spread[ranged], bundle.index[ranged], count)
+        one_range = spread_of.object_median(xp.hypot(spread, bias)[ranged], bundle.index[ranged], count)
         taken = xp.isfinite(fused[:, 0]) & ~(carried & (spread_of.largest_sigma(covariance) <= one_range))
         point = xp.where(taken[:, None], fused, point)
         covariance = xp.where(taken[:, None, None], fused_covariance, covariance)

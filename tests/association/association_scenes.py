@@ -137,6 +137,7 @@ def rays_of_boxes(
         sigma=pixel_sigma / camera.focal * direction[:, 2] ** 1.5,
         range=nothing,
         range_sigma=nothing,
+        range_bias=nothing,
         label=label,
         score=np.full(len(boxes), 0.9),
         box=boxes,
@@ -150,6 +151,17 @@ def join(*parts: Rays) -> Rays:
     order = np.argsort(np.concatenate([p.keyframe for p in parts]), kind="stable")
     columns = {
         name: np.concatenate([getattr(p, name) for p in parts])[order]
-        for name in ("keyframe", "direction", "sigma", "range", "range_sigma", "label", "score", "box", "track_id")
+        for name in (
+            "keyframe",
+            "direction",
+            "sigma",
+            "range",
+            "range_sigma",
+            "range_bias",
+            "label",
+            "score",
+            "box",
+            "track_id",
+        )
     }
     return Rays(**columns, label_names=parts[0].label_names)

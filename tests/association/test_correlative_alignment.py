@@ -33,6 +33,7 @@ def drive(rng, rays_each=1, ranges=True, strays=0):
         sigma=np.full(count, 0.004),
         range=measured,
         range_sigma=np.full(count, 0.05),
+        range_bias=np.zeros(count),
         label=zeros,
         score=np.ones(count),
         box=np.zeros((count, 4)),

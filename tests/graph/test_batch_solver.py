@@ -50,6 +50,7 @@ def rays_of(keyframe, directions, label, sigma, ranges=None):
         sigma=np.full(r, sigma),
         range=measured,
         range_sigma=np.full(r, 0.05),
+        range_bias=np.full(r, 0.05),
         label=label,
         score=np.ones(r),
         box=np.zeros((r, 4)),

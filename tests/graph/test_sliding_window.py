@@ -105,3 +105,38 @@ def test_the_graph_of_a_step_does_not_grow_with_the_path(monkeypatch, growth):
     whole = [size for size in sizes if size > 30 + STEP + 1]
     assert len(whole) <= 1 + np.log2(len(drive.keyframes) / (30 + STEP)) if growth == 2.0 else len(whole) == 1
     assert sizes[-1] == len(drive.keyframes)
+
+
+def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
+    """Nearer and nearer to a camera, its bearings would outweigh everything, and make the linear system singular."""
+    monkeypatch.setattr(sliding_window, "_WINDOW", 30)
+    drive, window = at_truth()
+    end = 1 + 4 * STEP
+    extended(drive, window, end)
+    window.solve()
+    bad = int(np.flatnonzero(np.isfinite(window.positions[:, 0]))[0])
+    taken = []
+
+    def collapsing(graph, values, *rest):
+        optimum = levenberg_marquardt(graph, values, *rest)
+        if not taken:
+            taken.append(True)
+            optimum.values.update(sliding_window.L0 + bad, read_poses(optimum.values)[5, :3, 3] + 1e-9)
+        return optimum
+
+    monkeypatch.setattr(sliding_window, "levenberg_marquardt", collapsing)
+    extended(drive, window, end + STEP)
+    window.solve()
+    assert np.isnan(window.positions[bad]).all()
+    rays = np.flatnonzero((drive.association.object != bad) & (drive.rays.keyframe > 0))
+    for last in [*range(end + 2 * STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
+        some = rays[(drive.rays.keyframe[rays] >= window.end) & (drive.rays.keyframe[rays] < last)]
+        born = np.setdiff1d(np.unique(drive.association.object[some]), np.flatnonzero(np.isfinite(window.positions[:, 0])))
+        window.positions[born] = drive.points[born]
+        window.extend(last, some, born, np.tile(np.eye(3), (len(born), 1, 1)))
+        window.solve()
+    measured = Measurements.of(drive.keyframes, drive.rays, drive.settings)
+    landmarks = np.unique(drive.association.object[rays])
+    graph = build_graph(measured.factors(drive.association.object, rays, landmarks, drive.points))
+    values = make_values(drive.keyframes.map_T_camera, drive.points, landmarks)
+    assert apart(window.map_T_camera, read_poses(levenberg_marquardt(graph, values, 100).values)) < 1e-3

@@ -3,7 +3,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 from objslam.io.camera_yaml import read_camera, write_camera
@@ -98,6 +98,29 @@ def test_distortion_models(tmp_path, model, coefficients, expected):
     lines[7], lines[8] = f"distortion_model: {model}", f"distortion_coefficients: {coefficients}"
     camera, _, _ = _read(tmp_path, "\n".join(lines))
     assert (camera.distortion_model, camera.distortion.tolist()) == expected
+
+
+def test_a_camera_tells_the_noise_of_its_depths(tmp_path):
+    camera, _, file = _read(tmp_path, _TEXT + "depth_noise: {sigma: 0.01, sigma_per_m: 5e-3, bias: 0}\n")
+    assert camera.depth_noise == RangeNoise(0.01, 0.005, 0.0)
+    write_camera(camera, file)
+    assert read_camera(file, Ledger()).depth_noise == camera.depth_noise
+    assert _read(tmp_path, _TEXT)[0].depth_noise is None
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ("0.01", "depth_noise must be a mapping"),
+        ("{sigma: 0.01, sigma_per_m: 0.005}", "depth_noise.bias is missing"),
+        ("{sigma: 0, sigma_per_m: 0.005, bias: 0.02}", "depth_noise.sigma must be above zero"),
+        ("{sigma: 0.01, sigma_per_m: -0.005, bias: 0.02}", "depth_noise.sigma_per_m must be at least zero"),
+        ("{sigma: .inf, sigma_per_m: 0.005, bias: 0.02}", "depth_noise.sigma must be a finite number"),
+    ],
+)
+def test_what_is_wrong_with_the_noise_of_depths_is_told(tmp_path, noise, message):
+    with pytest.raises(LogError, match=f"camera.yaml:15: {message}"):
+        _read(tmp_path, _TEXT + f"depth_noise: {noise}\n")
 
 
 def test_a_camera_that_sees_no_sizes_is_kept(tmp_path):

@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as npst
 from scipy.spatial.transform import Rotation
 
 from objslam.core.calibration import Calibration
+from objslam.core.camera import RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
 from objslam.core.validity import is_name
@@ -70,6 +71,7 @@ MESSAGES = st.one_of(
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations)),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
+    st.just(CameraMessage(replace(make_camera("depth"), depth_noise=RangeNoise(0.01, 0.005, 0.02)))),
     frames(),
 )
 

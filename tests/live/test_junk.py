@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as npst
 from waiting import LIMIT
 
 from objslam.config import load_settings
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.live.session.session import Session
 from objslam.sources.journal.file import messages
@@ -83,6 +83,7 @@ cameras = st.one_of(
         base_T_camera=or_junk(np.eye(4), np.eye(4).tolist()),
         depth_scale=or_junk(1000.0),
         sees_size=or_junk(True),
+        depth_noise=or_junk(None, RangeNoise(0.01, 0.005, 0.02), RangeNoise("1", 0.0, -1.0)),
     ),
 )
 stamps, poses, names = or_junk(1.0, 2.0, 3.0), or_junk(np.eye(4), np.eye(4).tolist()), or_junk("front", "rear")
@@ -161,6 +162,11 @@ def test_lists_are_as_good_as_arrays():
         ({"base_T_camera": [1, 2]}, "whose mount is not a rigid pose"),
         ({"depth_scale": "1000"}, "whose depth scale is not above zero"),
         ({"sees_size": 2}, "whose sees_size is neither true nor false"),
+        ({"depth_noise": 0.01}, "whose depth noise is none"),
+        (
+            {"depth_noise": RangeNoise(0.0, 0.01, 0.02)},
+            "whose depth noise is not a finite sigma above zero, and sigma_per_m and bias of at least zero",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_camera_is_told(change, reason):

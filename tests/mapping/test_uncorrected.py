@@ -68,7 +68,7 @@ def test_a_late_clock_shows_the_object_from_where_the_robot_was():
 
 def test_without_calibration_there_is_nothing_before():
     log = simulate(preset("demo", frames=300), 1)
-    result = pipeline.run(log, load_settings(None, ("output.picture=false", "output.recording=false")), Ledger())
+    result = pipeline.run(log, load_settings(None, ("output.picture=false", "calibration.use=false")), Ledger())
     assert result.residual_before is None
 
 

@@ -165,6 +165,20 @@ def test_ranges_that_scatter_more_than_they_claim_widen_the_covariance():
     assert covered(result.positions - truth, result.covariance) > 0.85
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_the_bias_that_all_ranges_of_an_object_share_is_in_its_covariance(told):
+    """A surface that is nearer than the centre does not average out over 30 images."""
+    count, bias = 400, 0.05
+    rng = np.random.default_rng(7)
+    m, n, index, truth = approaching(rng, count, 30, 0.004)
+    ranges = np.linalg.norm(truth - m, axis=1) + 0.03 * rng.normal(size=len(m)) + bias * rng.normal(size=count)[index]
+    result = triangulate(
+        m, n, index, count, 0.004, SETTINGS, ranges=ranges, range_sigma=0.03, range_bias=bias if told else 0.0
+    )
+    inside = covered(result.positions - truth, result.covariance)
+    assert 0.92 < inside < 0.98 if told else inside < 0.5
+
+
 def test_ranges_leave_a_position_that_the_rays_carry():
     rng = np.random.default_rng(9)
     m, n, index = passing(rng, 20, 20, 0.003)

@@ -44,8 +44,8 @@ class _Rows:
     """What the rows of a linear system are: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: m. parts: (3, s, 6, 6) covariances of the motions by
-    the noise along, across and in turning. rest: (s, 6, 6) covariances without this noise. motion_axes: (3, s, 6)
+    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m. parts: (3, s, 6, 6) covariances of the
+    motions by the noise along, across and in turning. rest: (s, 6, 6) covariances without this noise. motion_axes: (3, s, 6)
     these directions in the frame of the motion. motion_window: (s,), ray_window: (n,) which rows may err together.
     """
 
@@ -53,7 +53,7 @@ class _Rows:
     bearing_weight: Floats
     owner: Ints
     range_sigma: Floats
-    bias: float
+    bias: Floats
     parts: Floats
     rest: Floats
     motion_axes: Floats
@@ -106,7 +106,7 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
         bearing_weight=np.minimum(1.0, HUBER_K * rays.sigma / np.maximum(off, 1e-12)),
         owner=of.association.object[of.which][ranged],
         range_sigma=errors.rays.range_sigma[of.which][ranged],
-        bias=errors.settings.depth.bias,
+        bias=errors.rays.range_bias[of.which][ranged],
         parts=np.array(parts[:3]),
         rest=parts[3],
         motion_axes=np.moveaxis(to_camera[:, :, [3, 4, 2]], 2, 0),
@@ -222,11 +222,12 @@ def _range_noise(
     within = np.median(np.abs(off - middle[rows.owner]) / rows.range_sigma) / NORMAL_MEDIAN
     free = max(len(off) - int((number > 0).sum()), 0)
     ranges = np.sqrt((prior + free * within**2) / (prior + free))
-    if rows.bias == 0:
+    bias = np.nan_to_num(grouped_median(rows.bias, rows.owner, count))
+    has = (number > 1) & (bias > 0)
+    if not has.any():
         return ranges, 1.0
-    has = number > 1
     typical = np.sqrt(grouped_median(rows.range_sigma**2, rows.owner, count)[has]) * ranges
-    squares = max((middle[has] ** 2 - typical**2 / number[has]).sum(), 0.0) / rows.bias**2
+    squares = max(((middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2).sum(), 0.0)
     weight = min(prior, float(_PRIOR_OBJECTS))
     return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.noise import range_noise
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
 from objslam.frontend.corrected_log import refocused
@@ -103,7 +104,7 @@ def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     rays = offline_rays(m, rows, keyframe)
     direction = rays.direction
     for number, camera in enumerate(m.cameras):
-        mine = m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe[rows])] == number
+        mine = m.camera_of_rays(rows) == number
         direction = refocused(direction, mine, 1 / (1 + m.errors.get(f"{camera.name}.focal", 0.0)) - 1)
     return replace(rays, direction=direction, range=rays.range / longer, range_sigma=rays.range_sigma / longer)
 
@@ -112,7 +113,8 @@ def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe there."""
     names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
     columns = {name: getattr(m.rays, name)[rows] for name in names}
-    return Rays(keyframe=keyframe, **columns, track_id=m.rays.track[rows], label_names=tuple(m.labels))
+    _, bias = range_noise(columns["range"], m.camera_of_rays(rows), m.sent_cameras, m.given)
+    return Rays(keyframe=keyframe, **columns, range_bias=bias, track_id=m.rays.track[rows], label_names=tuple(m.labels))
 
 
 def recorded_log(m: MapState, name: str, keyframes: Keyframes) -> Log:

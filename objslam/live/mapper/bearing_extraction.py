@@ -6,6 +6,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
+from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, surest
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, refocused
@@ -75,7 +76,7 @@ class BearingExtractor:
             direction=refocused(direction, np.ones(len(direction), dtype=bool), focal),
             sigma=sigma,
             range=reach * longer,
-            range_sigma=(settings.depth.sigma + settings.depth.sigma_per_m * reach) * longer,
+            range_sigma=range_noise(reach, np.zeros(len(reach), dtype=np.int64), [camera], settings)[0] * longer,
             label=label[kept],
             score=frame.scores[kept],
             box=frame.boxes[kept],

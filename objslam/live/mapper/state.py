@@ -10,6 +10,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
+from objslam.core.noise import range_noise
 from objslam.core.types import Keyframes
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
@@ -152,12 +153,18 @@ class MapState:
         """Return the rows of landmarks by their ids, which must be in the table."""
         return np.searchsorted(self.landmarks.id, ids)
 
+    def camera_of_rays(self, at: Ints) -> Ints:
+        """Return the number of the camera of each ray in rows (n,)."""
+        k = self.keyframes
+        return np.asarray(k.camera[np.searchsorted(k.id, self.rays.keyframe[at])])
+
     def bearings(self, at: Ints) -> Bearings:
         """Return the rays in rows (n,) for the graph. Range noise includes a bias, which does not average out."""
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
-            sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * self.settings.depth.bias**2)
+            _, bias = range_noise(rays.range[at], self.camera_of_rays(at), self.sent_cameras, self.settings)
+            sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * bias**2)
         columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "direction", "sigma", "range")}
         return Bearings(**columns, landmark=rays.owner[at], range_sigma=sigma)
 

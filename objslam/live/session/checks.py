@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.camera import COEFFICIENTS, Camera
+from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 from objslam.core.types import MAX_BOXES
 from objslam.core.validity import (
     MAX_LIVE_STAMP,
@@ -105,8 +105,11 @@ def sound_camera(camera: object) -> Camera | str:
     sees_size: object = camera.sees_size
     if not isinstance(sees_size, bool | np.bool_):
         return "whose sees_size is neither true nor false"
+    noise: object = camera.depth_noise
+    if noise is not None and not isinstance(noise, RangeNoise):
+        return "whose depth noise is none"
     lens = matrix, camera.distortion_model, distortion
-    copied = Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size))
+    copied = Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size), noise)
     return camera_fault(copied) or copied
 
 

@@ -10,7 +10,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Ints
 from objslam.core.types import Log
 from objslam.errors import LogError
-from objslam.frontend.known_errors import estimates
+from objslam.frontend.known_errors import estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, check_stamps
 from objslam.mapping.checks.finding import Finding
@@ -127,8 +127,7 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErrors | None:
     """Return small errors that are worth a warning, and that a run in this mode does not estimate."""
-    localized = part.log.localization is not None
-    if part.drifts or settings.mode == "joint" or estimates(settings, part.log.odometry is not None, localized):
+    if part.drifts or settings.mode == "joint":
         return None
     noise = pose_noise(part, settings)
     start, best, log = found, 0.0, part.log
@@ -140,7 +139,12 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     errors = find_small_errors(log, start, settings, noise)
     if best:
         errors = with_clock(errors, best, part.log, found, settings)
-    if errors is None or not errors.harmful:
+    if errors is None:
+        return None
+    localized = part.log.localization is not None
+    estimated = estimates(settings, part.log.odometry is not None, localized)
+    errors = replace(errors, estimated=frozenset(possible(part.log, settings) if estimated else ()))
+    if not errors.harmful:
         return None
     after = agreement(part, errors.corrected(part.log), settings)
     return errors if after is not None and after.score > found.score + _GAIN else None

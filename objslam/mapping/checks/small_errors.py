@@ -50,18 +50,20 @@ CAUSES = {
 class SmallErrors:
     """Errors that explain the residuals. names, values (P,), sigma (P,): in the units of `core.calibration`.
 
-    errors: the measurements with these errors taken out. harmful: the names of those that are worth a warning.
+    errors: the measurements with these errors taken out. estimated: the names of those that the run itself estimates.
     """
 
     errors: SharedErrors
     names: tuple[str, ...]
     values: Floats
     sigma: Floats
+    estimated: frozenset[str] = frozenset()
 
     @property
     def harmful(self) -> tuple[str, ...]:
-        """The names of the errors that are worth a warning."""
-        return tuple(n for n, v in zip(self.names, self.values.tolist(), strict=True) if abs(v) > _HARMFUL[kind(n)])
+        """The names of the errors that are worth a warning: the large ones that the run does not estimate."""
+        named = zip(self.names, self.values.tolist(), strict=True)
+        return tuple(n for n, v in named if abs(v) > _HARMFUL[kind(n)] and n not in self.estimated)
 
     def corrected(self, log: Log) -> Log:
         """Return a log with the errors taken out."""

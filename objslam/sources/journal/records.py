@@ -4,14 +4,14 @@ import json
 import struct
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
-from objslam.core.camera import COEFFICIENTS, Camera
+from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 from objslam.core.validity import (
     box_rules,
     camera_fault,
@@ -140,7 +140,9 @@ def encode(message: Message) -> bytes:
     if isinstance(message, CameraMessage):
         c = message.camera
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
-        return _CAMERA_KIND + json.dumps([*data, c.base_T_camera.ravel().tolist(), c.depth_scale, c.sees_size]).encode()
+        noise = [] if c.depth_noise is None else [astuple(c.depth_noise)]
+        last = [c.base_T_camera.ravel().tolist(), c.depth_scale, c.sees_size, *noise]
+        return _CAMERA_KIND + json.dumps([*data, *last]).encode()
     known = np.where(np.isfinite(message.depths), message.depths, -1.0)
     numbers = [column.tolist() for column in (message.scores, known, message.track_ids)]
     row = [message.stamp, message.camera, message.boxes.tolist(), message.labels, *numbers, *[True] * message.whole]
@@ -192,9 +194,11 @@ def _read_camera(data: bytes) -> CameraMessage:
     if known is None:
         raise ValueError("an unknown lens model")
     inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
-    sees_size = bool(more[0]) if more else True  # Older journals do not store the flag.
+    # Older journals do not store whether boxes show sizes, and only sensors that tell it have a noise of their depths.
+    sees_size = bool(more[0]) if more else True
+    noise = RangeNoise(*_array(more[1], (3,)).tolist()) if len(more) > 1 else None
     size = _integer(width), _integer(height)
-    camera = Camera(_name(name), *size, inner, known, outer, _pose(base_T_camera), float(scale), sees_size)
+    camera = Camera(_name(name), *size, inner, known, outer, _pose(base_T_camera), float(scale), sees_size, noise)
     fault = camera_fault(camera)
     if fault is not None:
         raise ValueError(f"camera {fault}")
