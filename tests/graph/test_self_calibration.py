@@ -129,3 +129,24 @@ def test_a_calibration_of_before_is_where_the_next_solve_begins(tmp_path):
     assert (second.sigma < first.sigma).all()
     true = np.array([ERRORS.get(name, 0.0) for name in second.names])
     assert (np.abs(second.values - true) < 4 * second.sigma).all()
+
+
+def test_noise_of_odometry_does_not_pull_at_the_scale_of_turns():
+    """At the true errors, which are 0, the mean of the gradients of many drives is zero but for its own noise."""
+    drives = 12
+    pulls = np.zeros(drives)
+    for seed in range(drives):
+        made, errors = drive({}, seed=seed, depth=DepthNoise(), frames=240, false=0.0)
+        theta = np.zeros(len(errors.names))
+        true = made.map_T_base @ made.keyframes.base_T_camera
+        places, used = made.points, made.right()
+        measured = Measurements.of(*errors.at(theta))
+        graph = build_graph(measured.factors(made.association.object, np.flatnonzero(used), np.arange(len(places)), places))
+        values = levenberg_marquardt(graph, make_values(true, places, np.arange(len(places))), 20, 1e-8).values
+        places = with_points(places, np.arange(len(places)), values)
+        state = Linearised(graph, values, measured, made.association, read_poses(values), places, used)
+        system = linearise(state, errors, theta).reduce()
+        k = errors.names.index("odometry.turn_scale")
+        pulls[seed] = system.gradient[k] / np.sqrt(system.information[k, k])
+    assert_allclose(pulls.mean(), 0, atol=2.5 / np.sqrt(drives))
+    assert pulls.std() < 1.5
