@@ -1,4 +1,4 @@
-"""Short parts of MRCLAM logs, from bearings alone: the camera's clock is 0.2 s off, and few rays tell it."""
+"""Parts of MRCLAM logs: short ones, whose camera's clock is 0.2 s off, and halves, which must tell the same errors."""
 
 from dataclasses import replace
 
@@ -45,3 +45,14 @@ def test_a_short_part_from_bearings_has_one_object_for_each_label(data_dir, robo
     assert found["false"] == 0
     assert found["position_rmse"] < farthest
     assert found["inside_95"] >= 0.9
+
+
+def test_both_halves_of_a_log_tell_the_same_errors(data_dir):
+    log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=3, with_range=False))
+    middle = (log.odometry.stamps[-1] - log.odometry.stamps[0]) / 2
+    first, second = (mapped(part(log, *times)).calibration for times in ((0, middle), (middle, 2 * middle)))
+    assert first.names == second.names
+    apart = np.abs(first.values - second.values) / np.hypot(first.sigma, second.sigma)
+    assert (apart < 3).all(), dict(zip(first.names, apart, strict=True))
+    k = first.names.index("camera.clock")
+    assert max(first.sigma[k], second.sigma[k]) < 0.02
