@@ -23,7 +23,7 @@ from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
-from objslam.mapping.labels import labels_tell, may_be_by_label, noise_explains, warn_of_noise
+from objslam.mapping.labels import clock_explains, labels_tell, may_be_by_label, noise_explains, warn_of_noise
 from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
@@ -142,10 +142,15 @@ def _joint(
     measured = frames, all_rays
 
     def solve_once(
-        association: Association, errors: SharedErrors | None, start: Floats | None = None, trace: Trace | None = None
+        association: Association,
+        errors: SharedErrors | None,
+        start: Floats | None = None,
+        trace: Trace | None = None,
+        begin: Floats | None = None,
     ) -> Estimate:
+        at = theta if begin is None else begin
         return batch_solver.solve_joint(
-            keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, theta
+            keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, at
         )
 
     def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
@@ -160,14 +165,19 @@ def _joint(
         return solved
 
     if start is None and may_be_by_label(settings, all_rays):
-        by_label = associate_by_label(rays)
+        by_label, expected = associate_by_label(rays), errors
         solved = solve_round("labels", by_label)
-        if settings.association.method == "by_label" or labels_tell(by_label, solved.weight):
+        if settings.association.method == "by_label" or labels_tell(by_label, solved):
             return by_label, solved, []
         noisier = None if errors is None else noise_explains(by_label, solved, errors, partial(solve_once, by_label))
         if errors is not None and noisier is not None:
             warn_of_noise(errors, noisier, ledger)
             return by_label, solve_round("labels", by_label, noisier.map_T_base @ keyframes.base_T_camera), []
+        if expected is not None:
+            begin = clock_explains(by_label, expected, lambda at: solve_once(by_label, expected, begin=at))
+            if begin is not None:
+                errors, theta = expected, begin
+                return by_label, solve_round("labels", by_label), []
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None

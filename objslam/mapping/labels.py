@@ -6,6 +6,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.calibration import kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.noise import NOMINAL
@@ -20,6 +21,12 @@ _JUDGEMENTS = 2
 finds more of it. More judgements are slower."""
 _SAME_NOISE = 0.1
 """The relative change of the noise below which labels are not judged again. A larger change ends sooner."""
+
+_CLOCKS = (-1.0, 1.0, -2.0, 2.0)
+"""The clocks that are tried, in standard deviations of their prior. A solve finds a clock that is within one of them, so
+closer ones are slower and find the same. Farther ones find clocks that the prior excludes."""
+_SHORT = 500
+"""The largest number of keyframes of a log whose clocks are tried. A larger number is slower. Longer logs tell the clock."""
 
 _LARGER = 1.5
 """The factor on the noise of the settings above which a warning names it. A larger factor names less."""
@@ -36,12 +43,33 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     return np.unique(pairs, axis=1).shape[1] == pairs.shape[1]
 
 
-def labels_tell(association: Association, weight: Floats) -> bool:
-    """Return whether every label is one object: no label has many rejected rays (weight (R,) 0)."""
+def labels_tell(association: Association, estimate: Estimate) -> bool:
+    """Return whether every label is one object: no label has many rejected rays.
+
+    A label whose object has no position tells nothing. Its rays may have too little parallax. False if none has a position.
+    """
+    placed = np.isfinite(estimate.positions[:, 0])
     held = association.object >= 0
     number = np.bincount(association.object[held], minlength=association.count)
-    rejected = np.bincount(association.object[held & (weight == 0)], minlength=association.count)
-    return not ((rejected >= MANY) & (rejected > SECOND * number)).any()
+    rejected = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
+    return bool(placed.any()) and not (placed & (rejected >= MANY) & (rejected > SECOND * number)).any()
+
+
+def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
+    """Return the shared errors (P,) from which a solve of a short log ends where the labels tell, None if there are none.
+
+    With a wrong clock, the start of a solve rejects true rays, and a short log has too few others to find the clock from.
+    So solves begin with each clock of a coarse grid. solve: solves once, from shared errors.
+    """
+    clocks = np.array([kind(name) == "clock" for name in errors.names], dtype=bool)
+    if not clocks.any() or len(errors.keyframes) > _SHORT:
+        return None
+    for share in _CLOCKS:
+        theta = errors.mean + share * np.where(clocks, np.sqrt(np.diagonal(errors.prior)), 0.0)
+        theta = np.clip(theta, -errors.bounds, errors.bounds)
+        if labels_tell(association, solve(theta)):
+            return theta
+    return None
 
 
 def noise_explains(
@@ -58,7 +86,7 @@ def noise_explains(
     before = NOMINAL if estimate.noise is None else estimate.noise
     for _ in range(_JUDGEMENTS):
         estimate = solve(errors)
-        if labels_tell(association, estimate.weight):
+        if labels_tell(association, estimate):
             return estimate
         if estimate.noise is None or estimate.noise.like(before, _SAME_NOISE):
             return None

@@ -1,5 +1,7 @@
 """The joint solve with shared errors: against brute force, the errors that were put in, and what a log cannot tell."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drives import drive_of
@@ -11,7 +13,9 @@ from objslam.core.geometry import inverse
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
+from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.shared_error_jacobian import Linearised, linearise
+from objslam.graph.calibration.variance_components import TOGETHER
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.io.calibration_yaml import dump_calibration
@@ -129,3 +133,45 @@ def test_a_calibration_of_before_is_where_the_next_solve_begins(tmp_path):
     assert (second.sigma < first.sigma).all()
     true = np.array([ERRORS.get(name, 0.0) for name in second.names])
     assert (np.abs(second.values - true) < 4 * second.sigma).all()
+
+
+def test_noise_of_odometry_does_not_pull_at_the_scale_of_turns():
+    """At the true errors, which are 0, the mean of the gradients of many drives is zero but for its own noise."""
+    drives = 12
+    pulls = np.zeros(drives)
+    for seed in range(drives):
+        made, errors = drive({}, seed=seed, depth=DepthNoise(), frames=240, false=0.0)
+        theta = np.zeros(len(errors.names))
+        true = made.map_T_base @ made.keyframes.base_T_camera
+        places, used = made.points, made.right()
+        measured = Measurements.of(*errors.at(theta))
+        graph = build_graph(measured.factors(made.association.object, np.flatnonzero(used), np.arange(len(places)), places))
+        values = levenberg_marquardt(graph, make_values(true, places, np.arange(len(places))), 20, 1e-8).values
+        places = with_points(places, np.arange(len(places)), values)
+        state = Linearised(graph, values, measured, made.association, read_poses(values), places, used)
+        system = linearise(state, errors, theta).reduce()
+        k = errors.names.index("odometry.turn_scale")
+        pulls[seed] = system.gradient[k] / np.sqrt(system.information[k, k])
+    assert_allclose(pulls.mean(), 0, atol=2.5 / np.sqrt(drives))
+    assert pulls.std() < 1.5
+
+
+def test_errors_that_hang_together_make_the_gradient_less_certain():
+    """White residuals, and residuals that push a parameter the same way for three seconds each."""
+    made, errors = drive({}, frames=200, false=0.0)
+    theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
+    measured, landmarks = Measurements.of(*errors.at(theta)), np.arange(len(made.points))
+    true = made.map_T_base @ made.keyframes.base_T_camera
+    graph = build_graph(measured.factors(made.association.object, np.flatnonzero(every), landmarks, made.points))
+    values = make_values(true, made.points, landmarks)
+    state = Linearised(graph, values, measured, made.association, true, made.points, every)
+    system = linearise(state, errors, theta)
+    rng, rows = np.random.default_rng(0), np.repeat(made.keyframes.stamps[made.rays.keyframe], 2)
+    white = rng.standard_normal(len(system.residual))
+    k = errors.names.index("front.yaw")
+    assert correlation_factors(state, replace(system, residual=white))[k] < 1.4
+    window = np.floor((rows - made.keyframes.stamps[0]) / TOGETHER).astype(int)
+    pushes = system.sides[:, k] + system.jacobian @ system.reduce().sensitivity[:, k]  # what poses and places leave of it
+    together = white.copy()
+    together[: len(rows)] = rng.standard_normal(window.max() + 1)[window] * np.sign(pushes[: len(rows)])
+    assert correlation_factors(state, replace(system, residual=together))[k] > 1.5

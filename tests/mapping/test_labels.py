@@ -8,8 +8,10 @@ import pytest
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Log
+from objslam.core.estimate import Estimate
+from objslam.core.types import Association, Log
 from objslam.mapping import pipeline
+from objslam.mapping.labels import labels_tell
 from objslam.simulation import preset, simulate
 
 THIRD = (
@@ -84,3 +86,19 @@ def test_a_label_of_two_objects_is_two_objects():
     assert result.summary["rounds"] != []
     for position in true:
         assert min(np.linalg.norm(position - twin) for twin in twins) < 0.5
+
+
+def test_a_label_without_a_position_tells_nothing():
+    association = Association(np.repeat([0, 1], 10), np.arange(2))
+    agrees = np.repeat([1.0, 0.0], 10)
+    somewhere, nowhere = np.ones(3), np.full(3, np.nan)
+
+    def tells(*positions):
+        covariance, poses = np.tile(np.eye(3), (2, 1, 1)), np.eye(4)[None]
+        return labels_tell(
+            association, Estimate(poses, np.array(positions), covariance, np.ones(2), np.ones(2, bool), agrees, 0.0, 0.0, 1)
+        )
+
+    assert tells(somewhere, nowhere)
+    assert not tells(somewhere, somewhere)
+    assert not tells(nowhere, nowhere)

@@ -19,6 +19,7 @@ from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
+from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
 from objslam.graph.optimizers import build_graph, gauss_newton
@@ -106,8 +107,10 @@ def calibrate(
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
-    reduced = _without_shrinking(state, linearise(state, fit.errors, theta).reduce(), fit.errors, theta)
-    _, covariance = _curvature(reduced.information, noisy, np.asarray(np.linalg.inv(errors.prior), dtype=np.float64))
+    system = linearise(state, fit.errors, theta)
+    reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
+    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
+    _, covariance = _curvature(reduced.information, noisy, prior, correlation_factors(state, system))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     by_landmark = (len(state.landmarks), 3, len(theta))
     sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
@@ -210,12 +213,13 @@ class _Fit:
         )
 
 
-def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Floats, Floats]:
+def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
     noisy: (P, P) the noise in the information, as shares of its diagonal. The gradient varies as the whole information says,
     also by this noise, while the curvature is that of the signal alone. Hence the covariance is a sandwich (Huber 1967). In
-    no direction is it larger than that of the prior.
+    no direction is it larger than that of the prior. wider: (P,) factors on the deviations of the gradient, for noise that
+    is not white.
     SolveError if the information is not finite.
     """
     if not np.isfinite(information).all():
@@ -232,7 +236,8 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats) -> tuple[Float
         curvature = information + prior
     inverse = np.linalg.inv(curvature)
     root = np.linalg.cholesky(prior)
-    size, axes = np.linalg.eigh(root.T @ inverse @ (information + prior) @ inverse @ root)
+    varies = information * np.outer(wider, wider) + prior
+    size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
     axes = np.linalg.solve(root.T, axes)
     return curvature, np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
 

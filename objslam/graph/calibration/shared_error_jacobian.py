@@ -209,21 +209,27 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
 
     A motion's own noise is in its derivative by the scale and in its residual. Their product would pull the scale away: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is another
-    (instrumental variables; Fuller 1987, 1.4).
+    (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more of it.
+    Motions that were measured too short would weigh more. So the neighbours predict the covariance as well.
     """
     which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
         return sides
     keyframes = of.measured.keyframes
     steps = np.flatnonzero(keyframes.measured)
-    root = whitening(of.measured.odometry()[1][steps])
+    covariance = of.measured.odometry()[1][steps]
+    root = whitening(covariance)
     to_base = adjoint(keyframes.base_T_camera[1:][steps])
     seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
+    in_base = to_base @ covariance @ np.swapaxes(to_base, 1, 2)
+    near = from_neighbours(in_base.reshape(-1, 36), seconds).reshape(-1, 6, 6)
+    near = np.where((np.einsum("kii->k", near) > 0)[:, None, None], near, in_base)  # neighbours that take no time tell none
+    weight = np.swapaxes(to_base, 1, 2) @ np.linalg.inv(near) @ to_base
     instruments = sides.copy()
     for k in which:
         own = (to_base @ np.linalg.solve(root, sides[motions, k].reshape(-1, 6, 1)))[..., 0]
         told = np.linalg.solve(to_base, from_neighbours(own, seconds)[..., None])
-        instruments[motions, k] = (root @ told)[..., 0].ravel()
+        instruments[motions, k] = np.linalg.solve(np.swapaxes(root, 1, 2), weight @ told).ravel()
     return instruments
 
 

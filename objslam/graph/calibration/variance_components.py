@@ -26,7 +26,7 @@ _CONVERGED = 0.02
 """The relative change of all factors below which the iteration ends. A larger value ends it sooner."""
 _LIMITS = (0.05, 20.0)
 """The smallest and the largest factor. Noise beyond them is no noise of a sensor that the settings describe at all."""
-_TOGETHER = 3.0
+TOGETHER = 3.0
 """The time (s) for which errors may hang together: wheels lag behind a command, and a detector's box sits aside for a while.
 A longer time finds slower errors, from fewer independent sums."""
 _MOST_SHRINKAGE = 0.3
@@ -98,7 +98,7 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     origins, directions = rays.in_map(of.map_T_camera)
     to_landmark = of.positions[of.association.object[of.which]] - origins
     off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
-    second = np.floor(np.maximum.accumulate(keyframes.stamps) / _TOGETHER).astype(np.int64)
+    second = np.floor(np.maximum.accumulate(keyframes.stamps) / TOGETHER).astype(np.int64)
     pair = np.column_stack([of.association.object[of.which], second[rays.keyframe]])
     to_camera = adjoint(inverse(keyframes.base_T_camera[1:][steps]))
     return _Rows(

@@ -1,0 +1,44 @@
+"""Measure how far errors that hang together in time make the shared errors less certain than white noise would.
+
+The gradient by a parameter is a sum over measurements. Its variance is that of the sums over windows of time, which need not
+be white inside (cluster-robust covariance; Liang and Zeger 1986).
+"""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, factor
+from objslam.graph.calibration.variance_components import TOGETHER
+
+
+def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
+    """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
+
+    Each is the ratio of the deviation by sums over windows of `TOGETHER` seconds to that of white noise. system: of the
+    graph. SolveError if the linear system is singular.
+    """
+    jacobian = system.jacobian
+    factored = factor(jacobian)
+    told = np.column_stack([system.residual, system.instruments, system.sides])
+    left = told - jacobian @ factored.solve(jacobian.T @ told)
+    count = system.sides.shape[1]
+    parts, reduced = left[:, 1 : 1 + count] * left[:, :1], left[:, 1 + count :]
+    window = np.floor(_seconds(of, system) / TOGETHER).astype(np.int64)
+    sums = np.zeros((int(window.max(initial=0)) + 1, count))
+    np.add.at(sums, window, parts)
+    white = np.maximum((reduced**2).sum(axis=0), 1e-300)
+    return np.asarray(np.sqrt(np.maximum((sums**2).sum(axis=0) / white, 1.0)))
+
+
+def _seconds(of: Linearised, system: LinearSystem) -> Floats:
+    """Return the time (M,) of each row after the first keyframe, s. The priors of landmarks and poses have the time 0."""
+    keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
+    stamps = np.maximum.accumulate(keyframes.stamps) - keyframes.stamps[0]
+    seen, ranged = stamps[rays.keyframe], np.isfinite(rays.range)
+    seconds = np.zeros(len(system.residual))
+    seconds[: 2 * len(seen)] = np.repeat(seen, 2)
+    seconds[system.first_range : system.first_range + int(ranged.sum())] = seen[ranged]
+    if of.measured.motion is not None:
+        moved = np.repeat(stamps[1:][keyframes.measured], 6)
+        seconds[system.first_motion : system.first_motion + len(moved)] = moved
+    return seconds
