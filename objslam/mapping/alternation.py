@@ -136,22 +136,27 @@ def _joint(
     start: InitialEstimate | None,
     errors: SharedErrors | None,
 ) -> tuple[Association, Estimate, list[dict[str, int]]]:
-    from objslam.graph import batch_solver
+    from objslam.graph import batch_solver, ekf_exploration
     from objslam.graph.init_unknown_correspondences import initialize_unknown
 
     theta: Floats | None = None
     measured = frames, all_rays
 
     def solve_once(
-        association: Association, errors: SharedErrors | None, start: Floats | None = None, trace: Trace | None = None
+        association: Association,
+        errors: SharedErrors | None,
+        start: Floats | None = None,
+        trace: Trace | None = None,
+        hold: bool = False,
     ) -> Estimate:
+        solving = partial(progress, "solve")
         return batch_solver.solve_joint(
-            keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, theta
+            keyframes, rays, association, settings, ledger, solving, start, trace, errors, theta, hold
         )
 
-    def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
+    def solve_round(why: Why, association: Association, start: Floats | None = None, hold: bool = False) -> Estimate:
         nonlocal theta, errors, keyframes, rays
-        solved = solve_once(association, errors, start, trace)
+        solved = solve_once(association, errors, start, trace, hold)
         if errors is not None and solved.noise is not None:
             errors = errors.with_noise(solved.noise)
             theta = solved.calibration.values if solved.calibration is not None else errors.mean
@@ -172,14 +177,21 @@ def _joint(
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
+    estimate: Estimate | None = None
+    hold = False  # whether the shared errors are known well enough to move only in the last solve
     if start is None and not keyframes.localized_every:
-        start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
+        start = ekf_exploration.explore(keyframes, rays, cameras, settings, partial(progress, "explore"), errors)
+        if ekf_exploration.is_sure(start):
+            estimate = solve_round("association", start.association)
+            poses = estimate.map_T_base @ keyframes.base_T_camera
+            start, hold = replace(start, map_T_camera=poses, positions=estimate.positions), True
+        else:
+            start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
-    estimate: Estimate | None = None
     for number in range(settings.joint.max_rounds):
         progress(f"association, round {number + 1}", 0, 0)
         if errors is not None and theta is not None:
@@ -195,18 +207,20 @@ def _joint(
         if changed == 0:
             break
         association = found
-        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
+        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera, hold)
         for _ in range(settings.joint.max_rounds):
             merged = merge_unseen_together(rays, association, estimate, settings.association.duplicate_distance)
             if merged.count == association.count:
                 break
             rounds.append({"objects": merged.count, "rays_changed": rays_moved(association.object, merged.object)})
             association = merged
-            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera)
+            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera, hold)
         map_T_base, guess = estimate.map_T_base, (association, estimate.positions)
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
+    if hold:
+        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
     assert estimate is not None
     return association, estimate, rounds
 
