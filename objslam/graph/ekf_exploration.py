@@ -2,41 +2,33 @@
 
 The filter keeps how all errors are correlated, also with the errors that all motions share, such as a clock that lags. So it
 knows at each frame where each landmark may appear. The rays of a frame are assigned together, because one error of the pose
-shifts all of them. A ray that fits no landmark gives a new one: at once if it has a range, else when several rays meet.
+shifts all of them. A ray with a range that fits no landmark gives a new one.
 After a long way, new landmarks may be old ones. They are tied together if the errors of the way explain them all at once,
 much better than chance. A frame takes the same time at the start and at the end of a log.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from objslam.association import ekf
-from objslam.association.global_association import associate_globally
 from objslam.association.joint_assignment import Pairings, assign_jointly
 from objslam.association.place_recognition import MIN_LANDMARKS, label_densities
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
-from objslam.core.camera import Camera
 from objslam.core.geometry import inverse
 from objslam.core.statistics import SAME_POINT_WIDE
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.init_unknown_correspondences import HORIZON, InitialEstimate
 from objslam.graph.loop_closure import seen_together
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
-from objslam.graph.robust_cost import FLOOR, ray_information
 
 _STRETCH = 150
-"""The number of latest frames that are searched for new landmarks. A larger number is slower and includes more drift."""
+"""The number of frames after which a landmark with too few rays is dropped. A larger number keeps false ones longer."""
 _RECENT = 300
 """The number of frames after its birth during which a landmark may turn out to be an old one. A larger number is slower."""
-_MORE_RAYS = 2
-"""The number of agreeing rays beyond association.min_rays that a landmark without ranges needs. With more rays, landmarks
-enter later. With fewer, wrong landmarks enter, and each of them disturbs later poses."""
 _SURE = 4.0
 """The least log odds of a match over the best explanation without it. Larger odds leave more rays to the solve."""
 _NEW = 0.2
@@ -51,7 +43,7 @@ _TIED = 0.02
 _EXPLAINED = 0.8
 """The least share of rays with a sure landmark in an exploration that can be trusted. With ranges, it is 0.86 to 1 in
 simulated rooms and among the posts of Lost in the Woods, and 0.4 to 0.65 on the MRCLAM robots, whose landmarks stand 0.18 m
-apart. From bearings alone it is 0.5 to 0.9. A larger share trusts fewer explorations."""
+apart. A larger share trusts fewer explorations."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
 """The share by which one correction changes the factors on the motion's variances, the largest factor, and the largest
 ratio of a correction to its expected square that counts. Larger values follow rough odometry sooner, and outliers, too."""
@@ -60,7 +52,6 @@ ratio of a correction to its expected square that counts. Larger values follow r
 def explore(
     keyframes: Keyframes,
     rays: Rays,
-    cameras: tuple[Camera, ...],
     settings: Settings,
     progress: Callable[[int, int], None],
     errors: CalibratedMeasurements | None = None,
@@ -72,7 +63,7 @@ def explore(
     """
     if errors is not None:
         keyframes, rays, settings = errors.at(errors.mean)
-    return _Exploration(keyframes, rays, cameras, settings, errors).run(progress)
+    return _Exploration(keyframes, rays, settings, errors).run(progress)
 
 
 def is_sure(start: InitialEstimate) -> bool:
@@ -92,13 +83,12 @@ class _Exploration:
         self,
         keyframes: Keyframes,
         rays: Rays,
-        cameras: tuple[Camera, ...],
         settings: Settings,
         errors: CalibratedMeasurements | None,
     ) -> None:
         assert keyframes.odom_T_base is not None
         assert keyframes.drift is not None
-        self.keyframes, self.rays, self.cameras, self.settings = keyframes, rays, cameras, settings
+        self.keyframes, self.rays, self.settings = keyframes, rays, settings
         self.frames = Multiframes.of(keyframes)
         self.frame = self.frames.number[rays.keyframe]
         first, base = self.frames.first, keyframes.odom_T_base
@@ -127,7 +117,6 @@ class _Exploration:
             self._see(np.arange(begin[k], begin[k + 1]), k)
             self.path[k] = self.filter.map_T_base
             if (k + 1) % self.settings.joint.explore_step == 0 or k + 1 == len(self.path):
-                self._discover(k)
                 self._forget(k)
                 self._close(k)
                 progress(int(self.frames.first[k]) + 1, len(self.keyframes))
@@ -176,41 +165,8 @@ class _Exploration:
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first frame from which on the drift is small."""
+        """Return the first frame since which the drift is small."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
-
-    def _discover(self, now: int) -> None:
-        """Add landmarks where free rays without ranges meet."""
-        begin, rays, settings = self._stretch(now), self.rays, self.settings
-        within = (self.frame >= begin) & (self.frame <= now)
-        free = np.flatnonzero((self.owner < 0) & ~self.doubtful & ~np.isfinite(rays.range) & within)
-        fewest = settings.association.min_rays + _MORE_RAYS
-        if len(free) < fewest:
-            return
-        seen = np.arange(int(self.frames.first[begin]), int(np.searchsorted(self.frames.number, now, side="right")))
-        some = rays.take(free)
-        some = replace(some, keyframe=some.keyframe - seen[0])
-        map_T_camera = self.path[self.frames.number[seen]] @ self.base_T_camera[seen]
-        frames = self.keyframes.take(seen)
-        found = associate_globally(some, frames, self.cameras, settings, map_T_camera=map_T_camera, sigma=some.sigma)
-        if found.count == 0:
-            return
-        placed, ready = triangulate_landmarks(map_T_camera, some, found, fewest, settings)
-        born = np.flatnonzero(ready)
-        if len(born) == 0:
-            return
-        held = np.flatnonzero((placed.weight > 0) & np.append(ready, False)[found.object])
-        number = np.searchsorted(born, found.object[held])
-        origins, n = some.take(held).in_map(map_T_camera)
-        position = placed.positions[born]
-        across = np.linalg.norm(position[number] - origins, axis=1) * some.sigma[held]
-        information = ray_information(n, across**-2, np.zeros(len(held)), number, len(born))
-        covariance = np.linalg.inv(information + 1e-6 * np.eye(3)) + FLOOR**2 * np.eye(3)
-        self.owner[free[held]] = len(self.label) + number
-        first = np.full(len(born), now)
-        np.minimum.at(first, number, self.frame[free[held]])
-        self._add(position, covariance, found.label[born], first, now)
-        self.hits[-len(born) :] = np.bincount(number, minlength=len(born))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
         ekf.add(self.filter, position, covariance)

@@ -149,10 +149,8 @@ def _joint(
         trace: Trace | None = None,
         hold: bool = False,
     ) -> Estimate:
-        solving = partial(progress, "solve")
-        return batch_solver.solve_joint(
-            keyframes, rays, association, settings, ledger, solving, start, trace, errors, theta, hold
-        )
+        given = keyframes, rays, association, settings, ledger, partial(progress, "solve")
+        return batch_solver.solve_joint(*given, start, trace, errors, theta, hold)
 
     def solve_round(why: Why, association: Association, start: Floats | None = None, hold: bool = False) -> Estimate:
         nonlocal theta, errors, keyframes, rays
@@ -180,13 +178,15 @@ def _joint(
     estimate: Estimate | None = None
     hold = False  # whether the shared errors are known well enough to move only in the last solve
     if start is None and not keyframes.localized_every:
-        start = ekf_exploration.explore(keyframes, rays, cameras, settings, partial(progress, "explore"), errors)
-        if ekf_exploration.is_sure(start):
+        exploring = partial(progress, "explore")
+        if np.isfinite(rays.range).any():
+            start = ekf_exploration.explore(keyframes, rays, settings, exploring, errors)
+        if start is not None and ekf_exploration.is_sure(start):
             estimate = solve_round("association", start.association)
             poses = estimate.map_T_base @ keyframes.base_T_camera
             start, hold = replace(start, map_T_camera=poses, positions=estimate.positions), True
         else:
-            start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
+            start = initialize_unknown(keyframes, rays, cameras, settings, exploring)
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)

@@ -18,7 +18,7 @@ SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=3"))
 
 
 def drive(seed, frames=600, shift=0.0, **boxes):
-    """Log, keyframes, rays without names, their objects, errors. 20 objects, at 5 Hz, from odometry that drifts."""
+    """Keyframes, rays without names, their objects, errors. 20 objects, at 5 Hz, from odometry that drifts."""
     room = {"room": (12.0, 9.0), "objects": 20, "classes": 20, "min_view_share": 0.01}
     noise = {"pixel_sigma": 3.0, "false": 0.0, "localization": None, "odometry": Odometry(), "depth": {}} | boxes
     log = simulate(preset("demo", frames=frames, frame_rate=5.0, **room, **noise), seed)
@@ -32,13 +32,12 @@ def drive(seed, frames=600, shift=0.0, **boxes):
     keyframes, rays = seen_something(frames_of, build_rays(log, frames_of, SETTINGS, Ledger()))
     truth = rays.label
     rays = replace(rays, label=np.zeros_like(truth), label_names=("thing",))
-    return log, keyframes, rays, truth, shared_errors(log, keyframes, rays, SETTINGS)
+    return keyframes, rays, truth, shared_errors(log, keyframes, rays, SETTINGS)
 
 
 def explored(seed, **changes):
-    log, keyframes, rays, truth, errors = drive(seed, **changes)
-    cameras = tuple(c.camera for c in log.cameras)
-    return explore(keyframes, rays, cameras, SETTINGS, lambda done, total: None, errors), truth
+    keyframes, rays, truth, errors = drive(seed, **changes)
+    return explore(keyframes, rays, SETTINGS, lambda done, total: None, errors), truth
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
