@@ -98,6 +98,7 @@ def solve_joint(
     trace: Trace | None = None,
     errors: CalibratedMeasurements | None = None,
     theta: Floats | None = None,
+    hold: bool = False,
 ) -> Estimate:
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
@@ -108,6 +109,7 @@ def solve_joint(
     not finite.
     start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors,
     which are then estimated from theta (P,) on, or from their mean. Their covariance enters the covariance of the objects.
+    hold: whether the shared errors and the noise stay as they are.
     """
 
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
@@ -146,7 +148,9 @@ def solve_joint(
             if trace is not None and attempt is not None:
                 trace.take(attempt)
     calibrated, calibration = None, None
-    if errors is not None and theta is not None:
+    if errors is not None and theta is not None and hold:
+        calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+    elif errors is not None and theta is not None:
         from objslam.graph.calibration.self_calibration import calibrate  # scipy.sparse, which no other solve needs
 
         try:

@@ -27,7 +27,7 @@ from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
 from objslam.graph.variables import make_values, read_points, read_poses
 
-_HORIZON = 0.1
+HORIZON = 0.1
 """A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
 landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
 _STRETCH = 150
@@ -84,7 +84,7 @@ def initialize_unknown(
             rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end
         )
         fresh = new[owner[new] >= 0]
-        stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - _HORIZON**2)))
+        stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - HORIZON**2)))
         born = _discover(rays, owner, known, keyframes, map_T_camera, stretch, end, cameras, settings)
         fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known) - len(born))]) if len(born) else fresh
         known.last[owner[fresh]] = np.maximum(known.last[owner[fresh]], rays.keyframe[fresh])
@@ -146,8 +146,8 @@ def _close(
 
 
 def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Return for each landmark (N,) whether the heading drifted by less than `_HORIZON` since its last observation."""
-    return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < _HORIZON
+    """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since its last observation."""
+    return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < HORIZON
 
 
 def _recognise(

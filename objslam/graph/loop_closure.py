@@ -74,7 +74,7 @@ def find_closure(
     The search has two cases. After a long drift, landmarks with recent observations (`active`, (N,)) match the others. After
     a slip or a push, the landmarks that were found since then match all others.
     """
-    together = _seen_together(rays, owner, len(landmarks))
+    together = seen_together(rays.keyframe, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
     pivot = map_T_camera[now, :2, 3]
     born = active & (landmarks.first >= now - _EPOCH)
@@ -103,13 +103,13 @@ def find_closure(
     return best
 
 
-def _seen_together(rays: Rays, owner: Ints, count: int) -> Bools:
-    """Return for each pair of landmarks (N, N) whether some keyframe observed both."""
+def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
+    """Return for each pair of landmarks (N, N) whether some frame shows both. frame: (R,) the frame of each ray."""
     from scipy.sparse import csr_array
 
     held = np.flatnonzero(owner >= 0)
-    frames = int(rays.keyframe.max(initial=0)) + 1
-    table = csr_array((np.ones(len(held)), (owner[held], rays.keyframe[held])), shape=(count, frames))
+    frames = int(frame.max(initial=0)) + 1
+    table = csr_array((np.ones(len(held)), (owner[held], frame[held])), shape=(count, frames))
     return np.asarray((table @ table.T).toarray() > 0)
 
 

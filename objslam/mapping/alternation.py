@@ -147,15 +147,15 @@ def _joint(
         start: Floats | None = None,
         trace: Trace | None = None,
         begin: Floats | None = None,
+        hold: bool = False,
     ) -> Estimate:
         at = theta if begin is None else begin
-        return batch_solver.solve_joint(
-            keyframes, rays, association, settings, ledger, partial(progress, "solve"), start, trace, errors, at
-        )
+        given = keyframes, rays, association, settings, ledger, partial(progress, "solve")
+        return batch_solver.solve_joint(*given, start, trace, errors, at, hold)
 
-    def solve_round(why: Why, association: Association, start: Floats | None = None) -> Estimate:
+    def solve_round(why: Why, association: Association, start: Floats | None = None, hold: bool = False) -> Estimate:
         nonlocal theta, errors, keyframes, rays
-        solved = solve_once(association, errors, start, trace)
+        solved = solve_once(association, errors, start, trace, hold=hold)
         if errors is not None and solved.noise is not None:
             errors = errors.with_noise(solved.noise)
             theta = solved.calibration.values if solved.calibration is not None else errors.mean
@@ -181,16 +181,26 @@ def _joint(
 
     map_T_camera = keyframes.map_T_camera
     guess: tuple[Association, Floats] | None = None
+    estimate: Estimate | None = None
+    hold = False  # whether the shared errors are known well enough to move only in the last solve
     if start is None and not keyframes.localized_every:
+        from objslam.graph import ekf_exploration
         from objslam.graph.init_unknown_correspondences import initialize_unknown
 
-        start = initialize_unknown(keyframes, rays, cameras, settings, partial(progress, "explore"))
+        exploring = partial(progress, "explore")
+        if np.isfinite(rays.range).any():
+            start = ekf_exploration.explore(keyframes, rays, settings, exploring, errors)
+        if start is not None and ekf_exploration.is_sure(start):
+            estimate = solve_round("association", start.association)
+            poses = estimate.map_T_base @ keyframes.base_T_camera
+            start, hold = replace(start, map_T_camera=poses, positions=estimate.positions), True
+        else:
+            start = initialize_unknown(keyframes, rays, cameras, settings, exploring)
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
     rounds: list[dict[str, int]] = []
     association: Association | None = None
-    estimate: Estimate | None = None
     for number in range(settings.joint.max_rounds):
         progress(f"association, round {number + 1}", 0, 0)
         if errors is not None and theta is not None:
@@ -206,18 +216,20 @@ def _joint(
         if changed == 0:
             break
         association = found
-        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
+        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera, hold)
         for _ in range(settings.joint.max_rounds):
             merged = merge_unseen_together(rays, association, estimate, settings.association.duplicate_distance)
             if merged.count == association.count:
                 break
             rounds.append({"objects": merged.count, "rays_changed": rays_moved(association.object, merged.object)})
             association = merged
-            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera)
+            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera, hold)
         map_T_base, guess = estimate.map_T_base, (association, estimate.positions)
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
+    if hold:
+        estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
     assert estimate is not None
     return association, estimate, rounds
 

@@ -1,0 +1,118 @@
+"""Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
+
+One error of the pose shifts all measurements of a frame. So each pairing that is accepted tells where the others must be. A
+hypothesis grows from its first pairing, best pairing first. Its odds compare it with "all measurements are of new things".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+
+_SEEDS = 6
+"""The number of first pairings from which a hypothesis grows. A larger number is slower, and finds rarer hypotheses."""
+
+
+@dataclass(frozen=True)
+class Pairings:
+    """P possible pairings of a measurement and a landmark, each with D residuals.
+
+    row, column: (P,) the measurement and the landmark. residual: (P, D). covariance: (P, D, P, D) of all residuals, with the
+    correlations between pairings. rarity: (P,) minus the log density of residuals of something new. gate: the largest
+    squared deviation of a pairing.
+    """
+
+    row: Ints
+    column: Ints
+    residual: Floats
+    covariance: Floats
+    rarity: Floats
+    gate: float
+
+
+@dataclass(frozen=True)
+class JointAssignment:
+    """The best hypothesis. chosen: (n,) its pairings. margin: (n,) by how much the log odds of the best hypothesis exceed
+    those of the best one without each pairing. rival: (n,) whether the latter pairs the measurement with another landmark.
+    odds: the log odds of the whole over "everything is new"."""
+
+    chosen: Ints
+    margin: Floats
+    rival: Bools
+    odds: float
+
+
+def assign_jointly(pairings: Pairings) -> JointAssignment:
+    """Return the hypothesis with the highest odds. A row and a column are in at most one of its pairings."""
+    none = JointAssignment(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool), 0.0)
+    if len(pairings.row) == 0:
+        return none
+    odds = _odds(pairings, pairings.residual, _blocks(pairings.covariance))
+    allowed = np.isfinite(odds)
+    chosen, best = _best(pairings, odds, allowed)
+    if len(chosen) == 0:
+        return none
+    margin, rival = np.zeros(len(chosen)), np.zeros(len(chosen), dtype=bool)
+    for i, pairing in enumerate(chosen.tolist()):
+        without = allowed.copy()
+        without[pairing] = False
+        others, second = _best(pairings, odds, without)
+        margin[i], rival[i] = best - second, pairings.row[pairing] in pairings.row[others]
+    return JointAssignment(chosen, margin, rival, best)
+
+
+def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float]:
+    """Return the best hypothesis (n,) of allowed pairings and its log odds, which are 0 if no pairing is likely."""
+    best, most = np.zeros(0, dtype=np.int64), 0.0
+    seeds = np.flatnonzero(allowed)
+    seeds = seeds[np.argsort(-odds[seeds], kind="stable")][:_SEEDS]
+    tried = np.zeros(len(odds), dtype=bool)
+    for seed in seeds.tolist():
+        if tried[seed]:
+            continue
+        chosen, total = _grow(pairings, odds, allowed, seed)
+        tried[chosen] = True  # a hypothesis with this pairing is there already
+        if total > most:
+            best, most = chosen, total
+    return best, most
+
+
+def _grow(pairings: Pairings, odds: Floats, allowed: Bools, seed: int) -> tuple[Ints, float]:
+    """Return the hypothesis (n,) that grows from a pairing, and its log odds."""
+    size, dimension = pairings.residual.shape
+    residual, covariance = pairings.residual.copy(), pairings.covariance.reshape(size * dimension, -1).copy()
+    left, total, chosen, current = allowed.copy(), 0.0, list[int](), odds
+    pairing = seed
+    while True:
+        chosen.append(pairing)
+        total += float(current[pairing])
+        left &= (pairings.row != pairings.row[pairing]) & (pairings.column != pairings.column[pairing])
+        if not left.any():
+            break
+        own = slice(pairing * dimension, (pairing + 1) * dimension)
+        gain = np.linalg.solve(covariance[own, own], covariance[own]).T
+        residual = residual - (gain @ residual[pairing]).reshape(size, dimension)
+        covariance = covariance - gain @ covariance[own]
+        which = np.flatnonzero(left)
+        current = np.full(size, -np.inf)
+        blocks = _blocks(covariance.reshape(size, dimension, size, dimension))
+        current[which] = _odds(pairings, residual, blocks, which)
+        pairing = int(np.argmax(current))
+        if not current[pairing] > 0:
+            break
+    return np.array(chosen, dtype=np.int64), total
+
+
+def _blocks(covariance: Floats) -> Floats:
+    """Return the covariance (P, D, D) of each pairing alone."""
+    each = np.arange(len(covariance))
+    return covariance[each, :, each]
+
+
+def _odds(pairings: Pairings, residual: Floats, blocks: Floats, which: Ints | slice = slice(None)) -> Floats:
+    """Return the log odds (p,) of pairings over new things; -inf for one outside the gate."""
+    r, s = residual[which], blocks[which]
+    squared = np.einsum("pi,pi->p", r, np.linalg.solve(s, r[..., None])[..., 0])
+    spread = np.linalg.slogdet(2 * np.pi * s)[1]
+    return np.where(squared <= pairings.gate, pairings.rarity[which] - 0.5 * (squared + spread), -np.inf)
