@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from small_log import THINGS, small_log
+from waiting import LIMIT
 
 import objslam
 from objslam.core.diagnostics import Ledger
@@ -23,7 +24,7 @@ from objslam.errors import ConfigError, LogError, ObjslamError, OutputError
 from objslam.mapping import pipeline
 from objslam.sources.log_folder import write_log_folder
 
-QUICK = {"output": {"recording": False, "picture": False}}
+QUICK = {"output": {"recording": False, "picture": False}, "calibration": {"use": False}}
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
 
 def test_a_run_of_arrays_is_the_run_of_the_command(log: Log, result: objslam.Result) -> None:
     assert errors_of(result) < 0.03
-    known = pipeline.run(log, objslam.Settings(), Ledger())
+    known = pipeline.run(log, objslam.Settings(calibration={"use": False}), Ledger())
     np.testing.assert_array_equal(result.objects.positions, [o.position for o in known.map.objects])
     np.testing.assert_array_equal(result.objects.covariances, [o.covariance for o in known.map.objects])
 
@@ -204,7 +205,7 @@ def test_a_session_maps_what_is_pushed(log: Log) -> None:
             names = [boxes.label_names[i] for i in boxes.label[mine]]
             assert session.push_detections(stamp, "left", boxes.boxes[mine], names, boxes.scores[mine])
         assert not session.push_localization(path.stamps[-1] + 1, ["x"])
-        assert session.wait(60)
+        assert session.wait(LIMIT)
         now = session.snapshot()
         assert isinstance(now.map, objslam.ObjectMap)
         assert now.dropped["localization without a rigid pose or a stamp"] == 1

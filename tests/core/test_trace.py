@@ -34,8 +34,14 @@ def check_solves(result: RunResult) -> None:
 
 
 def test_fixed_poses_are_one_round() -> None:
-    result = run()
+    result = run("calibration.use=false")
     assert [r.why for r in result.trace] == ["fixed"]
+    check_solves(result)
+
+
+def test_each_calibration_at_fixed_poses_is_a_round() -> None:
+    result = run()
+    assert [r.why for r in result.trace] == ["fixed"] * (len(result.summary["rounds"]) + 1)
     check_solves(result)
 
 

@@ -204,7 +204,7 @@ def test_a_journal_with_messages_is_never_overwritten(tmp_path):
 def test_what_is_no_journal(tmp_path):
     (tmp_path / "j").write_bytes(b"something else")
     assert not is_journal(tmp_path / "j")
-    with pytest.raises(OutputError, match="no journal"):
+    with pytest.raises(OutputError, match="not a journal"):
         Journal(tmp_path / "j", resume=True)
     assert (tmp_path / "j").read_bytes() == b"something else"
     with pytest.raises(LogError):
