@@ -111,7 +111,7 @@ def test_settings_are_frozen():
 WRONG_FILES = {
     "joint: {los: l1}": "there is no setting joint.los",
     "speed: 3": "there is no setting speed",
-    "mode: both": "mode: input should be 'fixed' or 'joint', got 'both'",
+    "mode: both": "mode: input should be 'auto', 'fixed' or 'joint', got 'both'",
     "poses: {max_gap: -1}": "poses.max_gap: input should be greater than 0, got -1",
     "poses: {max_gap: .inf}": "poses.max_gap: input should be a finite number",
     "rays: {border: .nan}": "rays.border: input should be a finite number",

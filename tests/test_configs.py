@@ -104,7 +104,7 @@ def test_each_maps_the_simulated_drive(name: str, drive: Log, drive_among_tags: 
     assert len(found.matches) == 12
     assert not found.false
     assert found.errors.max() < 0.05
-    assert result.summary["mode"] == settings(name).mode
+    assert settings(name).mode in (result.summary["mode"], "auto")
 
 
 def test_paper_finds_the_least_sum_of_distances(drive: Log) -> None:

@@ -33,13 +33,15 @@ def doctor(
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
-    from objslam.mapping.pipeline import chosen_poses
+    from objslam.mapping.pipeline import chosen_poses, with_mode_of
 
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
     with progress_bar() as show:
         given = read(log, ledger, options)
-        said = take_out_expected(chosen_poses(given, settings), settings)
+        chosen = chosen_poses(given, settings)
+        settings = with_mode_of(chosen, settings)
+        said = take_out_expected(chosen, settings)
         found = diagnose(said, settings, show, thorough=True)
         solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None
     report(ledger)

@@ -37,12 +37,13 @@ Config = Annotated[
 ]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one setting. May be repeated.")]
 Mode = Annotated[
-    Literal["fixed", "joint"] | None,
+    Literal["auto", "fixed", "joint"] | None,
     typer.Option(
         "--mode",
-        parser=one_of("fixed", "joint"),
-        metavar="[fixed|joint]",
-        help="fixed (the default): keep the poses. joint: estimate poses and objects together.",
+        parser=one_of("auto", "fixed", "joint"),
+        metavar="[auto|fixed|joint]",
+        help="fixed: keep the poses. joint: estimate poses and objects together. auto (the default): fixed for a log with a "
+        "localisation, else joint.",
     ),
 ]
 Align = Annotated[

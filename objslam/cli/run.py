@@ -106,7 +106,7 @@ def run_log(
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
-    (tell or say_result)(result, f", {settings.mode} mode; {times}", out, removed)
+    (tell or say_result)(result, f", {result.settings.mode} mode; {times}", out, removed)
 
 
 def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:

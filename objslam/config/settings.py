@@ -23,7 +23,9 @@ _SHOWN = 200  # The most letters of a wrong value in a message. A larger number 
 class Settings(Section):
     """Hold all settings of a run."""
 
-    mode: Literal["fixed", "joint"] = "fixed"
+    mode: Literal["auto", "fixed", "joint"] = "auto"
+    """fixed: the objects are solved at the given poses. joint: poses and objects are solved together. auto: fixed for a log
+    with a localisation, else joint. Plain odometry drifts, and the covariances of fixed objects leave its drift out."""
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
     poses: mapping.Poses = mapping.Poses()

@@ -41,6 +41,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
     or does not fit the log.
     """
     log = chosen_poses(log, settings)
+    settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
@@ -145,6 +146,13 @@ def chosen_poses(log: Log, settings: Settings) -> Log:
     if (log.odometry if use == "odometry" else log.localization) is None:
         raise LogError(f"the log has no {use}", where=log.name, hint="set poses.use to auto")
     return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
+
+
+def with_mode_of(log: Log, settings: Settings) -> Settings:
+    """Return the settings with the mode that `auto` means for a log with the chosen poses."""
+    if settings.mode != "auto":
+        return settings
+    return settings.model_copy(update={"mode": "joint" if log.localization is None else "fixed"})
 
 
 @contextmanager
