@@ -45,6 +45,14 @@ def as_stamps(values: ArrayLike) -> Floats:
     return stamps
 
 
+def as_boxes(values: ArrayLike, where: str) -> Floats:
+    """Return the boxes (B, 4) of one frame, px. An empty list gives (0, 4). ValueError with `where` for another shape."""
+    given = np.asarray(values, dtype=np.float64)
+    if given.size and given.shape[1:] != (4,):
+        raise ValueError(f"{where}: boxes are (B, 4) x1, y1, x2, y2, got the shape {given.shape}")
+    return given.reshape(-1, 4)
+
+
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
     """Return one number for each box (M,) from one list for each frame. Without `values`, all are `unknown`."""
     if values is None:

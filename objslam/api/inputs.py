@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from objslam.api.array_input import as_poses, as_stamps, per_box
+from objslam.api.array_input import as_boxes, as_poses, as_stamps, per_box
 from objslam.core import types
 from objslam.core.camera import Camera
 from objslam.core.geometry import quaternion
@@ -73,7 +73,7 @@ class Detections(types.Detections):
         track_ids: for each frame B integers, -1 where unknown. whole: whether the image's edge cuts no box off.
         ValueError names what is wrong.
         """
-        frames = [np.asarray(one, dtype=np.float64).reshape(-1, 4) for one in boxes]
+        frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
         counts = [len(one) for one in frames]
         times = as_stamps(stamps)
         if len(frames) != len(times):
