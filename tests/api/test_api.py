@@ -127,6 +127,22 @@ def test_wrong_poses_are_named(poses: Any, message: str) -> None:
         objslam.Trajectory.from_arrays([0.0, 1.0], poses)
 
 
+def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:
+    camera, boxes = log.cameras[0].camera, log.cameras[0].detections
+    assert boxes is not None
+    lists: Any = {name: getattr(camera, name).tolist() for name in ("matrix", "distortion", "base_T_camera")}
+    made = objslam.Log.from_arrays(replace(camera, **lists), boxes, odometry=log.odometry).cameras[0].camera
+    for name in lists:
+        np.testing.assert_array_equal(getattr(made, name), getattr(camera, name))
+    with pytest.raises(ValueError, match=r"matrix is \(3, 3\), got the shape \(4, 4\)"):
+        objslam.Log.from_arrays(replace(camera, matrix=np.eye(4)), boxes, odometry=log.odometry)
+
+
+def test_rays_print_as_one_line(result: objslam.Result) -> None:
+    free = sum(one is None for one in result.rays.to_arrow()["object"].to_pylist())
+    assert repr(result.rays) == f"RaysTable of {len(result.rays)} rays, {free} of no object"
+
+
 def test_a_path_in_place_of_a_log_is_refused_in_one_line() -> None:
     given: Any = "my_log"
     with pytest.raises(TypeError, match=r"run needs a log, as `objslam\.read\(path\)` returns it, got str"):

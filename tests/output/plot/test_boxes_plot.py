@@ -23,7 +23,7 @@ def test_two_labels_of_one_thing_stand_below_each_other() -> None:
     two = cv2.imdecode(np.frombuffer(both, np.uint8), cv2.IMREAD_COLOR)
     assert one is not None
     assert two is not None
-    above = one[:99].any(axis=(1, 2)).nonzero()[0]
+    above = np.flatnonzero(one[:99].any(axis=(1, 2)))
     text = one[above[0] : above[-1] + 1] == 255
     assert text.all(axis=2).any()  # the label is white on its plate
     assert ((two[above[0] : above[-1] + 1] == 255).all(axis=2) == text.all(axis=2)).all()  # the second did not touch it
