@@ -10,8 +10,8 @@ def main(source: str) -> objslam.Result:
     log = objslam.read(source)
     (camera,) = log.cameras
     path, boxes = log.odometry, camera.detections
-    assert path is not None
-    assert boxes is not None
+    if path is None or boxes is None:
+        raise SystemExit(f"{source}: this example needs a log with odometry and boxes")
     with objslam.Session(patient=True) as session:  # patient: the log comes faster than it was recorded
         session.push_camera(camera.camera)
         pose = 0

@@ -20,7 +20,8 @@ def main(source: str) -> objslam.Result:
     """Run the detector on every image of the only camera, and map its boxes."""
     log = objslam.read(source)
     images = log.cameras[0].rgb
-    assert images is not None
+    if images is None:
+        raise SystemExit(f"{source}: the log has no images (rgb.txt)")
     boxes = []
     for path in images.paths:
         image = cv2.imread(str(path))

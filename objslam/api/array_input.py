@@ -1,13 +1,30 @@
 """Arrays of a user become the arrays of the data types. A wrong value raises ValueError and names its row."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, pose_from_quaternion
-from objslam.core.validity import rigid_poses, valid_pose_rows, valid_stamps
+from objslam.core.validity import camera_fault, rigid_poses, valid_pose_rows, valid_stamps
+
+
+def as_camera(camera: Camera) -> Camera:
+    """Return a camera whose matrix, distortion and base_T_camera are arrays. ValueError names what is wrong with it."""
+    given: dict[str, Any] = {
+        name: np.asarray(getattr(camera, name), dtype=np.float64) for name in ("matrix", "distortion", "base_T_camera")
+    }
+    for name, shape in (("matrix", (3, 3)), ("base_T_camera", (4, 4))):
+        if given[name].shape != shape:
+            raise ValueError(f"camera {camera.name!r}: {name} is {shape}, got the shape {given[name].shape}")
+    found = replace(camera, **given)
+    if (fault := camera_fault(found)) is not None:
+        raise ValueError(f"camera {camera.name!r} {fault}")
+    return found
 
 
 def as_poses(values: ArrayLike) -> Floats:
@@ -43,6 +60,14 @@ def as_stamps(values: ArrayLike) -> Floats:
     _all_good(valid_stamps(stamps), "stamp", "is not a finite number of seconds")
     _all_good(np.diff(stamps, prepend=-np.inf) > 0, "stamp", "is not later than the one before it")
     return stamps
+
+
+def as_boxes(values: ArrayLike, where: str) -> Floats:
+    """Return the boxes (B, 4) of one frame, px. An empty list gives (0, 4). ValueError with `where` for another shape."""
+    given = np.asarray(values, dtype=np.float64)
+    if given.size and given.shape[1:] != (4,):
+        raise ValueError(f"{where}: boxes are (B, 4) x1, y1, x2, y2, got the shape {given.shape}")
+    return given.reshape(-1, 4)
 
 
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:

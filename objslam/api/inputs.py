@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from objslam.api.array_input import as_poses, as_stamps, per_box
+from objslam.api.array_input import as_boxes, as_camera, as_poses, as_stamps, per_box
 from objslam.core import types
 from objslam.core.camera import Camera
 from objslam.core.geometry import quaternion
-from objslam.core.validity import box_rules, camera_fault, is_name, valid_depths
+from objslam.core.validity import box_rules, is_name, valid_depths
 from objslam.io.tables import arrow_table, to_pandas
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Detections(types.Detections):
         track_ids: for each frame B integers, -1 where unknown. whole: whether the image's edge cuts no box off.
         ValueError names what is wrong.
         """
-        frames = [np.asarray(one, dtype=np.float64).reshape(-1, 4) for one in boxes]
+        frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
         counts = [len(one) for one in frames]
         times = as_stamps(stamps)
         if len(frames) != len(times):
@@ -116,15 +116,12 @@ class Log(types.Log):
         cameras, detections: one of each, or as many of one as of the other. odometry: odom_T_base. localization: map_T_base.
         At least one of the two is needed. ValueError names what is wrong.
         """
-        lenses = [cameras] if isinstance(cameras, Camera) else list(cameras)
+        lenses = [as_camera(one) for one in ([cameras] if isinstance(cameras, Camera) else cameras)]
         boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
         if len(lenses) != len(boxes):
             raise ValueError(f"each camera needs its detections, got {len(lenses)} cameras and {len(boxes)} detections")
         if odometry is None and localization is None:
             raise ValueError("a log needs odometry, localization or both")
-        for camera in lenses:
-            if (fault := camera_fault(camera)) is not None:
-                raise ValueError(f"camera {camera.name!r} {fault}")
         views = tuple(types.CameraLog(camera, found) for camera, found in zip(lenses, boxes, strict=True))
         return cls(name, views, _path(odometry), _path(localization))
 

@@ -63,8 +63,10 @@ def run(
         changes: more changes, which win over `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
         LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.
-        DetectorError: the model cannot be used.
+        DetectorError: the model cannot be used. TypeError: `log` is no log.
     """
+    if not isinstance(log, types.Log):
+        raise TypeError(f"run needs a log, as `objslam.read(path)` returns it, got {type(log).__name__}")
     chosen = settings_of(settings, changes)
     ledger, told = Ledger(), []
     if log.reading is not None:

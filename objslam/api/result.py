@@ -27,7 +27,7 @@ class _Run:
     detected: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """The result of a run.
 

@@ -22,7 +22,7 @@ _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # Ho
 _UNIT = 1e-3  # The largest difference of a squared length of a direction from 1. A larger value accepts worse directions.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class RaysTable:
     """All rays of a result, with one row per ray."""
 
@@ -44,6 +44,9 @@ class RaysTable:
 
     def __len__(self) -> int:
         return len(self.object)
+
+    def __repr__(self) -> str:
+        return f"RaysTable of {len(self)} rays, {int((self.object < 0).sum())} of no object"
 
     def to_arrow(self) -> "pa.Table":
         """Return the rays as a pyarrow table with the columns of rays.parquet. Object -1 and NaN residuals become null."""

@@ -99,6 +99,8 @@ def test_a_log_of_arrays_gives_the_same_map_in_every_form_of_a_pose(log: Log, re
         ({"stamps": [0.0]}, "boxes needs one list for each stamp, got 2 for 1"),
         ({"labels": [["cup"], []]}, "labels needs one list for each frame"),
         ({"boxes": [[[0, 0, 5, 5]], [[5, 5, 4, 9]]]}, "frame 1: box without area"),
+        ({"boxes": [[[0, 0, 5, 5]], [[1, 1, 6]]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .1, 3."),
+        ({"boxes": [[[0, 0, 5, 5]], [1, 1, 6, 6]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .4,."),
         ({"labels": [["cup"], [""]]}, "frame 1: box with a label that is empty"),
         ({"scores": [[0.5], [1.5]]}, "frame 1: box with a score outside 0 to 1"),
         ({"scores": [[0.5], []]}, "scores needs one list for each frame"),
@@ -124,6 +126,35 @@ def test_wrong_frames_are_named(changes: dict[str, Any], message: str) -> None:
 def test_wrong_poses_are_named(poses: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         objslam.Trajectory.from_arrays([0.0, 1.0], poses)
+
+
+def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:
+    camera, boxes = log.cameras[0].camera, log.cameras[0].detections
+    assert boxes is not None
+    lists: Any = {name: getattr(camera, name).tolist() for name in ("matrix", "distortion", "base_T_camera")}
+    made = objslam.Log.from_arrays(replace(camera, **lists), boxes, odometry=log.odometry).cameras[0].camera
+    for name in lists:
+        np.testing.assert_array_equal(getattr(made, name), getattr(camera, name))
+    with pytest.raises(ValueError, match=r"matrix is \(3, 3\), got the shape \(4, 4\)"):
+        objslam.Log.from_arrays(replace(camera, matrix=np.eye(4)), boxes, odometry=log.odometry)
+
+
+def test_rays_print_as_one_line(result: objslam.Result) -> None:
+    free = sum(one is None for one in result.rays.to_arrow()["object"].to_pylist())
+    assert repr(result.rays) == f"RaysTable of {len(result.rays)} rays, {free} of no object"
+
+
+def test_a_path_in_place_of_a_log_is_refused_in_one_line() -> None:
+    given: Any = "my_log"
+    with pytest.raises(TypeError, match=r"run needs a log, as `objslam\.read\(path\)` returns it, got str"):
+        objslam.run(given)
+
+
+def test_results_are_compared_by_identity_without_an_error(result: objslam.Result, tmp_path: Any) -> None:
+    result.save(tmp_path / "out")
+    loaded = objslam.Result.load(tmp_path / "out")
+    assert loaded == loaded
+    assert loaded != result
 
 
 def test_a_log_that_cannot_be_is_refused(log: Log) -> None:

@@ -1,4 +1,4 @@
-"""Draw the boxes of a detector on a photo."""
+"""Draw the boxes of a detector on a photo, with their labels on plates that do not cover each other."""
 
 from collections.abc import Sequence
 
@@ -10,17 +10,44 @@ from objslam.output.plot.style import colours_of
 _LINE = 300  # The width of a line is the longer side of the image over this number. A larger number draws thinner lines.
 
 
+Plate = tuple[int, int, int, int]
+"""The filled rectangle behind a label: x1, y1, x2, y2, px."""
+
+
 def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Floats) -> bytes:
     """Return a PNG of an image (H, W, 3), BGR, with boxes (N, 4) x1, y1, x2, y2, px, in the colours of their labels."""
     import cv2
 
     drawn, line = np.ascontiguousarray(image).copy(), max(1, max(image.shape[:2]) // _LINE)
-    colours = colours_of(labels)
+    colours, plates = colours_of(labels), list[Plate]()
     for box, label, score in zip(boxes.round().astype(int).tolist(), labels, scores.tolist(), strict=True):
         red, green, blue = (round(255 * part) for part in colours[label])
         x1, y1, x2, y2 = box
         cv2.rectangle(drawn, (x1, y1), (x2, y2), (blue, green, red), line)
         text = f"{label} {score:.2f}".encode("ascii", "replace").decode()  # the font of OpenCV has ASCII only
-        place = (max(x1, 0), max(y1 - 2 * line, 12 * line))
-        cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45 * line, (blue, green, red), line, cv2.LINE_AA)
+        (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * line, line)
+        wide, high = width + 4 * line, height + 6 * line
+        plates.append(free_plate((x1, y1 - high, x1 + wide, y1), plates, drawn.shape[1], drawn.shape[0]))
+        left, top, right, bottom = plates[-1]
+        cv2.rectangle(drawn, (left, top), (right, bottom), (blue, green, red), cv2.FILLED)
+        place = (left + 2 * line, bottom - 3 * line)
+        cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * line, (255, 255, 255), line, cv2.LINE_AA)
     return cv2.imencode(".png", drawn)[1].tobytes()
+
+
+def free_plate(wanted: Plate, taken: Sequence[Plate], width: int, height: int) -> Plate:
+    """Return the plate of a label: the wanted one, moved into the image and down to the first free place.
+
+    taken: the plates that are drawn already. width, height: the size of the image, px. If no place below is free, the plate
+    covers another one.
+    """
+    x1, y1, x2, y2 = wanted
+    left, high = max(0, min(x1, width - (x2 - x1))), y2 - y1
+    first = max(0, min(y1, height - high))
+    right = left + x2 - x1
+    top = first
+    while below := [b for a, t, c, b in taken if a < right and c > left and t < top + high and b > top]:
+        top = max(below)
+        if top + high > height:
+            return left, first, right, first + high
+    return left, top, right, top + high

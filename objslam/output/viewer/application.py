@@ -17,7 +17,7 @@ import numpy as np
 
 from objslam.errors import ConfigError, OutputError
 from objslam.output.viewer.times import STAMP
-from objslam.results.files import RECORDING, hint_below
+from objslam.results.files import OBJECTS, RECORDING, hint_below
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -53,6 +53,8 @@ def find_rrd(out: Path) -> Path:
     file = out if out.is_file() else out / RECORDING
     if not out.exists():
         raise OutputError("there is no such result folder", where=str(out))
+    if not file.is_file() and not (out / OBJECTS).is_file():
+        raise OutputError(f"no result here: {OBJECTS} is missing", where=str(out), hint=hint_below(out))
     if not file.is_file():
         hint = hint_below(out) or "run with output.recording=true, and name the new result"
         raise OutputError("no recording here", where=str(out), hint=hint)

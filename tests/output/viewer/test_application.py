@@ -104,6 +104,14 @@ def test_a_damaged_recording_is_said_with_its_path(out: Path, tmp_path: Path, da
     assert application.find_rrd(tmp_path) == file
 
 
+def test_a_folder_without_a_result_is_told_from_a_result_without_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"no result here: objects\.json is missing"):
+        application.find_rrd(tmp_path)
+    (tmp_path / "objects.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"no recording here .*output\.recording=true"):
+        application.find_rrd(tmp_path)
+
+
 def test_results_in_folders_below_are_named(out: Path, tmp_path: Path) -> None:
     for name in ("fixed", "joint"):
         (tmp_path / name).mkdir()
