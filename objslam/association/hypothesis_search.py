@@ -89,9 +89,11 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices. If the first ray has a track, the
-    second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then the number of rays in between is uniform in its logarithm,
-    because near frames more often show the same object."""
+    """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices.
+
+    If the first ray has a track, the second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then
+    the number of rays in between is uniform in its logarithm, because near frames more often show the same object.
+    """
     n, count = len(obs), _DRAWS_EACH * search.hypotheses
     first = rng.integers(n, size=count)
     reach = np.exp(rng.uniform(0.0, np.log(max(n, 2)), count)).astype(np.int64)
