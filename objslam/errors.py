@@ -1,12 +1,21 @@
 """Errors that a user can correct. Each error names the problem, the place and the remedy."""
 
 
+def printable(text: str) -> str:
+    """Return a text with each character that is not printable as its escape, such as \\x1b. Line breaks (\\n) stay.
+
+    A name in a log may hold terminal commands or marks that reverse the order of the letters around them.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
+
 def one_line(text: object) -> str:
-    """Return a text, or the text of an exception, as one line of valid Unicode. An exception without text gives its type."""
+    """Return a text, or the text of an exception, as one printable line. An exception without text gives its type."""
     said = str(text)
     if not said.isprintable():
-        joined = " ".join(part for line in said.splitlines() if (part := line.strip()))
-        said = joined.encode("utf-8", "backslashreplace").decode()
+        said = printable(" ".join(part for line in said.splitlines() if (part := line.strip())))
     return type(text).__name__ if not said and isinstance(text, BaseException) else said
 
 

@@ -69,7 +69,9 @@ def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
     """Return points (H, 3) where two rays of different frames meet, where ranges end, and, if `search.parallax` is 0, along
     single rays."""
-    first, second = _draw(obs, _DRAWS_EACH * search.hypotheses, rng)
+    n = len(obs)
+    # Few rays have fewer pairs than hypotheses, and trying each pair once is both faster and complete.
+    first, second = np.triu_indices(n, 1) if n * (n - 1) // 2 <= search.hypotheses else _draw(obs, search, rng)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
     meet = (depth1 > MIN_DEPTH) & (depth2 > MIN_DEPTH) & (apart2 <= search.gate * limit)
@@ -86,11 +88,13 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
     return np.concatenate(points)
 
 
-def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw pairs of rays, and return their indices. If the first ray has a track, the second ray comes from it with
-    probability 0.5. Otherwise it comes from any frame. Then the number of rays in between is uniform in its logarithm,
-    because near frames more often show the same object."""
-    n = len(obs)
+def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[Ints, Ints]:
+    """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices.
+
+    If the first ray has a track, the second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then
+    the number of rays in between is uniform in its logarithm, because near frames more often show the same object.
+    """
+    n, count = len(obs), _DRAWS_EACH * search.hypotheses
     first = rng.integers(n, size=count)
     reach = np.exp(rng.uniform(0.0, np.log(max(n, 2)), count)).astype(np.int64)
     second = first + reach * rng.choice([-1, 1], count)

@@ -6,10 +6,13 @@ import functools
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from objslam.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
     from objslam.core.diagnostics import Ledger
 
@@ -20,11 +23,12 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     It takes the stage name, the number of finished items, and the total number of items, 0 if unknown."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    words = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), words, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     screen = console(stderr=True)
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         task = bar.add_task("reading")
-        yield lambda stage, done, total: bar.update(task, description=stage, completed=done, total=total or None)
+        yield lambda stage, done, total: bar.update(task, description=printable(stage), completed=done, total=total or None)
 
 
 def report(ledger: Ledger) -> None:
@@ -37,14 +41,19 @@ def report(ledger: Ledger) -> None:
 def console(stderr: bool = False) -> Console:
     """Return the console of stdout or stderr, with the width of the terminal, or 120 columns if it is no terminal.
 
-    Each stream has one console, so that a line printed during a progress bar or status line does not mix with it.
+    Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
+    console prints each text and each table cell as it is: [red] and :smile: stay, and `printable` replaces the rest.
     """
     from rich.console import Console
 
+    class Plain(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(printable(text), **options)
+
     stream = sys.stderr if stderr else sys.stdout
-    return Console(stderr=stderr, highlight=False, width=None if stream.isatty() else 120)
+    return Plain(stderr=stderr, highlight=False, markup=False, emoji=False, width=None if stream.isatty() else 120)
 
 
-def say(text: str, *, stderr: bool = False, markup: bool = False, end: str = "\n") -> None:
-    """Print a text without wrapping."""
-    console(stderr).print(text, markup=markup, end=end, soft_wrap=True)
+def say(text: str, *, stderr: bool = False, style: str | None = None, end: str = "\n") -> None:
+    """Print a text without wrapping. style: as rich names it, such as "bold"."""
+    console(stderr).print(text, style=style, end=end, soft_wrap=True)

@@ -138,10 +138,15 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """With `resume`, check that a journal exists. Else rename it, and restore it if the new session gets no message."""
-    from objslam.errors import OutputError
-    from objslam.sources.journal.file import put_back, set_aside
+    """With `resume`, check that a journal exists. Else rename it, and restore it if the new session gets no message.
 
+    If the last session was killed before its first message, the journal that it renamed is restored first.
+    """
+    from objslam.errors import OutputError
+    from objslam.sources.journal.aside import put_back, restore_after_kill, set_aside
+
+    if (kept := restore_after_kill(file)) is not None:
+        say(f"the last session was killed before its first message: restored {file} from {kept.name}", stderr=True)
     if resume:
         if not file.is_file():
             raise OutputError("there is no journal to resume", where=str(file), hint="leave out --resume")

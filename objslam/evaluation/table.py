@@ -37,15 +37,17 @@ _PATH_ROWS = (
 
 
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
-    """Return a table of the scores, a table of the objects by decreasing error, and the warnings."""
+    """Return a table of the scores, a table of the objects by decreasing error, and the warnings.
+
+    Labels and file names are in it as they are, so it needs a console without markup.
+    """
     from rich.console import Group
-    from rich.markup import escape
     from rich.table import Table
 
     data = evaluation.to_dict()
     title = f"align {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
     scores = Table(title=title)
-    scores.add_column("against the ground truth" if evaluation.truth is None else f"against {escape(evaluation.truth)}")
+    scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
     for key, name, unit in rows:
@@ -56,13 +58,13 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
         for column in ("object", "truth", "label", "error (m)"):
             listing.add_column(column, justify="left" if column == "label" else "right")
         for m in sorted(evaluation.objects.matches, key=lambda m: -m.error):
-            listing.add_row(str(m.object.id), str(m.truth.id), escape(m.object.label), f"{m.error:.3f}")
+            listing.add_row(str(m.object.id), str(m.truth.id), m.object.label, f"{m.error:.3f}")
         for missed in evaluation.objects.missed:
-            listing.add_row("-", str(missed.id), escape(missed.label), "missed")
+            listing.add_row("-", str(missed.id), missed.label, "missed")
         for false in evaluation.objects.false:
-            listing.add_row(str(false.id), "-", escape(false.label), "false")
+            listing.add_row(str(false.id), "-", false.label, "false")
         parts.append(listing)
-    parts += [f"warning: {escape(text)}" for text in evaluation.warnings]
+    parts += [f"warning: {text}" for text in evaluation.warnings]
     return Group(*parts)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from objslam.errors import OutputError
+from objslam.io.folders import remove_leftovers, temporary_name
 
 _STAGING = ".objslam-staging"
 _SWAPPING = "swapping"  # This file in the staging folder marks that the replacement of the old files has started.
@@ -65,9 +66,13 @@ def has_staging(folder: Path) -> bool:
 
 
 def write_file(file: Path, data: bytes) -> None:
-    """Write one file under a temporary name and rename it. Raises OutputError with the final file name for a disk error."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    """Write one file under a temporary name and rename it. Temporary files that killed processes left are deleted first.
+
+    Raises OutputError with the final file name for a disk error.
+    """
+    temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
+        remove_leftovers(file)
         try:
             _write(temporary, data)
             temporary.replace(file)

@@ -1,8 +1,16 @@
-"""Remove empty folders after a failure."""
+"""Remove what failed or killed work leaves on the disk: empty folders, temporary files and temporary folders."""
 
+import os
+import platform
+import re
+import shutil
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+OLD = "old"
+"""The entry of a temporary folder that holds the folder that is just being replaced."""
 
 
 @contextmanager
@@ -17,3 +25,43 @@ def no_empty_folders(path: Path) -> Iterator[None]:
                 if folder.exists():
                     folder.rmdir()
         raise
+
+
+def temporary_name(path: Path) -> str:
+    """Return the name of a temporary file or folder beside `path`. It names the machine and the process, for
+    `remove_leftovers`. A longer name that goes on with a dot belongs to the same process."""
+    return f".{path.name}.{_machine()}-{os.getpid()}"
+
+
+def remove_leftovers(path: Path) -> None:
+    """Delete the temporary files and folders beside `path` that dead processes of this machine left (`temporary_name`).
+
+    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Those
+    of other machines stay, because a process on the same disk may be alive there. Raises OSError if the disk refuses.
+    """
+    ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)
+    for entry in list(path.parent.iterdir()) if path.parent.is_dir() else []:
+        found = ours.fullmatch(entry.name)
+        if found is None or _is_alive(int(found[1])):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            if (entry / OLD).is_dir() and not path.exists():
+                (entry / OLD).rename(path)
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            entry.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    """Return a short mark of this machine. Process numbers of another machine or container mean nothing here."""
+    return f"{zlib.crc32(platform.node().encode()):08x}"
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # It belongs to another user.
+        return True
+    return True

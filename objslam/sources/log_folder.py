@@ -15,7 +15,7 @@ from objslam.core.types import CameraLog, Images, Log, Trajectory, Truth
 from objslam.errors import LogError, OutputError
 from objslam.io.camera_yaml import read_camera, write_camera
 from objslam.io.detections_jsonl import read_detections, write_detections
-from objslam.io.folders import no_empty_folders
+from objslam.io.folders import OLD, no_empty_folders, remove_leftovers, temporary_name
 from objslam.io.image_list import read_images, write_images
 from objslam.io.objects_json import FORMAT, read_truth_objects
 from objslam.io.text import reading
@@ -84,11 +84,11 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
         _write_content(log, fresh, path)
         try:
             if path.exists():
-                path.rename(work / "old")
+                path.rename(work / OLD)
             fresh.rename(path)
         finally:
-            if (work / "old").exists() and not path.exists():
-                (work / "old").rename(path)
+            if (work / OLD).exists() and not path.exists():
+                (work / OLD).rename(path)
 
 
 @contextmanager
@@ -98,7 +98,7 @@ def beside(path: Path) -> Iterator[Path]:
     with no_empty_folders(path.parent):
         with _writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            work = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+            work = Path(tempfile.mkdtemp(prefix=f"{temporary_name(path)}.", dir=path.parent))
         try:
             yield work
         finally:
@@ -106,8 +106,12 @@ def beside(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: Path, overwrite: bool) -> None:
-    """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced."""
+    """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced.
+
+    What killed processes left beside it is removed first. A log that one of them was replacing is put back.
+    """
     with _writing(path):
+        remove_leftovers(Path(os.path.realpath(path)))
         if path.exists() and not path.is_dir():
             raise OutputError("a file is in the way", where=str(path), hint="name another folder")
         if not path.exists() or not any(path.iterdir()):

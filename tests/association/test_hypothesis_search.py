@@ -7,7 +7,7 @@ from association_scenes import rays_of_boxes, watch
 from scipy.optimize import least_squares
 
 from objslam.association.hypothesis_search import Search, _Scorer, discover
-from objslam.association.observations import observe
+from objslam.association.observations import closest_approach, observe
 from objslam.association.refinement import refine
 from objslam.core.array_module import as_numpy
 from objslam.core.geometry import lift_se2
@@ -60,6 +60,24 @@ def test_points_are_found_among_three_times_as_many_strays():
     gaps = np.linalg.norm(found[:3, None] - THREE, axis=2)
     assert sorted(gaps.argmin(axis=1)) == [0, 1, 2]
     assert gaps.min(axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize(("count", "most"), [(1, 0), (3, 3), (12, 66), (400, 8 * SEARCH.hypotheses)])
+def test_a_search_among_few_rays_tries_each_pair_once(count, most, monkeypatch):
+    """The cost of a label with few boxes is that of its pairs, however many hypotheses the settings allow."""
+    obs = observed(watch(THREE, circle(200), pixel_sigma=1.0)).take(np.arange(count))
+    tried = []
+
+    def counting(obs, first, second):
+        tried.append(np.column_stack([first, second]))
+        return closest_approach(obs, first, second)
+
+    monkeypatch.setattr("objslam.association.hypothesis_search.closest_approach", counting)
+    discover(obs, SEARCH, np.random.default_rng(0))
+    (pairs,) = tried
+    assert len(pairs) <= most
+    if count <= 12:
+        assert sorted(map(tuple, pairs.tolist())) == [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def test_torch_finds_the_same_points_and_gives_its_threads_back(monkeypatch):

@@ -756,6 +756,37 @@ def test_an_interrupt_ends_a_run_without_a_traceback(log_folder, tmp_path):
     assert not (out / "summary.json").exists()
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_that_is_ended_from_outside_leaves_nothing_half(log_folder, tmp_path, number):
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", ENDLESS, "run", str(log_folder), "-o", str(out), *LEAN]
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert run.stdout.readline() == "begun\n"
+    run.send_signal(number)
+    _, err = run.communicate(timeout=LIMIT)
+    assert run.returncode in (-number, 128 + number)
+    assert len(err.splitlines()) <= 1
+    assert "Traceback" not in err
+    assert not out.exists() or not list(out.iterdir())
+
+
+@pytest.mark.parametrize("command", ["info", "info --json", "run --json"])
+def test_a_reader_that_leaves_early_is_no_traceback(log_folder, tmp_path, command):
+    """The pipe is closed before the first line, so the command cannot write at all."""
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    more = ("-o", str(tmp_path / "out"), *LEAN) if command.startswith("run") else ()
+    words = [SCRIPT, *command.split()[:1], str(log_folder), *command.split()[1:], *more]
+    done = subprocess.run(words, stdout=write_end, stderr=subprocess.PIPE, text=True, timeout=LIMIT, check=False)
+    os.close(write_end)
+    assert done.returncode in (0, 1, -signal.SIGPIPE)
+    assert "Traceback" not in done.stderr
+    assert "internal error" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    if more:
+        assert summary(tmp_path / "out")["counts"]["objects"] == 4
+
+
 def test_a_closed_pipe_is_no_traceback():
     run = subprocess.run(f"'{SCRIPT}' config dump | head -n 1", shell=True, capture_output=True, text=True, check=False)
     assert run.stdout.startswith("mode:")

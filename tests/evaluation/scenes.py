@@ -52,6 +52,6 @@ def numbers(evaluation: Evaluation) -> dict[str, float]:
 
 
 def show(evaluation: Evaluation) -> str:
-    console = Console(width=100, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    console = Console(width=100, markup=False, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
     console.print(evaluation_table(evaluation))
     return console.export_text()

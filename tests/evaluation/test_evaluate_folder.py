@@ -36,7 +36,7 @@ def test_what_was_compared_with_is_named(tmp_path: Path) -> None:
     for path, kept, title in ((None, None, "against the ground truth"), (other / "objects.json",) * 3):
         write_evaluation(evaluation := evaluate_folder(out, path), out)
         assert json.loads((out / "evaluation.json").read_text())["truth"] == (kept and str(kept))
-        console = Console(width=500, record=True, quiet=False)
+        console = Console(width=500, markup=False, record=True, quiet=False)
         console.print(evaluation_table(evaluation))
         assert str(title) in console.export_text()
 

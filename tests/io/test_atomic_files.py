@@ -117,6 +117,7 @@ def test_write_file_replaces_at_once(tmp_path: Path) -> None:
         if code == 0:
             break
     assert file.read_bytes() == b"new"
+    assert contents(tmp_path) == {"evaluation.json": b"new"}  # The files of the killed processes are gone.
     with pytest.raises(OutputError, match="No such file") as caught:
         write_file(tmp_path / "none" / "x.json", b"")
     assert caught.value.where == str(tmp_path / "none" / "x.json")  # not the temporary name

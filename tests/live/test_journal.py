@@ -1,6 +1,7 @@
 """Journals: what goes in comes out, and damage costs no more than what it hit."""
 
 import json
+import os
 import struct
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from objslam.core.validity import is_name
 from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
 from objslam.sources import read
+from objslam.sources.journal.aside import MAGIC, restore_after_kill
 from objslam.sources.journal.file import Journal, is_journal, messages, read_journal
 from objslam.sources.journal.records import (
     CalibrationMessage,
@@ -233,3 +235,23 @@ def test_a_journal_is_a_log(tmp_path):
     write(file, found[:3])
     with pytest.raises(LogError, match="no frames"):
         read_journal(file, Ledger())
+
+
+def test_an_empty_journal_gives_way_to_the_newest_one_kept(tmp_path):
+    file = tmp_path / "journal.objslam"
+    assert restore_after_kill(file) is None
+    older, newer = tmp_path / "journal.2.objslam", tmp_path / "journal.1.objslam"
+    for number, kept in enumerate((older, newer)):
+        kept.write_bytes(MAGIC + bytes([number]))
+        os.utime(kept, (1000 + number, 1000 + number))
+    (tmp_path / "journal.mine.objslam").write_bytes(MAGIC)
+    journal = Journal(file)
+    assert restore_after_kill(file) is None  # its session is alive
+    journal.close()
+    assert restore_after_kill(file) == newer
+    assert file.read_bytes() == MAGIC + b"\x01"
+    assert restore_after_kill(file) is None  # it has a message
+    assert {entry.name for entry in tmp_path.iterdir()} == {file.name, older.name, "journal.mine.objslam"}
+    file.write_text("my notes")
+    assert restore_after_kill(file) is None
+    assert file.read_text() == "my notes"

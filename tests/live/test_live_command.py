@@ -153,6 +153,21 @@ def test_where_nothing_comes_the_journal_that_was_there_stays(log, tmp_path):
     assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
 
 
+@pytest.mark.parametrize("more", [(), ("--resume",)])
+def test_a_start_killed_before_its_first_message_costs_no_journal(log, tmp_path, more):
+    out = tmp_path / "out"
+    kept = journal_in(out)
+    file = out / "journal.objslam"
+    with subprocess.Popen(command("stdin", out), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        wait_for(lambda: (out / "journal.1.objslam").exists() and file.exists() and file.stat().st_size == 8)
+        process.kill()
+    done = subprocess.run(command("stdin", out, *more), input="", capture_output=True, text=True, timeout=LIMIT)
+    assert done.returncode == 1
+    assert "the last session was killed before its first message" in done.stderr
+    assert ("continued" in done.stderr) == bool(more)
+    assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
+
+
 def test_a_session_starts_from_a_calibration(log, tmp_path):
     found = Calibration(("odometry.scale", "front.yaw"), np.array([0.01, 0.02]), np.diag([1e-4, 4e-6]), np.full(2, 0.03))
     file = tmp_path / "robot.yaml"

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from killed import in_child, killed_at
 
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject
 from objslam.errors import LogError, OutputError
+from objslam.io import folders
 from objslam.io.objects_json import read_truth_objects
 from objslam.sources import log_folder as folder_module
 from objslam.sources.log_folder import is_log_folder, read_log_folder, write_log_folder
@@ -343,3 +345,45 @@ def test_a_log_written_by_hand(tmp_path):
     assert len(log.odometry) == 2
     assert log.cameras[0].camera.focal == 500
     assert log.cameras[0].detections.stamps.tolist() == [1.5]
+
+
+def test_what_killed_processes_left_goes_and_a_log_that_was_being_replaced_comes_back(log, tmp_path):
+    """A killed process leaves its temporary folder beside the log, perhaps with the log that it was replacing."""
+    place = tmp_path / "place"
+    target = place / "log"
+    for step in range(40):
+        write_log_folder(log, target, overwrite=True)
+        code = in_child(killed_at(step, lambda: write_log_folder(log, target, overwrite=True)))
+        left = [entry for entry in place.iterdir() if entry.name.startswith(".log.")]
+        assert bool(left) <= (code == 9)
+        if code == 0:
+            break
+        if not target.exists():  # The process was killed between two renames.
+            with pytest.raises(OutputError, match="there is a log already"):
+                write_log_folder(log, target)
+        assert is_log_folder(target)
+    assert code == 0
+    assert step > 1
+    write_log_folder(log, target, overwrite=True)
+    assert [entry.name for entry in place.iterdir()] == ["log"]
+
+
+def test_leftovers_are_known_by_name_machine_and_dead_process(tmp_path, monkeypatch):
+    dead = os.fork()
+    if dead == 0:
+        os._exit(0)
+    os.waitpid(dead, 0)
+    mine = folders.temporary_name(tmp_path / "log")
+    machine = mine.removeprefix(".log.").split("-")[0]
+    gone = (f".log.{machine}-{dead}", f".log.{machine}-{dead}.x1y2", f".log.{machine}-{dead}.png")
+    alive = (mine, f"{mine}.abc", f".log.{machine}-1")
+    others = (f".log.00000000-{dead}", f".log.{dead}", f".log2.{machine}-{dead}", ".log.x")
+    stay = (*alive, *others, f".log.{machine}-{dead}x", f"log.{machine}-{dead}", f".log.{machine}-")
+    for name in (*gone, *stay):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").touch()
+    (tmp_path / f".log.{machine}-{dead}.link").symlink_to(tmp_path / mine)
+    (tmp_path / f".log.{machine}-{dead}.file").touch()
+    folders.remove_leftovers(tmp_path / "log")
+    assert {entry.name for entry in tmp_path.iterdir()} == set(stay)
+    assert (tmp_path / mine / "a").exists()

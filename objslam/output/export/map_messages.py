@@ -14,6 +14,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.geometry import make_pose, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.errors import printable
 from objslam.output.plot.style import captions, ellipsoid, label_colours
 
 if TYPE_CHECKING:
@@ -72,7 +73,8 @@ class MapMessages:
         if o.covariance is not None:
             covariance[:3, :3] = o.covariance
         with_covariance = self.make("geometry_msgs/PoseWithCovariance", pose, covariance.ravel())
-        hypotheses = [self.make("vision_msgs/ObjectHypothesis", *pair) for pair in (o.labels or {o.label: 1.0}).items()]
+        shares = {printable(label): share for label, share in (o.labels or {o.label: 1.0}).items()}
+        hypotheses = [self.make("vision_msgs/ObjectHypothesis", *pair) for pair in shares.items()]
         results = [self.make("vision_msgs/ObjectHypothesisWithPose", part, with_covariance) for part in hypotheses]
         width, height = o.extent or (0.0, 0.0)
         box = self.make("vision_msgs/BoundingBox3D", pose, self._vector("Vector3", np.array([width, width, height])))

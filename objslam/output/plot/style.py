@@ -10,6 +10,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
+from objslam.errors import printable
 
 RayKind = Literal["used", "rejected", "unexplained"]
 """The kind of a ray: used for its object, rejected as an outlier of its object, or unexplained by any object."""
@@ -59,7 +60,7 @@ def ray_ends(result: RunResult) -> Floats:
 def captions(objects: ObjectMap) -> list[str]:
     """Return a caption for each object: its label, followed by #id if several objects have the label."""
     shared = Counter(o.label for o in objects.objects)
-    return [o.label if shared[o.label] == 1 else f"{o.label} #{o.id}" for o in objects.objects]
+    return [printable(o.label if shared[o.label] == 1 else f"{o.label} #{o.id}") for o in objects.objects]
 
 
 def label_colours(objects: ObjectMap) -> dict[str, tuple[float, float, float]]:

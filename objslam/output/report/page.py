@@ -16,7 +16,7 @@ import numpy as np
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Images
-from objslam.errors import ConfigError, OutputError
+from objslam.errors import ConfigError, OutputError, printable
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
@@ -99,6 +99,7 @@ def write_report(
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.output.report", ""),
         autoescape=True,  # Texts of the result may contain HTML.
+        finalize=lambda value: printable(value) if type(value) is str else value,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from objslam.errors import ConfigError, OutputError
+from objslam.io.atomic_files import disk_errors
+from objslam.io.folders import remove_leftovers, temporary_name
 from objslam.output.viewer.times import STAMP
 from objslam.results.files import OBJECTS, RECORDING, hint_below
 
@@ -147,7 +149,9 @@ def screenshot(
         raise ConfigError("a picture is a PNG", where=str(picture), hint="name the file FILE.png")
     if not picture.parent.is_dir():
         raise OutputError("no such folder for the picture", where=str(picture.parent))
-    temporary = picture.with_name(f".{picture.stem}.{os.getpid()}.png")
+    temporary = picture.with_name(f"{temporary_name(picture)}.png")
+    with disk_errors(picture):
+        remove_leftovers(picture)
     port = free_port()
     window = f"{size[0]}x{size[1]}"
     viewer = start("--headless", "--hide-welcome-screen", "--port", str(port), "--window-size", window, *map(str, files))

@@ -1,5 +1,6 @@
 """The texts of a recording: events of the drive, changes of each round, changes of a live map, and a table of the run."""
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,6 +10,7 @@ from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trace import Round
+from objslam.errors import one_line
 from objslam.output.plot.style import captions, ray_kinds
 
 Level = Literal["INFO", "WARN"]
@@ -194,14 +196,18 @@ def summary_text(result: RunResult) -> str:
     if "cost_before" in summary:
         rows.append(("cost", f"{summary['cost_before']:.4g} to {summary['cost_after']:.4g}"))
     rows += [(f"seconds: {name}", f"{value:.2f}") for name, value in seconds.items()]
-    lines = [f"**{summary.get('log', 'run')}**, {summary.get('mode', result.settings.mode)} mode", "", *table(rows)]
+    lines = [
+        f"**{markdown(summary.get('log', 'run'))}**, {summary.get('mode', result.settings.mode)} mode",
+        "",
+        *table(rows),
+    ]
     if calibration := summary.get("calibration"):
         lines += ["", "| shared error | found | sigma | prior sigma | unit | |", "|---|---:|---:|---:|---|---|"]
         for name, of in calibration["parameters"].items():
             remark = "" if of["observable"] else "not observable from this log"
             shown = " | ".join(f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
-            lines.append(f"| {name} | {shown} | {of['unit']} | {remark} |")
-        lines += [f"This log cannot tell apart: {' and '.join(pair)}." for pair in calibration["traded_off"]]
+            lines.append(f"| {markdown(name)} | {shown} | {of['unit']} | {remark} |")
+        lines += [f"This log cannot tell apart: {markdown(' and '.join(pair))}." for pair in calibration["traded_off"]]
     if result.trace:
         lines += ["", "| round | objects | unexplained | cost |", "|---|---:|---:|---:|"]
         for number, r in enumerate(result.trace):
@@ -214,4 +220,9 @@ def summary_text(result: RunResult) -> str:
 
 def table(rows: list[tuple[str, str]]) -> list[str]:
     """Return the lines of a Markdown table of names and values."""
-    return ["| | |", "|---|---:|", *(f"| {name} | {value} |" for name, value in rows)]
+    return ["| | |", "|---|---:|", *(f"| {markdown(name)} | {value} |" for name, value in rows)]
+
+
+def markdown(text: str) -> str:
+    """Return a text as one line of Markdown that shows the text itself, and no link, image, HTML or table cell."""
+    return re.sub(r"([\\`*_\[\]<>|!~#&])", r"\\\1", one_line(text))

@@ -15,7 +15,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
 from objslam.output.plot.style import RayKind, captions, evenly
-from objslam.output.viewer.event_log import table
+from objslam.output.viewer.event_log import markdown, table
 from objslam.output.viewer.objects import log_objects
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.view_point import ViewPoint, first_view_point, look_at
@@ -158,7 +158,7 @@ def _text(f: ProximityField, objects: ObjectMap, o: MapObject, name: str, rays: 
         ("median distance, largest distance", f"{_metres(float(np.median(off)))}, {_metres(float(off.max()))}"),
         ("distance from the run's estimate", _metres(gap)),
     ]
-    head = f"**{name}**, {o.status}, in a map of {len(objects)} objects"
+    head = f"**{markdown(name)}**, {o.status}, in a map of {len(objects)} objects"
     colour = "The colour of a point shows its mean distance from the used rays (Eq. 1's cost / the number of rays)."
     valley = "Bright points are close. A valley along the rays means that the distance of the object is uncertain."
     return "\n".join([head, "", *table(rows), "", f"{colour} {valley}"])

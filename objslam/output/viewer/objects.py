@@ -9,6 +9,7 @@ from objslam.core.arrays import Floats
 from objslam.core.object_map import ObjectMap
 from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Truth
+from objslam.errors import printable
 from objslam.output.plot.style import captions, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
@@ -78,6 +79,6 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 def log_truth(recording: Any, truth: Truth) -> None:
     """Log the true objects as static black dots, `map/truth`."""
-    places, labels = [o.position for o in truth.objects], [o.label for o in truth.objects]
+    places, labels = [o.position for o in truth.objects], [printable(o.label) for o in truth.objects]
     points = rr.Points3D(places, colors=[_TRUTH], labels=labels, radii=rr.Radius.ui_points(3), show_labels=False)
     recording.log("map/truth", points, static=True)

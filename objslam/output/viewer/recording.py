@@ -10,6 +10,7 @@ import rerun as rr
 from objslam.core.arrays import Floats
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
+from objslam.errors import one_line
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, log_cameras
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
@@ -35,7 +36,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     recording = rr.RecordingStream("objslam")
     # The recording stays in memory until the end. A file sink would report a full disk on stderr and raise no error.
     memory = recording.memory_recording()
-    recording.send_recording_name(str(result.summary.get("log", "objslam")))
+    recording.send_recording_name(one_line(result.summary.get("log", "objslam")))
     view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])
     used = [c for i, c in enumerate(result.cameras) if (result.keyframes.camera == i).any()]
     cameras = [(camera_path(c), c.name) for c in used]

@@ -7,13 +7,12 @@ most the messages of that time.
 """
 
 import fcntl
-import itertools
 import os
 import struct
 import threading
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,6 +22,7 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, label_table
 from objslam.errors import LogError, OutputError
+from objslam.sources.journal.aside import MAGIC, refusals, set_aside
 from objslam.sources.journal.records import (
     CALIBRATION_KIND,
     CalibrationMessage,
@@ -37,7 +37,6 @@ from objslam.sources.journal.records import (
 )
 
 NAME = "journal.objslam"
-MAGIC = b"OBJSLAM1"
 _HEAD = struct.Struct("<II")
 _LONGEST = 1 << 26  # The largest content of a record, bytes. A record that states a greater length counts as damaged.
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
@@ -58,7 +57,7 @@ class Journal:
         self.file = file
         if not resume:
             set_aside(file)
-        with _refusals("open the journal", file):
+        with refusals("open the journal", file):
             self._stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -93,7 +92,7 @@ class Journal:
         self._syncing.join()
         stream, self._stream = self._stream, -1
         try:
-            with _refusals("write the end of the journal", self.file):
+            with refusals("write the end of the journal", self.file):
                 os.fsync(stream)
         finally:
             os.close(stream)
@@ -124,49 +123,6 @@ class Journal:
                 self._broken = worse
             raise OutputError(f"cannot write the journal: {error.strerror}", where=str(self.file)) from error
         self._end += len(data)
-
-
-def set_aside(file: Path) -> Path | None:
-    """Rename the journal `file` so that a new one can be written, and return its new path.
-
-    The new name is journal.1.objslam, or has the next free number. If there is no journal, or one without messages, nothing
-    is renamed and None is returned.
-    Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
-    """
-    with _refusals("set the journal aside", file):
-        if not file.is_file():
-            return None
-        with file.open("rb") as stream:
-            if not MAGIC.startswith(stream.read(len(MAGIC))):
-                raise OutputError("this file is not a journal", where=str(file), hint="move it out of the way")
-            if file.stat().st_size <= len(MAGIC):
-                return None
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError("another session writes this journal", where=str(file)) from error
-            others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
-            return file.rename(next(other for other in others if not other.exists()))
-
-
-def put_back(aside: Path, file: Path) -> bool:
-    """Rename `aside`, a journal that `set_aside` renamed, back to `file`. Returns whether it was renamed.
-
-    If `file` is by now a journal with messages, nothing is renamed. Raises OutputError if the journal cannot be renamed.
-    """
-    with _refusals(f"put {aside} back", file):
-        if file.is_file() and file.stat().st_size > len(MAGIC):
-            return False
-        aside.replace(file)
-    return True
-
-
-@contextmanager
-def _refusals(action: str, file: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(f"cannot {action}: {error.strerror}", where=str(file)) from error
 
 
 def is_journal(path: Path) -> bool:

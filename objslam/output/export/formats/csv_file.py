@@ -4,23 +4,37 @@ from __future__ import annotations
 
 import csv
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from objslam.errors import printable
 from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
     from objslam.output.export.content import Content
 
+_FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+"""The characters that start a formula in a spreadsheet, also in their full-width forms."""
+
 
 def _dump(content: Content) -> bytes:
-    """Return the objects as UTF-8 text. A reader gets each number back as the same float. An unknown value is empty."""
+    """Return the objects as UTF-8 text. A reader gets each number back as the same float. An unknown value is empty.
+
+    A label that a spreadsheet would take for a formula is preceded by an apostrophe, as OWASP advises against CSV injection.
+    """
     from objslam.core.object_map import COLUMNS
 
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(COLUMNS)
-    writer.writerows(["" if value is None else value for value in o.row().values()] for o in content.objects)
+    writer.writerows([_cell(value) for value in o.row().values()] for o in content.objects)
     return text.getvalue().encode()
+
+
+def _cell(value: Any) -> Any:
+    if not isinstance(value, str):
+        return "" if value is None else value
+    text = printable(value)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text
 
 
 EXPORT = ExportFormat("csv", "objects.csv", "a table of objects", _dump)

@@ -1,0 +1,82 @@
+"""Set the journal of an earlier session aside, and put it back if the new session gets no message."""
+
+import fcntl
+import itertools
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from objslam.errors import OutputError
+
+MAGIC = b"OBJSLAM1"
+"""The first bytes of a journal. A journal without messages holds nothing else."""
+
+
+def set_aside(file: Path) -> Path | None:
+    """Rename the journal `file` so that a new one can be written, and return its new path.
+
+    The new name is journal.1.objslam, or has the next free number. If there is no journal, or one without messages, nothing
+    is renamed and None is returned.
+    Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
+    """
+    with refusals("set the journal aside", file):
+        if not file.is_file():
+            return None
+        with file.open("rb") as stream:
+            if not MAGIC.startswith(stream.read(len(MAGIC))):
+                raise OutputError("this file is not a journal", where=str(file), hint="move it out of the way")
+            if file.stat().st_size <= len(MAGIC):
+                return None
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OutputError("another session writes this journal", where=str(file)) from error
+            others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
+            return file.rename(next(other for other in others if not other.exists()))
+
+
+def put_back(aside: Path, file: Path) -> bool:
+    """Rename `aside`, a journal that `set_aside` renamed, back to `file`. Returns whether it was renamed.
+
+    If `file` is by now a journal with messages, nothing is renamed. Raises OutputError if the journal cannot be renamed.
+    """
+    with refusals(f"put {aside} back", file):
+        if file.is_file() and file.stat().st_size > len(MAGIC):
+            return False
+        aside.replace(file)
+    return True
+
+
+def restore_after_kill(file: Path) -> Path | None:
+    """Put the newest journal that was set aside back, if `file` is the empty journal of a session that was killed.
+
+    A session sets the earlier journal aside before its own first message. Killed in between, it leaves an empty journal, and
+    a resumed session would start from nothing. Returns the path from which the journal came, None if there was nothing to
+    do. A session that is alive keeps its empty journal. Raises OutputError if the journal cannot be renamed.
+    """
+    numbered = re.compile(rf"{re.escape(file.stem)}\.[0-9]+{re.escape(file.suffix)}")
+    with refusals("put an earlier journal back", file):
+        if not file.is_file():
+            return None
+        with file.open("rb") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return None
+            content = stream.read(len(MAGIC) + 1)
+            kept = [other for other in file.parent.iterdir() if numbered.fullmatch(other.name)]
+            if not MAGIC.startswith(content) or not kept:
+                return None
+            newest = max(kept, key=lambda other: other.stat().st_mtime_ns)
+            newest.replace(file)
+    return newest
+
+
+@contextmanager
+def refusals(action: str, file: Path) -> Iterator[None]:
+    """Convert OSError to OutputError, "cannot ACTION: REASON", at `file`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot {action}: {error.strerror}", where=str(file)) from error
