@@ -29,8 +29,8 @@ class Evidence:
 
     resolved, unresolved: how many objects have a place, and how many have none. boxes: the boxes of the log. cut: those that
     the image's edge cuts off. rays: the boxes that were used. unexplained: those of no object. misses: the median residual
-    as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's frame. planar:
-    whether the path is planar. findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
+    as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's frame.
+    findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
     """
 
     resolved: int
@@ -41,7 +41,6 @@ class Evidence:
     unexplained: int
     misses: float
     odometry_frame: bool = False
-    planar: bool = True
     findings: tuple[str, ...] = ()
     spoilt: bool = False
 
@@ -76,7 +75,6 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         unexplained=counts["rays_unexplained"],
         misses=misses,
         odometry_frame=summary["map_frame"] == "odometry",
-        planar=summary["planar"],
         findings=tuple(finding["name"] for finding in findings),
         spoilt=any(finding["spoils_positions"] for finding in findings),
     )
@@ -88,7 +86,7 @@ def assess(e: Evidence) -> Assessment:
     level: Level = "bad" if bad else "check" if check else "good"
     them = "it" if e.resolved == 1 else "them"
     good = f"{_objects(e.resolved)}, and the rays miss {them} about as far as the settings say, or less."
-    frame = "The map lies in the frame of the odometry: `objslam eval` needs --align " + ("se2." if e.planar else "se3.")
+    frame = "The map lies in the frame of the odometry, which begins where the robot began."
     return Assessment(level, tuple(bad or check or [good]) + ((frame,) if e.odometry_frame and not bad else ()))
 
 

@@ -20,7 +20,7 @@ def warn_of_unexplained(rays: Rays, association: Association, ledger: Ledger) ->
         return
     number = np.bincount(rays.label[left], minlength=len(rays.label_names))
     worst = ", ".join(f"{rays.label_names[i]} {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
-    why = "" if association.count else "; an object needs at least three boxes from three places"
+    why = "" if association.count else "; an object needs at least three boxes from three places that agree"
     if left.mean() > _IMPLAUSIBLE:
         why += f"; unless most things move, the input may be wrong: check {_INPUT}"
     ledger.warn(f"{left.sum()} of {len(left)} boxes are explained by no object at rest ({worst}){why}")
