@@ -10,7 +10,7 @@ _HALF = 0.5
 share finds smaller differences."""
 _FEW, _PART = 2, 0.1
 """The fewest rays, and the least share of all its rays, by which an object is seen in a half. Smaller values take chance for
-an object. False boxes fit an object by chance in a tenth of the cases."""
+an object. Of the boxes of another recording, about a tenth fit an object of the same label by chance."""
 
 
 def check_halves(late: Bools, fits: Bools) -> Finding | None:
