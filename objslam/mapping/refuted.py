@@ -1,7 +1,8 @@
 """Findings that the solve refutes: a joint solve may correct what a quick look at the boxes takes for wrong input.
 
 The quick look holds odometry and calibration as they are, for some seconds each. A camera that is turned by some degrees and
-late by a tenth of a second lets few boxes fit then, and few boxes fit many hypotheses by chance.
+late by a tenth of a second lets few boxes fit then, and few boxes fit many hypotheses by chance. Objects that are seen under
+little parallax in one half of a log get no point there. So the solved map answers the same question again.
 """
 
 from dataclasses import replace
@@ -19,6 +20,8 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import Solution, seen_something, solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.halves import check_halves, seen_in_both
+from objslam.mapping.checks.mixture import find_mixture
 from objslam.mapping.progress import Progress
 
 _EXPLAINED = 0.85
@@ -29,11 +32,10 @@ _NOISE = 2.0
 enough noise everything fits. Simulated logs that are put right have at most 1.6."""
 _MORE = 0.05
 """How much more of the rays the log put right must explain. A larger share refutes more findings."""
-_IN_BOTH = 0.5
-"""The share of the rays in each half that must belong to objects seen in both halves, for the halves to agree. A larger
-share refutes fewer findings."""
-_FEW = 2
-"""The fewest rays by which an object is seen in a half. A larger number refutes fewer findings."""
+_IN_BOTH = 0.4
+"""The share of the explained rays of a half that must belong to objects seen in both halves (`seen_in_both`), for the halves
+to agree. A larger share refutes fewer findings. Simulated clean logs with such a finding have 0.63 and more. Those of two
+recordings have at most 0.23 if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
@@ -45,7 +47,7 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     kept = tuple(
         one
         for one in diagnosis.findings
-        if not (one.by_boxes and _refuted(one, diagnosis, solution, log, settings, progress))
+        if not (one.basis != "log" and _refuted(one, diagnosis, solution, log, settings, progress))
     )
     return replace(diagnosis, findings=kept)
 
@@ -53,10 +55,13 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
 def _refuted(
     finding: Finding, diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress
 ) -> bool:
-    explained = _least_explained(solution) >= _EXPLAINED and _noise(solution, rays_only=True) <= _NOISE
-    if finding.by_halves:
+    quiet = _noise(solution, rays_only=True) <= _NOISE
+    if finding.basis == "frames":
+        return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
+    explained = quiet and _least_explained(solution) >= _EXPLAINED
+    if finding.basis == "halves":
         # Where labels do not name the objects, an object that is there twice would explain the boxes of both halves.
-        return (explained and not solution.rounds) or _halves_agree(solution)
+        return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
     if explained:
         return True
     named = [t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == finding.name]
@@ -108,10 +113,8 @@ def _noise(solution: Solution, *, rays_only: bool = False) -> float:
 
 
 def _halves_agree(solution: Solution) -> bool:
-    """Return whether most rays of each half belong to objects that are seen in both halves."""
-    explained, late, owner = _explained(solution), _late(solution), solution.association.object
-    count = solution.association.count
-    seen = [np.bincount(owner[explained & mask], minlength=count) for mask in (late, ~late)]
-    both = np.append((seen[0] >= _FEW) & (seen[1] >= _FEW), False)  # -1 is no object
-    agree = explained & both[owner]
-    return all(mask.any() and agree[mask].mean() >= _IN_BOTH for mask in (late, ~late))
+    """Return whether the rays of both halves fit the solved objects, and these are the same objects."""
+    explained, late = _explained(solution), _late(solution)
+    if check_halves(late, explained) is not None:
+        return False
+    return seen_in_both(late, explained, solution.association.object) >= _IN_BOTH

@@ -5,18 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from objslam.config import load_settings
+from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping import pipeline
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.halves import check_halves, seen_in_both
 from objslam.mapping.checks.hypotheses import Hypothesis
 from objslam.mapping.checks.trials import Trial
 from objslam.mapping.refuted import without_refuted
-from objslam.simulation import preset, simulate
-from objslam.simulation.wrong_inputs import MISTAKES
+from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
+from objslam.simulation.wrong_inputs import MISTAKES, join
 
 SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false"))
 
@@ -51,6 +53,72 @@ def test_a_finding_stays_only_if_the_log_put_right_is_explained_better(clean, wr
     solution = solve(frames, rays, (log.cameras[0].camera,), SETTINGS, Ledger(), nothing)
     trial = Trial(Hypothesis("mirrored", "the boxes mirrored", "the images are mirrored", put_right), 1.0, 1.0, None)
     others = Finding("depth in mm", "the depths are in mm")
-    found = Diagnosis((Finding("mirrored", "it is mirrored", by_boxes=True), others), (trial,))
+    found = Diagnosis((Finding("mirrored", "it is mirrored", basis="boxes"), others), (trial,))
     left = without_refuted(found, solution, log, SETTINGS, nothing)
     assert [one.name for one in left.findings] == (["mirrored"] if kept else []) + ["depth in mm"]
+
+
+def names(log):
+    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    result = pipeline.run(log, settings, Ledger())
+    return [one["name"] for one in result.summary["wrong_input"]], len(result.map.resolved())
+
+
+def room(seed, **changes):
+    noise = {"pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "odometry": Odometry(), "localization": None}
+    return simulate(preset("demo", **{"objects": 10, "classes": 10, "frames": 300, **noise, **changes}), seed)
+
+
+def test_objects_that_one_half_sees_under_little_parallax_are_no_mistake():
+    """The quick look says that 99 % of the rays fit in the first half and 22 % in the second."""
+    wrong, ok = names(simulate(preset("demo", frames=150, localization=None), 2))
+    assert wrong == []
+    assert ok == 12
+
+
+@pytest.mark.parametrize("basis", ["halves", "frames"])
+def test_a_solve_of_a_clean_log_refutes_what_a_quick_look_said(clean, basis):
+    frames = build_keyframes(clean, SETTINGS, Ledger())
+    rays = build_rays(clean, frames, SETTINGS, Ledger())
+    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+    said = Finding("odd", "some boxes do not fit", basis=basis)
+    kept = Finding("odd", "the input says so itself")
+    assert without_refuted(Diagnosis((said, kept)), solution, clean, SETTINGS, nothing).findings == (kept,)
+
+
+@pytest.mark.parametrize(("depth", "unnamed"), [(None, False), (DepthNoise(), True)])
+def test_a_half_of_another_recording_still_spoils_a_joint_map(depth, unnamed):
+    log = join(room(0, depth=depth), room(50, depth=depth), interleaved=False)
+    if unnamed:
+        camera = log.cameras[0]
+        boxes = replace(camera.detections, label=np.zeros_like(camera.detections.label), label_names=("thing",))
+        log = replace(log, cameras=(replace(camera, detections=boxes),))
+    wrong, ok = names(log)
+    assert "halves differ" in wrong
+    assert ok == 0
+
+
+def test_frames_of_another_recording_still_spoil_a_joint_map():
+    rooms = [room(seed, localization=PoseNoise(xy=0.02, yaw=0.005)) for seed in (0, 50)]
+    wrong, ok = names(join(*rooms, interleaved=True))
+    assert "mixed recordings" in wrong
+    assert ok == 0
+
+
+def test_halves_are_compared_by_their_fitting_rays():
+    late = np.repeat([False, True], 100)
+    assert check_halves(late, np.tile(np.arange(100) < 40, 2)) is None
+    differ = check_halves(late, np.concatenate([np.arange(100) < 90, np.arange(100) < 20]))
+    assert differ.message.startswith("90 % of the rays fit in the first half of the log, 20 % in the second")
+
+
+def test_an_object_is_seen_in_both_halves_unless_by_chance():
+    late = np.repeat([False, True], 50)
+    fits = np.ones(100, dtype=bool)
+    assert seen_in_both(late, fits, np.zeros(100, dtype=int)) == 1.0
+    assert seen_in_both(late, fits, np.repeat([0, 1], 50)) == 0.0
+    # Object 0 fills the first half and two thirds of the second, the rest is new: most of the first half is seen again.
+    assert seen_in_both(late, fits, np.append(np.zeros(83, dtype=int), np.ones(17, dtype=int))) == 1.0
+    # Two rays of 52 are chance.
+    assert seen_in_both(late, fits, np.append(np.zeros(52, dtype=int), np.ones(48, dtype=int))) == 0.0
+    assert seen_in_both(late, ~fits, np.zeros(100, dtype=int)) == 0.0

@@ -14,6 +14,7 @@ from objslam.frontend.known_errors import estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, check_stamps
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.halves import check_halves
 from objslam.mapping.checks.hypotheses import later
 from objslam.mapping.checks.mixture import check_mixture
 from objslam.mapping.checks.path import check_path
@@ -29,8 +30,6 @@ _FITTING = 0.82
 runs a few seconds."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
 """The offsets (s) of a clock that every run tries. A clock that is off by more fits better already on the way to it."""
-_HALF = 0.5
-"""The share of boxes that fit in one half of a log, compared with the other half, below which the halves differ."""
 _CROWD = 5.0
 """The crowd (`Part.crowd`) above which rays meet anywhere and tell nothing. A larger crowd takes longer."""
 _FEWEST = 60
@@ -68,7 +67,7 @@ class Diagnosis:
     @property
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute a finding."""
-        return any(finding.by_boxes for finding in self.findings)
+        return any(finding.basis != "log" for finding in self.findings)
 
     def with_findings(self, more: Sequence[Finding]) -> Self:
         """Return the diagnosis with more findings."""
@@ -156,18 +155,9 @@ def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
     late = found.keyframes.stamps[found.rays.keyframe] > middle
     if min(late.sum(), (~late).sum()) < _FEWEST:
         return []
-    shares = [float((found.point[mask] >= 0).mean()) for mask in (~late, late)]
-    worse, better = sorted(shares)
-    if worse < _HALF * better:
-        return [
-            Finding(
-                "halves differ",
-                f"{100 * shares[0]:.0f} % of the rays fit in the first half of the log, {100 * shares[1]:.0f} % in the "
-                "second: the poses, the camera or the boxes of one half belong to something else",
-                by_boxes=True,
-                by_halves=True,
-            )
-        ]
+    differ = check_halves(late, found.point >= 0)
+    if differ is not None:
+        return [differ]
     windows: tuple[Ints, ...] = tuple(
         window + (window.max(initial=0) + 1) * (one.detections.frame_stamps > middle)
         if one.detections is not None
@@ -214,8 +204,7 @@ def _turned_cameras(
                     "camera moved",
                     f"{name} changes by {np.degrees(change):.1f} deg between the halves of the log: "
                     "somebody moved the camera on the robot",
-                    by_boxes=True,
-                    by_halves=True,
+                    basis="halves",
                 )
             )
     return results

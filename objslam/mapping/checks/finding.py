@@ -1,7 +1,7 @@
 """What a check found."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -9,15 +9,15 @@ class Finding:
     """One thing that is wrong with the input.
 
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the positions
-    of a map cannot be relied on, because the error is not corrected. by_boxes: whether only the agreement of the
-    boxes says so. by_halves: whether it compares the halves of the log.
+    of a map cannot be relied on, because the error is not corrected. basis: what says so. "log" is the input itself. The
+    others are how well boxes agree at the given poses: all "boxes", those of the "halves" of the log, or those of single
+    "frames". A joint solve may refute these.
     """
 
     name: str
     message: str
     spoils: bool = True
-    by_boxes: bool = False
-    by_halves: bool = False
+    basis: Literal["log", "boxes", "halves", "frames"] = "log"
 
     def to_dict(self) -> dict[str, Any]:
         """Return what summary.json holds."""

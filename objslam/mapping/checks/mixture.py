@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from objslam.core.arrays import Bools, Ints
 from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
@@ -20,8 +21,13 @@ def check_mixture(found: Agreement, part: Part) -> Finding | None:
     """Return whether some frames belong to another recording. Odometry drifts within windows, so it cannot tell."""
     if part.drifts:
         return None
-    number = np.bincount(found.rays.keyframe, minlength=len(found.keyframes))
-    fitting = np.bincount(found.rays.keyframe[found.point >= 0], minlength=len(found.keyframes))
+    return find_mixture(found.rays.keyframe, found.point >= 0)
+
+
+def find_mixture(frame: Ints, fits: Bools) -> Finding | None:
+    """Return whether rays fit by whole frames. frame: (R,) the frame of each ray. fits: (R,) whether it fits its object."""
+    frames = int(frame.max(initial=-1)) + 1
+    number, fitting = np.bincount(frame, minlength=frames), np.bincount(frame[fits], minlength=frames)
     judged = number >= _RAYS
     if judged.sum() < _FRAMES:
         return None
@@ -36,4 +42,5 @@ def check_mixture(found: Agreement, part: Part) -> Finding | None:
         "mixed recordings",
         f"in {100 * bad:.0f} % of the frames hardly a box fits, in {100 * good:.0f} % nearly all do: "
         "boxes or poses of another recording are probably mixed in",
+        basis="frames",
     )

@@ -77,7 +77,7 @@ def verdict(trials: list[Trial], part: Part) -> Finding | None:
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
     message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
-    return Finding(best.hypothesis.name, message, by_boxes=not _is_crooked(first))
+    return Finding(best.hypothesis.name, message, basis="log" if _is_crooked(first) else "boxes")
 
 
 def crooked(log: Log) -> bool:
