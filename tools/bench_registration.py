@@ -53,7 +53,8 @@ def same_places(rng: np.random.Generator, pairs: int) -> None:
         )
     right, known, accepted, place_found = np.mean(rows, axis=0)
     print(
-        f"{pairs} same places: right {right:.3f}  known {known:.3f}  accepted {accepted:.3f}  matches right {place_found:.3f}"
+        f"{pairs} same places: right {right:.3f}  known {known:.3f}  accepted {accepted:.3f}"
+        f"  matches right {place_found:.3f}"
     )
 
 
@@ -75,9 +76,8 @@ def large(rng: np.random.Generator) -> None:
         begin = time.perf_counter()
         found = register_maps(a, b)
         seconds = time.perf_counter() - begin
-        print(
-            f"1000 x 1000, overlap {overlap}: {seconds:.2f} s, right {within(*errors(found.b_T_a, truth, a.position[both[:, 0]]))}"
-        )
+        right = within(*errors(found.b_T_a, truth, a.position[both[:, 0]]))
+        print(f"1000 x 1000, overlap {overlap}: {seconds:.2f} s, right {right}")
 
 
 def folders(names: list[str]) -> None:
