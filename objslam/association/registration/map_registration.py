@@ -38,7 +38,7 @@ _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
 """For each stage of growth, how many objects around its pair a proposal is fitted to, and how many proposals enter. Larger
 numbers find smaller overlaps and take longer."""
 _FITS = 2
-"""The number of rounds of matching and fitting in each stage. The fits change little after two."""
+"""The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
 """Two transforms nearer than this (m at the middle of the map, rad) are one place. Larger values hide a near repetition."""
 

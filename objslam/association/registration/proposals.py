@@ -9,7 +9,7 @@ from objslam.core.arrays import Array, Floats, Ints
 
 _PAIRS = 6000
 """The most ordered pairs of one map that propose transforms, except that each object has at least `_MIN_PARTNERS`. A larger
-number finds smaller overlaps and takes longer. Chosen by tools/bench_registration.py."""
+number finds smaller overlaps and takes longer. Chosen for time, not by a sweep."""
 _MIN_PARTNERS = 6
 """The least number of partners of an object in the pairs. A larger number takes longer on large maps."""
 _MIN_BASE = 6.0
