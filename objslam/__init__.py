@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from objslam.api.inputs import Detections, Log, Trajectory
     from objslam.api.mapping import read, run
+    from objslam.api.registration import register
     from objslam.api.result import Result
     from objslam.api.session import Session
     from objslam.config import Settings
@@ -32,12 +33,14 @@ __all__ = [
     "Trajectory",
     "__version__",
     "read",
+    "register",
     "run",
 ]
 
 _HOMES = {
     **dict.fromkeys(("Detections", "Log", "Trajectory"), "objslam.api.inputs"),
     **dict.fromkeys(("read", "run"), "objslam.api.mapping"),
+    **{"register": "objslam.api.registration"},
     **{"Result": "objslam.api.result", "Session": "objslam.api.session", "Settings": "objslam.config"},
     **{"Camera": "objslam.core.camera", "MapObject": "objslam.core.object_map"},
     **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.results.object_map"},

@@ -1,0 +1,216 @@
+"""Register two maps whose frames are unknown to each other, by how their objects lie to each other.
+
+Pairs of objects with equal labels and equal distances propose transforms. The best proposals grow from the neighbourhood of
+their pair to the whole map. The evidence is a number of false alarms (a-contrario; Desolneux, Moisan & Morel 2000): how many
+proposals as good as this one two maps of unrelated places would give.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+from scipy.special import gammaln
+
+from objslam.association.place_recognition import Constellation
+from objslam.association.registration.fitting import (
+    Problem,
+    centred,
+    covariances,
+    fit,
+    gate,
+    jacobian_of,
+    move,
+    one_each,
+    robust_step,
+)
+from objslam.association.registration.proposals import around, propose
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import lift_se2
+from objslam.core.statistics import SAME_POINT
+
+Verdict = Literal["accepted", "ambiguous", "too little evidence"]
+MIN_LOG_ODDS = 9.2
+"""The least log odds against chance of an accepted registration, and its least lead over another place. A larger value
+refuses more. 9.2 allows one false alarm in 10,000 pairs of maps."""
+_STAGES = ((32, 200), (100, 60), (1 << 30, 20))
+"""For each stage of growth, how many objects around its pair a proposal is fitted to, and how many proposals enter. Larger
+numbers find smaller overlaps and take longer."""
+_FITS = 2
+"""The number of rounds of matching and fitting in each stage. A larger number takes longer."""
+_SAME_SHIFT, _SAME_TURN = 0.5, 0.1
+"""Two transforms nearer than this (m at the middle of the map, rad) are one place. Larger values hide a near repetition."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How one map lies in the frame of another.
+
+    b_T_a: (4, 4) takes points of the map a to the frame of b; it turns about z only. NaN if no transform fits at all.
+    covariance: (4, 4) of the x, y, z (m) and yaw (rad) of b_T_a. matches: (P, 2) indices of one object in a and in b.
+    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: the same of
+    the best other place, None and -inf if there is none.
+    """
+
+    b_T_a: Floats
+    covariance: Floats
+    matches: Ints
+    log_odds: float
+    second_b_T_a: Floats | None
+    second_log_odds: float
+
+    @property
+    def lead(self) -> float:
+        """How much the log odds exceed those of the best other place, or 0 where that place has none."""
+        return self.log_odds - max(self.second_log_odds, 0.0)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the evidence carries the transform, and whether it carries another place as well."""
+        if self.log_odds < MIN_LOG_ODDS:
+            return "too little evidence"
+        return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the transform may be used."""
+        return self.verdict == "accepted"
+
+
+def register_maps(a: Constellation, b: Constellation) -> Registration:
+    """Find the transform (yaw and translation) from the frame of a to that of b. Labels are numbers that both maps share.
+
+    Both maps have z up. The log odds are -ln(T * P(X >= m - 2)): T proposals were tried, m objects match, and X is Poisson
+    with the mean of the chance matches. The chance that an object of a has a match is the local density of objects in b,
+    times the area of the gate, times the share of the objects of b that have its label and its height. The two objects of
+    the proposing pair do not count.
+    """
+    keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
+    if min(len(keep_a), len(keep_b)) < 2:
+        return _nothing()
+    centre_a, centre_b = a.position[keep_a].mean(axis=0), b.position[keep_b].mean(axis=0)
+    problem = Problem(centred(a, keep_a, centre_a), centred(b, keep_b, centre_b))
+    first, x, tried = propose(problem)
+    if len(first) == 0:
+        return _nothing()
+    x = _grow(problem, first, x)
+    if len(x) == 0:
+        return _nothing()
+    odds = _log_odds(problem, _everything(problem, x), x, tried)
+    best = int(np.argmax(odds))
+    other = np.where(_differ(x, x[best]), odds, -np.inf)
+    second = int(np.argmax(other)) if np.isfinite(other).any() else None
+    fitted, covariance, matches = _finish(problem, x[best])
+
+    def whole(pose: Floats) -> Floats:
+        transform = lift_se2(pose[[0, 1, 3]])
+        transform[:3, 3] = pose[:3] + centre_b - transform[:3, :3] @ centre_a
+        return transform
+
+    b_T_a = whole(fitted)
+    lever = np.eye(4)  # The translation of b_T_a is that of the centre, less the turned centre.
+    turned = b_T_a[:3, :3] @ centre_a
+    lever[0, 3], lever[1, 3] = turned[1], -turned[0]
+    return Registration(
+        b_T_a,
+        lever @ covariance @ lever.T,
+        np.column_stack([keep_a[matches[:, 0]], keep_b[matches[:, 1]]]),
+        float(odds[best]),
+        None if second is None else whole(x[second]),
+        -np.inf if second is None else float(other[second]),
+    )
+
+
+def _nothing() -> Registration:
+    unknown = np.full((4, 4), np.nan)
+    return Registration(unknown, unknown, np.zeros((0, 2), dtype=np.int64), -np.inf, None, -np.inf)
+
+
+def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
+    """Return the best transforms (H, 4), each fitted to the objects around its pair, then farther, then to all."""
+    for size, entering in _STAGES:
+        first, x = first[:entering], x[:entering]
+        index = around(problem.a, first, size)
+        hessian = np.full((len(x), 4, 4), np.nan)
+        for _ in range(_FITS):
+            x, hessian = fit(problem, index, x, hessian)
+        fitted = np.isfinite(hessian).all(axis=(1, 2))
+        first, x, index = first[fitted], x[fitted], index[fitted]
+        best = np.argsort(-_log_odds(problem, index, x, 1), kind="stable")
+        kept: list[int] = []
+        for h in best.tolist():
+            if not kept or _differ(x[kept], x[h]).all():
+                kept.append(h)
+        first, x = first[kept], x[kept]
+    return x
+
+
+def _everything(problem: Problem, x: Floats) -> Ints:
+    """Return the indices (H, N) of all objects of a for each transform."""
+    return np.broadcast_to(np.arange(len(problem.a.label)), (len(x), len(problem.a.label)))
+
+
+def _differ(x: Floats, other: Floats) -> Bools:
+    """Return which transforms (H, 4) are another place than one transform (4,)."""
+    turn = (x[:, 3] - other[3] + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray((np.hypot(*(x[:, :2] - other[:2]).T) > _SAME_SHIFT) | (np.abs(turn) > _SAME_TURN))
+
+
+def _log_odds(problem: Problem, index: Ints, x: Floats, tried: int) -> Floats:
+    """Return the log odds against chance (H,) of transforms (H, 4), by the formula of `register_maps`.
+
+    The tail of the Poisson distribution is bounded by its first term and a geometric series: with mean u, P(X >= n) is at
+    most exp(n ln u - u - ln n!) / (1 - u / (n + 1)).
+    """
+    moved = move(x, problem.a.position[index])
+    partner, miss, covariance, _, _ = gate(problem, index, x, np.full((len(x), 4, 4), np.nan))
+    squared = (miss * np.linalg.solve(covariance, miss[..., None])[..., 0]).sum(axis=-1)
+    number = np.maximum(one_each(partner, squared <= SAME_POINT).sum(axis=1) - 2, 0)
+    mean = np.maximum(problem.chance(moved, index, covariance).sum(axis=1), 1e-12)
+    beyond = number > mean
+    rest = np.where(beyond, mean / (number + 1), 0.0)
+    tail = number * np.log(mean) - mean - gammaln(number + 1) - np.log1p(-rest)
+    return np.asarray(-np.where(beyond, np.minimum(tail, 0.0), 0.0) - np.log(tried))
+
+
+def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
+    """Match all objects one-to-one under a transform (4,) and fit it to the matches.
+
+    Returns the transform, its covariance (4, 4), and the matches (P, 2).
+    """
+    a = b = np.zeros(0, dtype=np.int64)
+    hessian = np.eye(4)[None]
+    for _ in range(_FITS):
+        moved = move(x[None], problem.a.position[None])[0]
+        near = KDTree(moved).sparse_distance_matrix(KDTree(problem.b.position), _reach(problem), output_type="coo_matrix")
+        one, two = (np.asarray(rows, dtype=np.int64) for rows in (near.row, near.col))
+        equal = problem.a.label[one] == problem.b.label[two]
+        one, two = one[equal], two[equal]
+        miss = problem.b.position[two] - moved[one]
+        squared = (
+            miss * np.linalg.solve(covariances(problem, x[None], one[None], two[None])[0], miss[..., None])[..., 0]
+        ).sum(axis=1)
+        good = squared <= SAME_POINT
+        gain = np.zeros((len(moved), len(problem.b.label)))
+        gain[one[good], two[good]] = 2 * SAME_POINT - squared[good]
+        a, b = linear_sum_assignment(-gain)
+        matched = gain[a, b] > 0
+        a, b = a[matched], b[matched]
+        if len(a) < 2:
+            break
+        fitted, hessian = robust_step(
+            x[None],
+            (problem.b.position[b] - moved[a])[None],
+            covariances(problem, x[None], a[None], b[None]),
+            jacobian_of(x[None], moved[a][None]),
+            np.ones((1, len(a)), dtype=bool),
+        )
+        x = fitted[0]
+    return x, np.linalg.inv(hessian[0]), np.column_stack([a, b])
+
+
+def _reach(problem: Problem) -> float:
+    """Return the largest distance (m) of two objects that may match."""
+    widest = sum(float(np.linalg.eigvalsh(m.covariance)[:, -1].max()) for m in (problem.a, problem.b))
+    return float(np.sqrt(SAME_POINT * widest))

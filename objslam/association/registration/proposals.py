@@ -1,0 +1,112 @@
+"""Propose transforms between two maps: pairs of objects with equal labels and equal distances."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from objslam.association.place_recognition import Constellation
+from objslam.association.registration.fitting import Problem, move
+from objslam.core.arrays import Array, Floats, Ints
+
+_PAIRS = 6000
+"""The most ordered pairs of one map that propose transforms, except that each object has at least `_MIN_PARTNERS`. A larger
+number finds smaller overlaps and takes longer. Chosen for time, not by a sweep."""
+_MIN_PARTNERS = 6
+"""The least number of partners of an object in the pairs. A larger number takes longer on large maps."""
+_MIN_BASE = 6.0
+"""The least distance of a pair's two objects, in standard deviations of their difference. A larger value gives better
+headings and fewer pairs. At 6, the heading of a pair has a standard deviation below 1/6 rad in each map."""
+_GATE = 3.0
+"""The largest difference of two pairs' lengths, in standard deviations. A larger value proposes more wrong transforms."""
+_MAX_PROPOSALS = 60_000
+"""The most proposals that are compared by the neighbours of their pair. A larger number takes longer."""
+_NEIGHBOURS = 12
+"""The number of neighbours that compare a proposal. A larger number ranks better and takes longer."""
+_AT_ONCE = 1 << 20
+"""The most differences of neighbours computed together. A larger number needs more memory."""
+
+
+def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
+    """Return the ordered pairs (P,), (P,) of each object and its nearest partners that give a heading."""
+    count = len(m.label)
+    partners = min(count - 1, max(_MIN_PARTNERS, _PAIRS // count))
+    distance, index = KDTree(m.position[:, :2]).query(m.position[:, :2], k=min(count, 3 * partners + 1))
+    far = distance > _MIN_BASE * np.sqrt(spread[:, None] + spread[index])
+    i, column = np.nonzero(far & (np.cumsum(far, axis=1) <= partners))
+    return i, np.asarray(index)[i, column]
+
+
+def propose(problem: Problem) -> tuple[Ints, Floats, int]:
+    """Return the proposals: the first object (H,) of its pair in a, the transform (H, 4), and how many were tried in all.
+
+    A transform is where the middle of a lies in b: x, y, z (m) and yaw (rad). If there are too many proposals, those of the
+    pairs with the fewest like pairs remain, because they are the most distinctive.
+    """
+    a, b = problem.a, problem.b
+    (i, j), (k, n) = _pairs(a, problem.spread_a), _pairs(b, problem.spread_b)
+    base_a, base_b = a.position[j] - a.position[i], b.position[n] - b.position[k]
+    long_a, long_b = (np.hypot(base[:, 0], base[:, 1]) for base in (base_a, base_b))
+    var_a, var_b = problem.spread_a[i] + problem.spread_a[j], problem.spread_b[k] + problem.spread_b[n]
+    labels = int(a.label.max()) + 1
+    key = (b.label[k] * labels + b.label[n]) * 2 * problem.apart + long_b
+    order = np.argsort(key, kind="stable")
+    middle = (a.label[i] * labels + a.label[j]) * 2 * problem.apart + long_a
+    reach = np.minimum(_GATE * np.sqrt(var_a + var_b.max(initial=0.0)), problem.apart / 4)
+    begin, end = np.searchsorted(key[order], middle - reach), np.searchsorted(key[order], middle + reach, side="right")
+    number = end - begin
+    rare = np.argsort(number, kind="stable")
+    rare = rare[np.cumsum(number[rare]) <= _MAX_PROPOSALS]
+    p = np.repeat(rare, number[rare])
+    step = np.arange(len(p)) - np.repeat(np.cumsum(number[rare]) - number[rare], number[rare])
+    q = order[begin[p] + step]
+    tall_a, tall_b = (m.covariance[u, 2, 2] + m.covariance[v, 2, 2] for m, u, v in ((a, i, j), (b, k, n)))
+    fits = np.abs(long_a[p] - long_b[q]) <= _GATE * np.sqrt(var_a[p] + var_b[q])
+    fits &= np.abs(base_a[p, 2] - base_b[q, 2]) <= _GATE * np.sqrt(tall_a[p] + tall_b[q])
+    share = fits.mean() if len(fits) else 0.0
+    p, q = p[fits], q[fits]
+    yaw = np.arctan2(base_b[q, 1], base_b[q, 0]) - np.arctan2(base_a[p, 1], base_a[p, 0])
+    x = np.column_stack([np.zeros((len(p), 3)), yaw])
+    ends_a, ends_b = a.position[i[p]] + a.position[j[p]], b.position[k[q]] + b.position[n[q]]
+    x[:, :3] = (ends_b - move(x, ends_a[:, None])[:, 0]) / 2
+    support = _support(problem, i[p], k[q], yaw, (var_a[p] + var_b[q]) / long_a[p] ** 2)
+    best = np.argsort(-support, kind="stable")
+    # Of the proposals of one place, in cells of a metre and of 0.2 rad, only the best remains.
+    cell = np.round(np.column_stack([x[:, :2], np.mod(yaw, 2 * np.pi) / 0.2]))[best]
+    best = best[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
+    return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair proposes in both orders.
+
+
+def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
+    """Return how many neighbours (H,) of the object i (H,) of a land on a neighbour of the object k (H,) of b."""
+    (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))
+    support = np.zeros(len(i))
+    spread = float(np.median(problem.spread_b))
+    size = max(1, _AT_ONCE // (near_a.shape[1] * near_b.shape[1]))
+    for begin in range(0, len(i), size):
+        h = slice(begin, begin + size)
+        a, b = near_a[i[h]], near_b[k[h]]
+        turned = offset_a[i[h]] * np.exp(1j * yaw[h])[:, None]
+        own = problem.spread_a[i[h]] + problem.spread_b[k[h]]
+        variance = problem.spread_a[a] + spread + own[:, None] + np.abs(turned) ** 2 * turn_variance[h, None]
+        miss = turned[:, :, None] - offset_b[k[h]][:, None, :]
+        close = miss.real**2 + miss.imag**2 <= _GATE**2 * variance[:, :, None]
+        close &= problem.a.label[a][:, :, None] == problem.b.label[b][:, None, :]
+        rise = problem.a.position[a, 2] - problem.a.position[i[h], 2][:, None]
+        rise_b = problem.b.position[b, 2] - problem.b.position[k[h], 2][:, None]
+        tall = problem.a.covariance[a, 2, 2] + 2 * np.median(problem.b.covariance[:, 2, 2])
+        tall += problem.a.covariance[i[h], 2, 2][:, None]
+        close &= (rise[:, :, None] - rise_b[:, None, :]) ** 2 <= _GATE**2 * tall[:, :, None]
+        support[h] = close.any(axis=2).sum(axis=1)
+    return support
+
+
+def _offsets(m: Constellation) -> tuple[Ints, Array]:
+    """Return the neighbours (N, K) of each object and their offsets (N, K), as complex numbers."""
+    plane = m.position[:, 0] + 1j * m.position[:, 1]
+    near = around(m, np.arange(len(plane)), _NEIGHBOURS + 1)[:, 1:]
+    return near, plane[near] - plane[:, None]
+
+
+def around(m: Constellation, index: Ints, size: int) -> Ints:
+    """Return for each object `index` (H,) the `size` objects nearest to it, itself first."""
+    at = m.position[:, :2]
+    return np.asarray(KDTree(at).query(at[index], k=np.arange(1, min(size, len(at)) + 1))[1])
