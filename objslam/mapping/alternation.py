@@ -164,6 +164,18 @@ def _joint(
             trace.end_round(why, association, solved)
         return solved
 
+    rounds: list[dict[str, int]] = []
+
+    def merge(association: Association, estimate: Estimate, hold: bool) -> tuple[Association, Estimate]:
+        for _ in range(settings.joint.max_rounds):
+            merged = merge_unseen_together(rays, association, estimate, settings.association.duplicate_distance)
+            if merged.count == association.count:
+                break
+            rounds.append({"objects": merged.count, "rays_changed": rays_moved(association.object, merged.object)})
+            association = merged
+            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera, hold)
+        return association, estimate
+
     if start is None and may_be_by_label(settings, all_rays):
         by_label, expected = associate_by_label(rays), errors
         solved = solve_round("labels", by_label)
@@ -199,7 +211,6 @@ def _joint(
     if start is not None:
         map_T_camera, guess = start.map_T_camera, (start.association, start.positions)
     map_T_base = map_T_camera @ inverse(keyframes.base_T_camera)
-    rounds: list[dict[str, int]] = []
     association: Association | None = None
     for number in range(settings.joint.max_rounds):
         progress(f"association, round {number + 1}", 0, 0)
@@ -217,19 +228,14 @@ def _joint(
             break
         association = found
         estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera, hold)
-        for _ in range(settings.joint.max_rounds):
-            merged = merge_unseen_together(rays, association, estimate, settings.association.duplicate_distance)
-            if merged.count == association.count:
-                break
-            rounds.append({"objects": merged.count, "rays_changed": rays_moved(association.object, merged.object)})
-            association = merged
-            estimate = solve_round("merge", association, estimate.map_T_base @ keyframes.base_T_camera, hold)
+        association, estimate = merge(association, estimate, hold)
         map_T_base, guess = estimate.map_T_base, (association, estimate.positions)
     else:
         ledger.warn(f"the association still changes after {settings.joint.max_rounds} rounds (joint.max_rounds)")
     assert association is not None
-    if hold:
+    if hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         estimate = solve_round("association", association, map_T_base @ keyframes.base_T_camera)
+        association, estimate = merge(association, estimate, hold=False)
     assert estimate is not None
     return association, estimate, rounds
 
