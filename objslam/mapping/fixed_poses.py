@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
 _ROUNDS = 8
 """The most rounds of association and calibration. Two or three are usual. More rounds are slower."""
-_SAME = 0.2
-"""The shared errors have converged if they change by fewer standard deviations than this. A larger number ends sooner."""
+_SAME = 0.1
+"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. A tenth of
+the noise moves hardly a ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared errors
+does not work: with precise errors, the association can swing between two states for ever."""
 _EXPLAINED = 0.5
 """An association explains too few rays below this share. A larger share tries another association more often."""
 
@@ -98,17 +100,18 @@ def calibrate_fixed(
     The covariance of the errors is added to the covariance of the objects. Returns the input without the errors, the
     association, the estimate, and the number of objects in each round.
     """
-    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
     noise = pose_noise(errors.rays, errors.keyframes, at.settings)
+    told = noise_of_errors(every, calibration)
     rounds: list[dict[str, int]] = []
     for number in range(_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
-        association = now.associate(noise_of_errors(every, calibration))
+        association = now.associate(told)
         if (plain := _explains_far_more(now, association)) is not None:
             association = plain
         rounds.append({"objects": association.count})
@@ -120,9 +123,11 @@ def calibrate_fixed(
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             return now, association, replace(estimate, calibration=calibration), rounds
-        moved = np.abs(found.calibration.values - calibration.values)
-        calibration = found.calibration
-        if (moved < _SAME * calibration.sigma).all():
+        allowed = np.hypot(noise[0], told)
+        turned = turned_by_errors(every, calibration.values, found.calibration.values)
+        calibration, told = found.calibration, noise_of_errors(every, found.calibration)
+        changes = turned / allowed, np.hypot(noise[0], told) / allowed - 1
+        if all(np.sqrt((change**2).mean()) < _SAME for change in changes):
             break
     else:
         ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")

@@ -98,12 +98,17 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
     size, axes = np.linalg.eigh(calibration.covariance)
     variance = np.zeros(len(errors.rays))
     for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-        ends = []
-        for sign in (1, -1):
-            keyframes, rays, _ = errors.at(calibration.values + sign * step, drift=False)
-            ends.append(rays.in_map(keyframes.map_T_camera)[1])
-        variance += ((ends[0] - ends[1]) ** 2).sum(axis=1) / 4
+        variance += turned_by_errors(errors, calibration.values - step, calibration.values + step) ** 2 / 4
     return np.sqrt(variance)
+
+
+def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
+    """Return the angles (R,), rad, by which ray directions in map turn from some shared errors (P,) to others (P,)."""
+    ends = []
+    for values in (before, after):
+        keyframes, rays, _ = errors.at(values, drift=False)
+        ends.append(rays.in_map(keyframes.map_T_camera)[1])
+    return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1))
 
 
 def linearise_points(
