@@ -1,4 +1,4 @@
-"""Alternate association and solve until the association is stable. `fixed_poses` does both where the poses are fixed."""
+"""Alternate association and solve until the association is stable. `fixed_poses` is the part for fixed poses."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def solve(
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
     the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are
-    estimated, and taken out of the keyframes and rays. SolveError if the joint mode has neither odometry nor localisation.
+    estimated and removed from the keyframes and rays. SolveError if the joint mode has neither odometry nor localisation.
     """
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
@@ -102,7 +102,7 @@ def solve(
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
-    """Return the keyframes and rays that an estimate belongs to: without its shared errors, and with its noise."""
+    """Return the keyframes and rays that belong to an estimate: without its shared errors, and with its noise."""
     values = errors.mean if estimate.calibration is None else estimate.calibration.values
     keyframes, rays, _ = with_noise_of(errors, estimate).at(values)
     return keyframes, rays
@@ -111,7 +111,7 @@ def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes,
 def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
     """Return shared errors with the noise of an estimate.
 
-    Lengths are as they were measured: only inside a solve they make up for its shrinkage.
+    Lengths keep their measured scale. The shrinkage is corrected only inside a solve.
     """
     noise = errors.noise if estimate.noise is None else estimate.noise
     return errors.with_noise(replace(noise, shrinkage=0.0))
@@ -216,7 +216,7 @@ def _joint(
         progress(f"association, round {number + 1}", 0, 0)
         if errors is not None and theta is not None:
             frames, all_rays, _ = errors.take(*measured).at(theta, drift=False)
-            # Noise below the nominal one is that of rays which agreed. A gate must let the others in, too.
+            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the larger one.
             all_rays = replace(all_rays, sigma=np.maximum(all_rays.sigma, measured[1].sigma))
         at = correct_poses(frames.stamps, frames.map_T_base, keyframes.stamps, keyframes.map_T_base, map_T_base)
         scale = 1.0 if rounds else _FIRST
@@ -279,9 +279,9 @@ def rays_moved(before: Ints, after: Ints) -> int:
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
     """Merge pairs of objects of one label whose positions agree within their covariances, and that share no frame.
 
-    If poses drift between two visits, an object appears twice, and each copy holds the poses of its visit. So no association
-    at these poses can find the error, and a merge closes the loop. The nearest pairs by Mahalanobis distance merge first. An
-    object takes part in one merge at a time. farthest: the largest distance (m) of a pair.
+    If poses drift between two visits, an object appears twice. Each copy keeps the poses of its visit where they are. So an
+    association at these poses cannot find the error, but a merge closes the loop. The nearest pairs by Mahalanobis distance
+    merge first. An object takes part in one merge at a time. farthest: the largest distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))

@@ -6,16 +6,16 @@ from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes
 
 _STEADY = 0.7
-"""How long the mean of the cameras' unit up vectors must be. A smaller value judges cameras that roll about, too."""
+"""The least length of the mean of the cameras' unit up vectors. A smaller value also judges cameras that roll about."""
 _TILT = np.radians(45)
-"""The angle, rad, between this mean and the map's z axis, above which the map lies on its side. Cameras on robots look up or
+"""The angle, rad, between this mean and the map's z axis above which the map lies on its side. Cameras on robots look up or
 down by less. A larger angle warns less often."""
 
 
 def lies_on_its_side(keyframes: Keyframes) -> str | None:
     """Return a warning if the cameras' mean up vector is far from the map's z axis, as after visual SLAM; None otherwise.
 
-    A planar path tells where up is by itself, so there is no warning.
+    There is no warning for a planar path, because its plane shows where up is.
     """
     if not len(keyframes) or is_planar(keyframes.map_T_base):
         return None
