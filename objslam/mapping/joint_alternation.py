@@ -14,6 +14,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
+from objslam.core.noise import NoiseFactors
 from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
@@ -31,6 +32,12 @@ _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
 """The noise (m, rad) of solved poses that an association expects. Larger values let it tolerate larger residuals."""
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve. A larger factor tolerates larger residuals."""
+_NOISIER = 1.5
+"""The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
+A larger factor explores fewer logs twice."""
+_LOOSE = 3.0
+"""The factor on the noise of the odometry in this exploration if the solve found only the rays to be noisy. A larger factor
+suits worse odometry, and loses more objects of good odometry."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
@@ -146,16 +153,21 @@ class JointState:
         drift = _turned_since(self.keyframes, self.rays.keyframe[self.association.object >= 0])[self.rays.keyframe]
         if not (drift > self.rays.sigma).any():
             return self
-        trace = None if self.trace is None else self.trace.aside()
-        attempt = replace(self, ledger=Ledger(), trace=trace)
         guess = self.association, self.estimate.positions
-        found = attempt.alternated(self.estimate.map_T_base, guess, drifting=True)
-        if found.explained <= self.explained:
+        return self.better(self.attempt().alternated(self.estimate.map_T_base, guess, drifting=True))
+
+    def attempt(self) -> Self:
+        """Return a state for rounds that may be discarded."""
+        return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
+
+    def better(self, attempt: Self) -> Self:
+        """Return the result of an attempt if it explains more rays than this state, else this state."""
+        if attempt.explained <= self.explained:
             return self
-        self.ledger.add(found.ledger)
-        if self.trace is not None and trace is not None:
-            self.trace.rounds.extend(trace.rounds)
-        return replace(found, ledger=self.ledger, trace=self.trace)
+        self.ledger.add(attempt.ledger)
+        if self.trace is not None and attempt.trace is not None:
+            self.trace.rounds.extend(attempt.trace.rounds)
+        return replace(attempt, ledger=self.ledger, trace=self.trace)
 
     @property
     def explained(self) -> int:
@@ -207,11 +219,13 @@ def solve_joint(
             assert state.estimate is not None
             return state.association, state.estimate, ()
         state = replace(state, association=None, estimate=None)
-    if start is None and not state.keyframes.localized_every:
-        state, start = _explored(state)
-    map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
-    guess = None if start is None else (start.association, start.positions)
-    state = state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess).drift_followed()
+    if start is not None or state.keyframes.localized_every:
+        state = _from_start(state, start).drift_followed()
+    else:
+        state = _from_start(*_explored(state)).drift_followed()
+        noisier = _with_loose_odometry(state)
+        if noisier is not None:
+            state = state.better(_from_start(*_explored(noisier)).drift_followed())
     if not state.settled:
         rounds = state.settings.joint.max_rounds
         state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
@@ -221,6 +235,13 @@ def solve_joint(
     assert state.association is not None
     assert state.estimate is not None
     return state.association, state.estimate, state.rounds
+
+
+def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after rounds from a start, or from the poses of the keyframes."""
+    map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
+    guess = None if start is None else (start.association, start.positions)
+    return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
 
 
 def _by_label(state: JointState) -> tuple[JointState, bool]:
@@ -260,6 +281,24 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
     assert solved.estimate is not None
     start = replace(start, map_T_camera=solved.solved_poses, positions=solved.estimate.positions)
     return replace(solved, hold=True, association=None), start
+
+
+def _with_loose_odometry(state: JointState) -> JointState | None:
+    """Return an attempt with the noise of the odometry that the last solve suggests, None if it is about nominal.
+
+    The solve finds this noise, but the exploration needs it before. A wrong map can hide it in the noise of the rays.
+    """
+    if state.errors is None or "odometry" not in state.errors.unknown_noise:
+        return None
+    found, values = state.errors.noise, state.theta
+    if max(found.along, found.turning) <= _NOISIER:
+        if found.rays <= _NOISIER:
+            return None
+        found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), None
+    errors = state.errors.with_noise(replace(found, shrinkage=0.0))
+    keyframes, rays, _ = errors.at(errors.mean if values is None else values)
+    unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
+    return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
 
 
 def _turned_since(keyframes: Keyframes, assigned: Ints) -> Floats:
