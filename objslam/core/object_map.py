@@ -122,7 +122,7 @@ class ObjectMap:
 
     @property
     def positions(self) -> Floats:
-        """(N, 3) m, the positions of all objects. That of an unresolved object is a guess on its ray, or NaN."""
+        """(N, 3) m, the positions of all objects. The position of an unresolved object is a guess on its ray, or NaN."""
         return np.array([o.position for o in self.objects], dtype=np.float64).reshape(-1, 3)
 
     @property

@@ -142,7 +142,7 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
-    reading: what was dropped while the log was read, None if nobody kept account of it.
+    reading: the data dropped while the log was read, None if they were not counted.
     """
 
     name: str

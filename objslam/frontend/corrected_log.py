@@ -40,7 +40,7 @@ def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Traj
 
 
 class CorrectablePath:
-    """Odometry that is corrected for many values of its errors. What no error changes is computed once."""
+    """Odometry that is corrected for many values of its errors. The parts that no error changes are computed once."""
 
     def __init__(self, odometry: Trajectory) -> None:
         """Measure the steps of the odometry."""
@@ -120,7 +120,7 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 
 def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
-    """Return unit directions (R, 3). Those that `mine` (R,) marks are for a focal length that is longer by the share
+    """Return unit directions (R, 3). Directions in the mask `mine` (R,) are for a longer focal length, by the share
     `focal`."""
     if focal == 0:
         return directions
@@ -150,7 +150,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data with errors taken out. path: the path on which its stamps stay (see `later`), or None."""
+    """Return a camera and its data without errors. path: the path on which its stamps stay (see `later`), or None."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

@@ -1,4 +1,4 @@
-"""Remove what failed or killed work leaves on the disk: empty folders, temporary files and temporary folders."""
+"""Remove the remains of failed or killed work from the disk: empty folders, temporary files and temporary folders."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ OLD = "old"
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """After an error in the block, delete those of `path` and its parents that the block created and left empty."""
+    """If the block raises an error, delete the folders of `path` and its parents that the block created and left empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

@@ -92,7 +92,7 @@ class MapState:
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
     the course. rng: seeded by the settings.
     given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
-    the cameras as received, and without their errors. errors: by name, the errors that are taken out of all measurements.
+    the cameras as received, and without their errors. errors: by name, the errors that are corrected in all measurements.
     calibration: the estimate of these errors.
     """
 

@@ -58,7 +58,7 @@ class Intake:
         self._lead = Lead(self._clock, settings.poses.max_gap)
 
     def push_camera(self, camera: Camera) -> bool:
-        """Push as `Sink` says. A known camera that has not changed is accepted, but not delivered again."""
+        """Push a camera, as `Sink.push_camera`. A known camera that has not changed is accepted, but not delivered again."""
         sound = checks.sound_camera(camera)
         if isinstance(sound, str):
             return self._refuse(f"camera {sound}", checks.told(camera.name if isinstance(camera, Camera) else camera))
