@@ -25,7 +25,7 @@ _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
 noisy and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01
-"""The step of every other parameter, in its unit; the measurements are close to linear over it."""
+"""The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
 """The largest absolute value of a parameter without a bound of its own, in standard deviations of its prior. A larger value
 lets a parameter move farther from its prior."""
@@ -202,7 +202,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # the stamps of the poses, which end with the path
+        known = stamps.copy()  # The stamps of the poses, which end with the path.
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 OLD = "old"
-"""The entry of a temporary folder that holds the folder that is just being replaced."""
+"""The name, in a temporary folder, of the folder that is being replaced."""
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def temporary_name(path: Path) -> str:
 def remove_leftovers(path: Path) -> None:
     """Delete the temporary files and folders beside `path` that dead processes of this machine left (`temporary_name`).
 
-    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Those
+    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Entries
     of other machines stay, because a process on the same disk may be alive there. Raises OSError if the disk refuses.
     """
     ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)

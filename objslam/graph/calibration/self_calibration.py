@@ -50,8 +50,8 @@ _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
 
 _LEAST_GROWTH = 0.5
-"""The least growth of the map for a reliable projection, if all scales grow by 1. Without linearisation errors, the growth
-is 1. With a larger value, the projection is used more rarely."""
+"""If all scales grow by 1, the linearised map must grow at least by this, or the projection is not used. An exact map would
+grow by 1. With a larger value, the projection is used more rarely."""
 _FAR = 3.0
 """Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
 determined landmarks count too."""

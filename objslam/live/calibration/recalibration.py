@@ -1,4 +1,4 @@
-"""Take other values of the shared errors out of a live map: out of its path, keyframes, rays, tracks and graph."""
+"""Correct a live map by new values of the shared errors: its path, keyframes, rays, tracks and graph."""
 
 import numpy as np
 

@@ -194,7 +194,7 @@ def _read_camera(data: bytes) -> CameraMessage:
     if known is None:
         raise ValueError("an unknown lens model")
     inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
-    # Older journals do not store whether boxes show sizes, and only sensors that tell it have a noise of their depths.
+    # Older journals do not store `sees_size`. The noise of depths is stored only if a sensor has its own.
     sees_size = bool(more[0]) if more else True
     noise = RangeNoise(*_array(more[1], (3,)).tolist()) if len(more) > 1 else None
     size = _integer(width), _integer(height)
