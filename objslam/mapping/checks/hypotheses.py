@@ -179,7 +179,7 @@ def yaws(poses: Floats) -> Floats:
 
 
 def _yaw_times(poses: Floats, factor: float) -> Floats:
-    """Return poses with other headings."""
+    """Return poses with their headings multiplied by a factor."""
     yaw = factor * yaws(poses)
     return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
 
