@@ -13,7 +13,7 @@ from objslam.core.statistics import grouped_median, grouped_quantile, grouped_qu
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
 _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
-_CORE_SHARE = 0.8  # A class's distances come from this share of its boxes, of its strongest objects. Others may be phantoms.
+_CORE_SHARE = 0.8  # The strongest objects, with this share of a class's boxes, set its distances. Others may be phantoms.
 _FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
 _CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it: in m, and as a share of its distance.
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.

@@ -49,8 +49,8 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, a fifth of the number
-    of frames with its less seen landmark.
+    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, the number of frames
+    with its less seen landmark, divided by 5.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)
