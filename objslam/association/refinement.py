@@ -150,7 +150,7 @@ def velocity_gain(
 def _across(to: Floats) -> tuple[Floats, Floats]:
     """Return the lengths (P,) m of offsets (P, 3) m from cameras, and projections (P, 3, 3) perpendicular to them.
 
-    Angles do not change along the line of sight. So a point that moves along with the camera explains nothing.
+    Residuals are angles, which do not change along the line of sight. So a point gains nothing by moving with its camera.
     """
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
     toward = to / distance[:, None]

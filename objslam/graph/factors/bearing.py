@@ -85,7 +85,7 @@ def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
 def tangent_basis(directions: Floats) -> Floats:
     """Return two unit vectors (R, 3, 2) across unit directions (R, 3), as GTSAM chooses them (`Unit3::basis`).
 
-    The first is the cross product with the axis that the direction has least of.
+    The first one is the cross product with the axis along which the direction has its smallest component.
     """
     first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
