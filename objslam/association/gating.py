@@ -134,7 +134,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
         chosen[ray[taken]] = landmark[taken]
         rest = rest[~apart]
     order = np.lexsort((landmark[rest], ray[rest], part[rest]))
-    ray, landmark, gain, part = (values[rest[order]] for values in (ray, landmark, gain, part))
+    rest = rest[order]
+    ray, landmark, gain, part = ray[rest], landmark[rest], gain[rest], part[rest]
     bounds = np.flatnonzero(np.diff(part, prepend=-1, append=-1)).tolist()
     for i, j in pairwise(bounds):
         rows, r = np.unique(ray[i:j], return_inverse=True)

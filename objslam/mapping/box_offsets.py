@@ -16,7 +16,7 @@ from objslam.core.camera import Camera
 from objslam.core.geometry import evenly_spread, is_planar
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
-from objslam.mapping.alternation import Solution
+from objslam.mapping.solution import Solution
 
 _SIDES = 103
 """The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All rays from one side

@@ -5,8 +5,8 @@ from dataclasses import replace
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.alternation import Solution, with_noise_of
 from objslam.mapping.checks.shared_errors import warn_of_large_errors
+from objslam.mapping.solution import Solution, with_noise_of
 
 
 def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple[Solution, Log]:

@@ -17,9 +17,9 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
-from objslam.mapping.alternation import Solution
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
+from objslam.mapping.solution import Solution
 
 
 def make_result(

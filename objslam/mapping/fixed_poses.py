@@ -93,7 +93,7 @@ class FixedPoses:
 
 def calibrate_fixed(
     at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
-) -> tuple[FixedPoses, Association, Estimate, list[dict[str, int]]]:
+) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
@@ -107,14 +107,14 @@ def calibrate_fixed(
     every = errors.take(at.frames, at.rays)
     noise = pose_noise(errors.rays, errors.keyframes, at.settings)
     told = noise_of_errors(every, calibration)
-    rounds: list[dict[str, int]] = []
+    rounds: tuple[dict[str, int], ...] = ()
     for number in range(_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
         association = now.associate(told)
         if (plain := _explains_far_more(now, association)) is not None:
             association = plain
-        rounds.append({"objects": association.count})
+        rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
         placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)

@@ -19,7 +19,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import seen_something, solve
+from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
@@ -31,6 +31,7 @@ from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
+from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 
 

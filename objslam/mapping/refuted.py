@@ -17,12 +17,13 @@ from objslam.errors import ObjslamError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import Solution, seen_something, solve
+from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.halves import check_halves, seen_in_both
 from objslam.mapping.checks.mixture import find_mixture
 from objslam.mapping.progress import Progress
+from objslam.mapping.solution import Solution, seen_something
 
 _EXPLAINED = 0.85
 """A solve explains the boxes if it explains at least this share of the rays in each half of a log. A larger share refutes

@@ -6,7 +6,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import angles_off, interpolate, inverse
 from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.alternation import Solution
+from objslam.mapping.solution import Solution
 
 
 def uncorrected_residual(errors: SharedErrors, solution: Solution, path: Trajectory) -> Floats | None:

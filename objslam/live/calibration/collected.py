@@ -11,7 +11,7 @@ from objslam.errors import ObjslamError
 from objslam.frontend.corrected_log import refocused
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.live.mapper.state import MapState
-from objslam.mapping.alternation import seen_something
+from objslam.mapping.solution import seen_something
 
 
 @dataclass(frozen=True)

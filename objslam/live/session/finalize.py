@@ -19,10 +19,11 @@ from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
-from objslam.mapping.alternation import Solution, solve, without_errors
+from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.solution import Solution, without_errors
 
 
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
