@@ -40,7 +40,7 @@ class Snapshot:
     rebuilt. lag: the time, s, from the arrival of the newest message until the map contains it. update: the median and the
     99th percentile of the time, s, from the push of a message to the updated map. counters: how many messages of each kind
     were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
-    image. calibration: the shared errors that the session takes out of its measurements, None if it takes out none.
+    image. calibration: the shared errors that the session corrects in its measurements, None if it corrects none.
     """
 
     stamp: float
