@@ -100,6 +100,11 @@ class Result:
         return Assessment(found["level"], tuple(found["reasons"]))
 
     @property
+    def localised(self) -> bool:
+        """Whether the drive was found in the map of another day, so that the result is in the frame of that map."""
+        return bool(self.summary.get("localisation", {}).get("localised", False))
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """The warnings of the run, one line each."""
         return tuple(self.summary.get("warnings", ()))

@@ -26,6 +26,8 @@ def choose_alignment(out: Path) -> tuple[Alignment, str]:
     summary = load_summary(out)
     if summary.get("map_frame") == "localization":
         return "none", "a localisation fixed the frame of the map"
+    if summary.get("map_frame") == "map":
+        return "none", "the drive was found in an older map, whose frame it has"
     if summary.get("map_frame") == "odometry":
         planar = summary.get("planar") is not False
         return ("se2", "the map has the frame of the odometry") if planar else ("se3", _IN_SPACE)

@@ -115,7 +115,7 @@ def solve_joint(
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings, multiframes)
+        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes)
 
     if errors is None:
         measured = measure(keyframes, rays, settings)
@@ -211,7 +211,7 @@ def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, lan
     return shift[:, :, None] * shift[:, None, :]
 
 
-def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
+def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
     # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
     ranged = np.isfinite(rays.range) & (association.object >= 0)

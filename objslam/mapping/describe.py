@@ -128,8 +128,8 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the content of summary.json. counts: how many images, frames and boxes the driver found.
 
-    `map_frame` in it says what fixed the frame of the map: `localization`, or `odometry` if nothing absolute did. `planar`
-    says whether the measured path has one height, roll and pitch.
+    `map_frame` in it says what fixed the frame of the map: `localization`, or `odometry` if nothing absolute did. A drive
+    that was found in an older map has `map`. `planar` says whether the measured path has one height, roll and pitch.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
