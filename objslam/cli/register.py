@@ -30,7 +30,7 @@ def register_results(
         say("sigma: x {:.3f} y {:.3f} z {:.3f} m, yaw {:.2f} deg".format(*sigma))
     for i, k in found.matches.tolist():
         say(f"  {one[i].label} #{one[i].id} is #{other[k].id}")
-    why = reason(found, one, other)
+    why = reason(found, one, other, (str(a), str(b)))
     say(f"registered: {why}" if found.accepted else f"not registered: {why}")
     if not found.accepted:
         raise typer.Exit(1)

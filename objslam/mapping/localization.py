@@ -58,7 +58,7 @@ def localize(
     the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
     """
     found = register(objects, known.objects)
-    why = reason(found, objects, known.objects)
+    why = reason(found, objects, known.objects, ("the drive", "the map"))
     told: dict[str, Any] = {
         "map": known.name,
         "localised": found.accepted,

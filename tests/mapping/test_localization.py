@@ -97,4 +97,4 @@ def test_the_map_of_another_room_refuses_the_drive(days):
 def test_an_empty_map_says_why(days):
     ledger = Ledger()
     result = run(days[1], settings(), ledger, known=PriorMap("empty", ObjectMap(())))
-    assert "the other map has 0 resolved objects" in result.summary["localisation"]["line"]
+    assert "the map has 0 resolved objects" in result.summary["localisation"]["line"]

@@ -36,11 +36,11 @@ def placed(objects: ObjectMap) -> list[int]:
     return [i for i, o in enumerate(objects.objects) if o.status == "ok" and o.covariance is not None]
 
 
-def reason(found: Registration, a: ObjectMap, b: ObjectMap) -> str:
-    """Return in a few words why the registration of a to b was accepted or refused."""
-    for name, objects in (("first", a), ("other", b)):
+def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
+    """Return in a few words why the registration of a to b was accepted or refused. names: of a and b."""
+    for name, objects in zip(names, (a, b), strict=True):
         if len(placed(objects)) < 2:
-            return f"too little evidence, because the {name} map has {len(placed(objects))} resolved objects"
+            return f"too little evidence, because {name} has {len(placed(objects))} resolved objects"
     if not len(found.matches):
         return "too little evidence, because no two objects lie to each other alike in both maps"
     odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"
