@@ -115,7 +115,7 @@ def _read(
     return Calibration(camera, placed)
 
 
-def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
+def parse_camera(text: bytes, place: str, ledger: Ledger, name: str | None) -> Camera:
     """Parse a camera from a text in the format of a camera file. Raises LogError, which names `place` as the file."""
     path = Path(place)
     return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
@@ -123,6 +123,11 @@ def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
 
 def write_camera(camera: Camera, path: Path) -> None:
     """Write a camera file. Every number except the quaternion of the rotation is read back as the same float."""
+    path.write_text(dump_camera(camera), encoding="utf-8")
+
+
+def dump_camera(camera: Camera) -> str:
+    """Return the text of a camera file, as `write_camera` writes it."""
     xyzw = quaternion(camera.base_T_camera[None])[0]
     data = {
         "camera_name": camera.name,
@@ -136,8 +141,7 @@ def write_camera(camera: Camera, path: Path) -> None:
         **({} if camera.sees_size else {"sees_size": False}),
         **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
-    path.write_text(text, encoding="utf-8")
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
 
 
 def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -> LogError:
