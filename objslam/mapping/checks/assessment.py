@@ -30,7 +30,7 @@ class Evidence:
     resolved, unresolved: how many objects have a place, and how many have none. boxes: the boxes of the log. cut: those that
     the image's edge cuts off. rays: the boxes that were used. unexplained: those of no object. misses: the median residual
     as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's frame.
-    findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
+    fixed: whether the poses were taken as they are. findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
     """
 
     resolved: int
@@ -41,6 +41,7 @@ class Evidence:
     unexplained: int
     misses: float
     odometry_frame: bool = False
+    fixed: bool = False
     findings: tuple[str, ...] = ()
     spoilt: bool = False
 
@@ -75,6 +76,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         unexplained=counts["rays_unexplained"],
         misses=misses,
         odometry_frame=summary["map_frame"] == "odometry",
+        fixed=summary["mode"] == "fixed",
         findings=tuple(finding["name"] for finding in findings),
         spoilt=any(finding["spoils_positions"] for finding in findings),
     )
@@ -100,6 +102,9 @@ def _bad(e: Evidence) -> list[str]:
 
 def _check(e: Evidence) -> list[str]:
     found = []
+    if e.fixed and e.odometry_frame:
+        # Objects that drift smears fall into parts, each of which its rays fit well: the residuals do not tell.
+        found.append("The poses are the odometry's as they are, so its drift is in the map: --mode joint takes it out.")
     if e.findings:
         found.append(f"The input has an error that the warnings explain ({', '.join(e.findings)}).")
     elif e.misses > _MISSES:
