@@ -27,10 +27,11 @@ says so more often."""
 class Evidence:
     """The numbers that the judgement looks at.
 
-    resolved, unresolved: how many objects have a place, and how many have none. boxes: the boxes of the log. cut: those that
-    the image's edge cuts off. rays: the boxes that were used. unexplained: those of no object. misses: the median residual
-    as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's frame.
-    fixed: whether the poses were taken as they are. findings: the names of what is wrong with the input. spoilt: whether that spoils positions.
+    resolved, unresolved: how many objects have a place, and how many have none. boxes: the boxes of the log. cut: those
+    that the image's edge cuts off. rays: the boxes that were used. unexplained: those of no object. misses: the median
+    residual as a multiple of its noise, NaN without objects. odometry_frame: whether nothing absolute fixed the map's
+    frame. fixed: whether the poses were taken as they are. findings: the names of what is wrong with the input. spoilt:
+    whether that spoils positions.
     """
 
     resolved: int
