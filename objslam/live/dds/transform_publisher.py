@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 from objslam.core.arrays import Floats
 from objslam.core.snapshot import Snapshot
@@ -31,7 +32,8 @@ class TransformPublisher:
         self._newest: Floats | None = None
         self._messages, self._layout = MapMessages(""), layouts_of(_TYPE)[0]
         qos = Qos(Policy.Reliability.Reliable(0), Policy.Durability.Volatile, Policy.History.KeepLast(_QUEUE))
-        self._writer = DataWriter(network.participant, Topic(network.participant, dds_topic(topic), self._layout), qos=qos)
+        at: Any = Topic(network.participant, dds_topic(topic), self._layout)
+        self._writer: Any = DataWriter(network.participant, at, qos=qos)
 
     def update(self, snapshot: Snapshot) -> None:
         """Take the correction of a snapshot. A snapshot without one leaves the last."""
