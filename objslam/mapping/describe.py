@@ -17,6 +17,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
+from objslam.core.up import up_axis
 from objslam.mapping.alternation import Solution
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
@@ -129,7 +130,7 @@ def summarise(
     """Return the content of summary.json. counts: how many images, frames and boxes the driver found.
 
     `map_frame` in it says what fixed the frame of the map: `localization`, or `odometry` if nothing absolute did. `planar`
-    says whether the measured path has one height, roll and pitch.
+    says whether the measured path has one height, roll and pitch. `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
@@ -141,6 +142,7 @@ def summarise(
         "mode": settings.mode,
         "map_frame": "localization" if solution.keyframes.localized_every else "odometry",
         "planar": is_planar(solution.keyframes.map_T_base),
+        "up": up_axis(solution.keyframes),
         "counts": {
             **counts,
             "keyframes": len(solution.keyframes),
