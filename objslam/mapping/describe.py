@@ -17,7 +17,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
-from objslam.core.up import up_axis
+from objslam.frontend.up import up_axis
 from objslam.mapping.alternation import Solution
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from objslam.core.up import Up
+from objslam.core.types import Up
 
 _Integer = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 _Number = Annotated[float, Field(gt=-1e300, lt=1e300)]

@@ -1,7 +1,7 @@
 """A check of the map's frame: whether its z axis points up."""
 
 from objslam.core.types import Keyframes
-from objslam.core.up import up_axis
+from objslam.frontend.up import up_axis
 
 
 def lies_on_its_side(keyframes: Keyframes) -> str | None:

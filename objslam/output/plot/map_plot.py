@@ -10,7 +10,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
-from objslam.core.up import from_above, up_axis
+from objslam.frontend.up import from_above, up_axis
 from objslam.output.plot.label_layout import needs_leader, place_labels
 from objslam.output.plot.style import captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
 

@@ -10,8 +10,8 @@ import rerun as rr
 from objslam.core.arrays import Floats
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
-from objslam.core.up import up_axis
 from objslam.errors import one_line
+from objslam.frontend.up import up_axis
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, log_cameras
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text

@@ -6,7 +6,8 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import ObjectMap
-from objslam.core.up import Up, from_above, up_vector
+from objslam.core.types import Up
+from objslam.frontend.up import from_above, up_vector
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
 

@@ -1,15 +1,12 @@
 """Which axis of a map points up, by the cameras that saw it, and the view of the map from above."""
 
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import is_planar
-from objslam.core.types import Keyframes
-
-Up = Literal["x", "y", "z", "-x", "-y", "-z"]
-"""An axis of the map's frame, and its direction."""
+from objslam.core.types import Keyframes, Up
 
 _STEADY = 0.7
 """How long the mean of the cameras' unit up vectors must be. A smaller value judges cameras that roll about, too."""
