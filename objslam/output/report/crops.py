@@ -99,12 +99,9 @@ def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
 def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kind]:
     """Choose rays of a label that belong to no object: those with the highest score of each part of the time."""
     mine = np.flatnonzero((rays.object < 0) & (rays.label == label))
-    parts = (
-        np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], min(count, len(mine)))
-        if count and len(mine)
-        else []
-    )
-    return {int(part[np.argmax(rays.score[part])]): "unexplained" for part in parts if len(part)}
+    most = min(count, len(mine))
+    parts = np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], most) if most else []
+    return {int(part[np.argmax(rays.score[part])]): "unexplained" for part in parts}
 
 
 def cut_crops(

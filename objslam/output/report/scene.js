@@ -264,8 +264,7 @@
     for (const button of document.querySelectorAll("[data-zoom]")) button.addEventListener("click", () => zoom(+button.dataset.zoom));
     for (const name of ["rays", "labels", "ellipsoids"]) document.getElementById("scene-" + name).addEventListener("change", redraw);
     for (const link of document.querySelectorAll("[data-show]")) link.addEventListener("click", () => {
-      const o = byId.get(+link.dataset.show);
-      if (o) { view = {...start, target: [...o.at], distance: 0.7 * size}; fitted = false; choose(o.id); }
+      view = {...view, ...start}; fitted = true; choose(+link.dataset.show);
     });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
     new ResizeObserver(redraw).observe(canvas);
