@@ -1,5 +1,6 @@
 """The picture map.png: the map from above."""
 
+import io
 import warnings
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,23 @@ def _draw(result: RunResult, file: Path, truth: Truth | None) -> None:
         if left_out:
             note = f"{left_out} labels have no room"
             axes.text(1, 1.005, note, transform=axes.transAxes, ha="right", va="bottom", fontsize=7, color="#777777")
-        with file.open("wb") as stream:
-            figure.savefig(stream, format="png")
+        _save(figure, canvas, file)
+
+
+def _save(figure: Any, canvas: Any, file: Path) -> None:
+    """Write the figure as a PNG of 256 colours. It looks the same, and is a fifth of the size of all colours."""
+    from PIL import Image
+
+    pixels = io.BytesIO()
+    figure.savefig(pixels, format="rgba")
+    image = Image.frombytes("RGBA", canvas.get_width_height(), pixels.getvalue()).convert("RGB")
+    few = image.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    # The method makes white a shade darker. The paper, as in the first pixel, stays white.
+    palette, paper = few.getpalette() or [], int(np.asarray(few)[0, 0])
+    palette[3 * paper : 3 * paper + 3] = [255, 255, 255]
+    few.putpalette(palette)
+    with file.open("wb") as stream:
+        few.save(stream, format="png")
 
 
 def _frame(result: RunResult, plane: list[int], points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
