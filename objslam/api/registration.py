@@ -1,4 +1,4 @@
-"""Register the map of one run to that of another, where nobody knows how their frames lie to each other."""
+"""Register the map of one run to the map of another run, if the transform between their frames is unknown."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from objslam.core.object_map import ObjectMap
 
 
 def register(a: ObjectMap, b: ObjectMap) -> Registration:
-    """Find the transform b_T_a from the frame of map a to that of map b, by how their objects lie to each other.
+    """Find the transform b_T_a from the frame of map a to the frame of map b, by the relative positions of their objects.
 
     Both frames have z up. The transform turns about z and shifts along x, y and z. Only resolved objects count. `matches`
-    are indices into the objects of a and b. Use the transform only if `accepted` is true: `verdict` says why it is not.
+    are indices into the objects of a and b. Use the transform only if `accepted` is true. Otherwise `verdict` says why not.
     """
     names = sorted({o.label for m in (a, b) for o in m})
     number = {name: k for k, name in enumerate(names)}

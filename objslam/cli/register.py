@@ -1,4 +1,4 @@
-"""The command `objslam register`, which finds how the frames of two maps lie to each other."""
+"""The command `objslam register`, which finds the transform between the frames of two maps."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from objslam.cli.console import say
 
 def register_results(
     a: Annotated[Path, typer.Argument(metavar="A", help="A result folder, or an objects.json.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="The other one.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The other map.")],
 ) -> None:
-    """Register map A to map B by how their objects lie to each other. The exit code is 1 if the evidence is too little."""
+    """Find the transform from map A to map B by the relative positions of their objects. Exit code 1: it is not certain."""
     import numpy as np
 
     from objslam.api.registration import register

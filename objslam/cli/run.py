@@ -131,7 +131,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         console().print(calibration_table(calibration))
     if noise := result.summary.get("noise"):
         found = {name: factor for name, factor in noise.items() if name != "shrinkage"}
-        say("noise, times that of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
+        say("noise, as a multiple of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(
@@ -166,7 +166,7 @@ def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
 
 
 def calibration_table(calibration: dict[str, Any]) -> Table:
-    """Return a table of the shared errors, and which of them the log does not determine."""
+    """Return a table of the shared errors. It marks the errors that the log does not determine."""
     from rich.table import Table
 
     pairs = "; ".join(" and ".join(pair) for pair in calibration["traded_off"])

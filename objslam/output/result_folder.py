@@ -87,7 +87,7 @@ def write_result(
 
 
 def copy_result(folder: Path, out: Path) -> tuple[str, ...]:
-    """Copy the files of a result into the folder `out`, as `write_result` writes them there, and return the same."""
+    """Copy the files of a result into the folder `out`. Replace, return and raise as `write_result` does."""
     prepare_output(out)
     found = [name for name in _FILES.names(folder) if (folder / name).is_file()]
     return replace_files(out, _FILES, {name: partial(shutil.copyfile, folder / name) for name in found})

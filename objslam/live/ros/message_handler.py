@@ -185,7 +185,7 @@ class RosMessages:
             except ValueError as error:
                 frames = f"{transform.header.frame_id} -> {transform.child_frame_id}"
                 self.refuse(str(error), f"{topic}: {plain(frames)}")
-        with suppress(UnknownTransform):  # waiting boxes report what is missing in an incomplete tree
+        with suppress(UnknownTransform):  # If tf is incomplete, the waiting boxes report the missing part.
             self._read_path(changed)
         self.tick()
 

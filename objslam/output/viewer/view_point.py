@@ -132,7 +132,7 @@ def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, floa
     rank = np.arange(len(order)) - first
     row = np.ceil(dots[:, 1] / line).astype(np.int64)
     frames = int(frame.max()) + 1 if len(frame) else 0
-    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Each row is full up to this x, px.
+    until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Labels fill each row up to this x, px.
     hung, found = dots.copy(), np.zeros(len(dots), dtype=bool)
     for k in range(int(rank.max()) + 1 if len(rank) else 0):
         mine = order[rank == k]  # the k-th label of each image
