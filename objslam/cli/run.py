@@ -189,10 +189,11 @@ def calibration_table(calibration: dict[str, Any]) -> Table:
     table = Table(
         title="errors that all measurements share", caption=f"this log cannot tell apart: {pairs}" if pairs else None
     )
-    for name in ("error", "found", "sigma", "prior sigma", "unit", ""):
-        table.add_column(name, justify="left" if name in ("error", "unit", "") else "right")
+    for name in ("error", "found", "sigma", "prior sigma", "unit", "told by"):
+        words = name in ("error", "unit", "told by")
+        table.add_column(name, justify="left" if words else "right", no_wrap=True)
     for name, of in calibration["parameters"].items():
         numbers = (f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
-        remark = "" if of["observable"] else "not observable from this log"
-        table.add_row(name, *numbers, of["unit"], remark, style="" if of["observable"] else "dim")
+        source = "the log" if of["observable"] else "the prior"
+        table.add_row(name, *numbers, of["unit"], source, style="" if of["observable"] else "dim")
     return table

@@ -7,7 +7,7 @@ forward). `a_T_b` is the pose of b in a. It turns coordinates in b into coordina
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from objslam.core.diagnostics import Ledger
 
 MAX_BOXES = 10_000
 """The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""An axis of a map's frame, with its direction, that points up in the world."""
 
 
 def _need(condition: Any, message: str) -> None:

@@ -17,6 +17,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
+from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
 from objslam.mapping.solution import Solution
@@ -137,7 +138,7 @@ def summarise(
 
     Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
     measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
-    one height, roll and pitch.
+    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
@@ -149,6 +150,7 @@ def summarise(
         "mode": settings.mode,
         "map_frame": "localization" if solution.keyframes.localized_every else "odometry",
         "planar": is_planar(solution.keyframes.map_T_base),
+        "up": up_axis(solution.keyframes),
         "counts": {
             **counts,
             "keyframes": len(solution.keyframes),
