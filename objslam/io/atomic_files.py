@@ -32,10 +32,15 @@ class FileSet:
 
 
 def try_folder(folder: Path, files: FileSet) -> None:
-    """Create a folder and test writing to it. Raises OutputError if `replace_files` would fail."""
+    """Create a folder and test writing to it. Temporary files of the set that killed processes left are deleted.
+
+    Raises OutputError if `replace_files` would fail.
+    """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with _staged(folder, files) as staging:
+            for name in files.names(folder):
+                remove_leftovers(folder / name)
             _write(staging / "probe", b"objslam")
 
 
