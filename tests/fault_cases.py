@@ -23,7 +23,8 @@ from objslam.core.geometry import quaternion
 from objslam.core.types import Log
 from objslam.output.export.formats import FORMATS
 from objslam.results.files import SUMMARY
-from objslam.sources.journal.file import NAME, is_journal, messages
+from objslam.sources.journal.reader import messages
+from objslam.sources.journal.segments import NAME, is_journal
 from objslam.sources.log_folder import write_log_folder
 
 LEAN = (

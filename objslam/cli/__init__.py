@@ -15,6 +15,7 @@ from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
 from objslam.cli.info import info
+from objslam.cli.journal import journal_app
 from objslam.cli.live import live
 from objslam.cli.register import register_results
 from objslam.cli.report import report_result
@@ -45,6 +46,7 @@ app.command()(export)
 config_app = typer.Typer(no_args_is_help=True, help="Print the settings.")
 config_app.command("dump")(config_dump)
 app.add_typer(config_app, name="config")
+app.add_typer(journal_app, name="journal")
 
 
 def _version(asked: bool) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
 from objslam.cli.live_status import status_line, times
-from objslam.errors import ObjslamError, one_line
+from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:
     from objslam.core.snapshot import Snapshot
@@ -28,7 +28,20 @@ class LatestObjects:
     """The writer of objects.json during a session. Its first write removes an older result."""
 
     def __init__(self, out: Path) -> None:
-        self._out, self._begun = out, False
+        self._out, self._begun, self._refused = out, False, False
+
+    def try_write(self, snapshot: Snapshot) -> None:
+        """Write as `write` does, but let an error of the disk cost no map: warn of the first one, and of its end."""
+        refused = None
+        try:
+            self.write(snapshot)
+        except OutputError as error:
+            refused = error
+        if refused is not None and not self._refused:
+            say(f"warning: {refused}; the mapping goes on", stderr=True)
+        elif refused is None and self._refused:
+            say(f"objects.json can be written again into {self._out}", stderr=True)
+        self._refused = refused is not None
 
     def write(self, snapshot: Snapshot) -> None:
         """Write the objects of a snapshot, unless the session has no keyframe yet."""
@@ -47,7 +60,7 @@ class LatestObjects:
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
     """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
-    the views and the status line. An error of the disk or of a view also ends the loop. It is returned instead of raised,
+    the views and the status line. An error of a view also ends the loop. It is returned instead of raised,
     so that `finish` can write the map first."""
     from objslam.live.session import low_latency
 
@@ -61,20 +74,21 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
             ended.append(error)
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
-    shown = 0
+    ledgers, shown = (feed.adapter.ledger, session.counters.ledger), [0, 0]
     with _ends_by_signal(stop), status_line() as show:
         bringing.start()
         due = time.monotonic() + interval
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
                 bringing.join(_POLL)
-                for warning in feed.adapter.ledger.warnings[shown:]:
-                    shown += 1
-                    say(f"warning: {warning}", stderr=True)
+                for i, ledger in enumerate(ledgers):
+                    for warning in ledger.warnings[shown[i] :]:
+                        shown[i] += 1
+                        say(f"warning: {warning}", stderr=True)
                 if time.monotonic() >= due:
                     due = time.monotonic() + interval
                     snapshot = session.snapshot()
-                    latest.write(snapshot)
+                    latest.try_write(snapshot)
                     for view in feed.views:
                         view(snapshot)
                     show(snapshot, feed.adapter.ledger)
@@ -119,7 +133,7 @@ def finish(
 
 
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
-    from objslam.sources.journal.file import NAME
+    from objslam.sources.journal.segments import NAME
 
     internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
     more = f"; `objslam run {out}` maps all received messages" if (out / NAME).is_file() else ""

@@ -6,7 +6,7 @@ The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a 
 import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import yaml
@@ -123,8 +123,14 @@ def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
 
 def write_camera(camera: Camera, path: Path) -> None:
     """Write a camera file. Every number except the quaternion of the rotation is read back as the same float."""
+    text = yaml.safe_dump(camera_keys(camera), sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
+    path.write_text(text, encoding="utf-8")
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Return the content of a camera file."""
     xyzw = quaternion(camera.base_T_camera[None])[0]
-    data = {
+    return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
         "image_height": int(camera.height),
@@ -136,8 +142,6 @@ def write_camera(camera: Camera, path: Path) -> None:
         **({} if camera.sees_size else {"sees_size": False}),
         **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
-    path.write_text(text, encoding="utf-8")
 
 
 def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -> LogError:
