@@ -139,6 +139,7 @@ _NEXT_EVERY = 3
 """After every how many faults the command is started again. A larger number costs less time."""
 _PRELOADED = (
     "cv2",
+    "encodings.utf_8_sig",
     "objslam.api.mapping",
     "objslam.live.session.session",
     "objslam.mapping.pipeline",
@@ -166,7 +167,7 @@ def check(case: Case, folder: Path, fault: Fault, number: int) -> str:
     case.lay(folder)
     done = case.run(folder, fault)
     if fault.error:
-        _check_words(case, done)
+        said_well(case, done)
     else:
         assert done.killed or (case.live and done.code == 0), f"exit code {done.code}: {done.err[-300:]}"
     state = case.judge(folder)
@@ -180,7 +181,7 @@ def check(case: Case, folder: Path, fault: Fault, number: int) -> str:
     return state
 
 
-def _check_words(case: Case, done: Outcome) -> None:
+def said_well(case: Case, done: Outcome) -> None:
     """The command ended with 0 or 1; with 1, it said why in one line."""
     assert done.code in (0, 1), f"exit code {done.code}: {done.err[-300:]}"
     for word in ("Traceback", "internal error", "Exception ignored"):

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from objslam.live.adapters import Feed
     from objslam.live.session.session import Session
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
 _POLL = 0.1  # The time in s between two checks for the end of the source.
 
 
@@ -142,14 +143,18 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
 
 @contextmanager
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` at Ctrl-C or SIGTERM. A second signal interrupts immediately."""
+    """Set `stop` at Ctrl-C, SIGTERM, or when the terminal closes (SIGHUP). A second signal interrupts immediately.
+
+    A signal that is ignored, as nohup ignores SIGHUP, stays so.
+    """
 
     def end(number: int, frame: object) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = (number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN)
+    before = {number: signal.signal(number, end) for number in heard}
     try:
         yield
     finally:
