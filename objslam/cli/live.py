@@ -65,7 +65,7 @@ def live(
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
-    from objslam.sources.journal.file import NAME
+    from objslam.sources.journal.segments import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
         raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")
