@@ -5,9 +5,9 @@
     python tools/bench_soak.py --check              # exit code 1 if memory or latency grow after the second hour
 
 A robot drives the same laps of a room with 30 objects again and again, so that every lap closes a loop. Its odometry drifts
-and comes at 200 Hz, its boxes at 20 Hz. The session gets the messages as fast as it takes them, never faster than it can, and
-keeps a journal. --odometry and --frames set lower rates, which cost less time. Memory is the resident size of the process.
-Latency is the time from the push of a frame to the map that has it, median and 99 %.
+and comes at 200 Hz, its boxes at 20 Hz. The session gets the messages as fast as it takes them, never faster than it can,
+and keeps a journal. --odometry and --frames set lower rates, which cost less time. Memory is the resident size of the
+process. Latency is the time from the push of a frame to the map that has it, median and 99 %.
 """
 
 from __future__ import annotations
