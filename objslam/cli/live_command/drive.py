@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
-from objslam.cli.live_status import status_line, times
+from objslam.cli.live_command.status import status_line, times
 from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:
@@ -82,6 +82,8 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
                 bringing.join(_POLL)
+                for tick in feed.ticks:
+                    tick()
                 for i, ledger in enumerate(ledgers):
                     for warning in ledger.warnings[shown[i] :]:
                         shown[i] += 1
