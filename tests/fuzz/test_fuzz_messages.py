@@ -151,6 +151,6 @@ def test_mutated_json_lines():
     taken = []
     adapter = StdinAdapter(intake(taken), io.BytesIO())
     for number, data in enumerate(chain.from_iterable(mutated(json.dumps(line).encode(), 60) for line in LINES)):
-        adapter._take(data, number)
+        survives(lambda data=data, number=number: adapter._take(data, number), "lines", data)
     assert taken
     checked(taken)

@@ -10,6 +10,7 @@ from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.bag.records import Connection, plain
+from objslam.ros.message_limits import check_size
 from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
@@ -159,6 +160,7 @@ class DdsAdapter:
                 if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
                     continue
                 try:
+                    check_size(reader.of.type, sample.data, "cdr")
                     message = reader.decode(sample.data)
                 except DecodeError as error:
                     self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")

@@ -32,6 +32,8 @@ _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger 
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
 _ZERO = 0.05  # After a gap, a pose smaller than this, m and rad, means a restart. A larger value detects more restarts.
 _FAR = 0.1  # The least size of the pose before such a gap, m and rad. A larger value takes more restarts for motion.
+_MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
+_MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0  # If a stamp leads the path by more than this, s, earlier shifts are tried. More takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
@@ -52,6 +54,7 @@ class Intake:
         self._lock = threading.Lock()
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
+        self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # by camera, in the order of arrival
         self._start_T_odom = np.eye(4)
         self._last: dict[PathKind, PoseMessage] = {}
@@ -66,6 +69,8 @@ class Intake:
             known = self._cameras.get(sound.name)
             if known and all(np.array_equal(getattr(known, f.name), getattr(sound, f.name)) for f in fields(Camera)):
                 return True
+            if known is None and len(self._cameras) >= _MOST_CAMERAS:
+                return self._refuse(f"camera beyond the first {_MOST_CAMERAS}", checks.told(sound.name))
             if not self._hand_on(CameraMessage(sound)):
                 return False
             self._cameras[sound.name] = sound
@@ -121,6 +126,7 @@ class Intake:
                 return self._refuse("frame with a repeated stamp", where)
             if seen and at < next(reversed(seen)):
                 self.counters.accept("frames out of order")
+            frame = self._with_known_labels(frame, where)
             if not self._hand_on(replace(frame, stamp=at)):
                 return False
             self.counters.accept("boxes", len(frame))
@@ -146,6 +152,7 @@ class Intake:
             elif isinstance(message, NoteMessage):
                 self._clock.shift, self._start_T_odom = message.clock, message.odometry
             elif isinstance(message, FrameMessage):
+                self._labels.update(message.labels)
                 self._remember(message.camera, message.stamp)
         self.counters.accept(_kind(message))
         if isinstance(message, FrameMessage):
@@ -211,6 +218,19 @@ class Intake:
             self._note()
             return np.asarray(self._start_T_odom @ odom_T_base)
         return np.asarray(pose)
+
+    def _with_known_labels(self, frame: FrameMessage, where: str) -> FrameMessage:
+        """Return a frame without the boxes whose labels are beyond the first _MOST_LABELS of the session."""
+        for label in dict.fromkeys(frame.labels):
+            if len(self._labels) >= _MOST_LABELS:
+                break
+            self._labels.add(label)
+        if self._labels.issuperset(frame.labels):
+            return frame
+        kept = [i for i, label in enumerate(frame.labels) if label in self._labels]
+        self.counters.drop(f"box with a label beyond the first {_MOST_LABELS}", where, len(frame) - len(kept))
+        columns = {name: getattr(frame, name)[kept] for name in ("boxes", "scores", "depths", "track_ids")}
+        return replace(frame, labels=tuple(frame.labels[i] for i in kept), **columns)
 
     def _remember(self, camera: str, at: float) -> None:
         seen = self._stamps.setdefault(camera, {})

@@ -17,14 +17,13 @@ from objslam.core.arrays import Floats, Ints
 from objslam.io.box_collector import BoxCollector
 from objslam.ros.bag.recording import Recording, read_messages
 from objslam.ros.bag.records import MAX_NAME, Connection, FileReport, frame_name
-from objslam.ros.messages.decode import DecodeError, make_decoder, read_head, read_length
-from objslam.ros.messages.detections import MAX_BOXES, WRONG_LAYOUT, find_boxes, track_number
+from objslam.ros.message_limits import check_size
+from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
+from objslam.ros.messages.detections import WRONG_LAYOUT, find_boxes, track_number
 from objslam.ros.messages.poses import PoseRows, choose_times
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSES, TRANSFORMS, is_boxes
-from objslam.ros.tf.frames import MAX_TRANSFORMS
 from objslam.ros.tf.tree import TfRows
 
-_MAX_SMALL = 64 << 20  # The largest message of detections, bytes. The value is chosen to limit the memory.
 _MAX_TOPICS = 10_000  # The largest number of topics. The value is chosen to limit the memory.
 _Decoder = Callable[[bytes], Any]
 _Handler = Callable[[bytes, int], None]
@@ -154,8 +153,7 @@ def _add_pose(connection: Connection, topic: Topic, decode: _Decoder, data: byte
 
 
 def _add_transforms(connection: Connection, decode: _Decoder, tf: TfRows, data: bytes, logged: int) -> None:
-    if read_length(data, connection.encoding) > MAX_TRANSFORMS:
-        raise DecodeError(f"more than {MAX_TRANSFORMS} transforms in one message")
+    check_size(connection.type, data, connection.encoding)
     for transform in decode(data).transforms:
         tf.add(transform, logged, connection.topic.endswith("tf_static"))
 
@@ -176,11 +174,7 @@ def _add_image(connection: Connection, topic: Topic, decode: _Decoder, data: byt
 
 
 def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: str, data: bytes, logged: int) -> None:
-    number = read_head(data, connection.encoding)[2]
-    if number > MAX_BOXES:
-        raise DecodeError(f"more than {MAX_BOXES} detections in one message")
-    if len(data) > _MAX_SMALL:
-        raise DecodeError(f"message larger than {_MAX_SMALL >> 20} MiB")
+    check_size(connection.type, data, connection.encoding)
     try:
         found = list(find_boxes(connection.type, decode(data)))
     except WRONG_LAYOUT as error:
