@@ -99,6 +99,29 @@ def detection_history(
     return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
 
 
+def count_looks(
+    position: Floats, extent: Floats, seen_from: Floats, view: CameraFrames, obs: Observations, distance: Floats
+) -> Ints:
+    """Return in how many frames (N,) each object of a map should be detected if it is where the map says.
+
+    Its box lies in the image, its distance is one from which it was detected before, and no closer box covers it.
+    extent: (N, 2) m, NaN where unknown. seen_from: (N, 2) m, the least and the greatest distance. obs: the boxes of the
+    frames. distance: (R,) m, how far their objects are, NaN where unknown.
+    """
+    found = np.zeros(len(position), dtype=np.int64)
+    for number, camera in enumerate(view.cameras):
+        frames = np.flatnonzero(view.camera == number)
+        step = max(1, _PAIRS_AT_ONCE // max(len(position), 1))
+        for begin in range(0, len(frames), step):
+            some = frames[begin : begin + step]
+            obj, frame, away, pixel = _in_image(position, np.nan_to_num(extent), seen_from[:, 1], camera, some, view)
+            usual = away >= seen_from[obj, 0]
+            obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
+            clear = ~_hidden(frame, away, pixel, obs, distance)
+            found += np.bincount(obj[clear], minlength=len(position))
+    return found
+
+
 def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
     """Return the least and the greatest usual distance (C,) of each class, from the distances (P,) m of its boxes."""
     number = np.bincount(index, minlength=len(label))

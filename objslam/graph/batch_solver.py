@@ -116,7 +116,7 @@ def solve_joint(
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings, multiframes)
+        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes)
 
     if errors is None:
         measured = measure(keyframes, rays, settings)
@@ -212,7 +212,7 @@ def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, lan
     return shift[:, :, None] * shift[:, None, :]
 
 
-def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
+def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
     # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. n independent ranges with the
     # variance s^2 + n b^2 have the same.

@@ -116,7 +116,7 @@ def _read(
     return Calibration(camera, placed)
 
 
-def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
+def parse_camera(text: bytes, place: str, ledger: Ledger, name: str | None) -> Camera:
     """Parse a camera from a text in the format of a camera file. Raises LogError, which names `place` as the file."""
     path = Path(place)
     return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
@@ -124,7 +124,17 @@ def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
 
 def write_camera(camera: Camera, path: Path) -> None:
     """Write a camera file. Every number except the quaternion of the rotation is read back as the same float."""
-    data = {
+    path.write_text(dump_camera(camera), encoding="utf-8")
+
+
+def dump_camera(camera: Camera) -> str:
+    """Return the text of a camera file, as `write_camera` writes it."""
+    return _dumped(camera_keys(camera))
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Return the content of a camera file."""
+    return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
         "image_height": int(camera.height),
@@ -136,7 +146,6 @@ def write_camera(camera: Camera, path: Path) -> None:
         **({} if camera.sees_size else {"sees_size": False}),
         **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
-    path.write_text(_dumped(data), encoding="utf-8")
 
 
 def write_mounts(mounts: Mapping[str, Floats], path: Path) -> None:

@@ -106,9 +106,16 @@ def describe(
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
+                seen_from=_distances(estimate.positions[j], origins[kept]) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
+
+
+def _distances(position: Floats, origins: Floats) -> tuple[float, float]:
+    """Return the least and the greatest distance (m) of a position (3,) from the origins (n, 3) of its rays."""
+    distance = np.linalg.norm(origins - position, axis=1)
+    return round(float(distance.min()), 3), round(float(distance.max()), 3)
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
@@ -131,8 +138,8 @@ def summarise(
     """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
     Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
-    measurement. Its entry `planar` says whether the measured path has one height, roll and pitch. Its entry
-    `up` names the axis of the map that points up.
+    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
+    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]

@@ -36,6 +36,11 @@ class _Assessment(_Shape):
     reasons: list[str] = []
 
 
+class _Localisation(_Shape):
+    localised: bool
+    line: str
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
@@ -56,6 +61,7 @@ class Summary(_Shape):
     versions: dict[str, str] = {}
     warnings: list[str] = []
     assessment: _Assessment | None = None
+    localisation: _Localisation | None = None
 
 
 class _Match(_Shape):

@@ -118,6 +118,7 @@ def write_report(
         trends=trends(rays),
         calibration=summary.get("calibration"),
         assessment=summary.get("assessment"),
+        localisation=summary.get("localisation"),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
