@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import platform
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +144,6 @@ def summarise(
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
-    packages = ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,
         "log_path": None if path is None else str(path),
@@ -173,9 +173,15 @@ def summarise(
         "cost_after": estimate.cost_after,
         "iterations": estimate.iterations,
         "seconds": seconds,
-        "versions": {
-            "python": platform.python_version(),
-            **{package: importlib.metadata.version(package) for package in packages},
-        },
+        "versions": _versions(),
         "warnings": list(ledger.warnings),
     }
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide a result, without those that are not installed."""
+    found = {"python": platform.python_version()}
+    for package in ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d"):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[package] = importlib.metadata.version(package)
+    return found

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 
@@ -35,6 +36,9 @@ from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 
+_LIBRARIES = ("cv2", "gtsam", "scipy.linalg", "scipy.sparse", "scipy.special")
+"""The libraries of every solve. They load in a stage of their own, because this takes longer than a small solve."""
+
 
 def run(
     log: Log,
@@ -54,6 +58,9 @@ def run(
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
+    with _stage("load", seconds, progress):
+        for library in _LIBRARIES:
+            import_module(library)
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:
