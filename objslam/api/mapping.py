@@ -35,13 +35,13 @@ _LOG = logging.getLogger("objslam")
 def read(path: str | PathLike[str], **options: Any) -> Log:
     """Read a log folder, a ROS bag, or another recording that `objslam info` knows.
 
-    options: the options of the recording's kind, by the names of their flags in Python, such as `robot=1` for --robot 1 and
-    `label="cup"` for --label cup (`objslam.sources.SourceOptions` lists them). What is dropped is logged as a warning, and
-    the log keeps account of it in `reading`. LogError if the recording cannot be read, ConfigError for a wrong option.
+    options: the options for this kind of recording, named like their flags: `robot=1` for --robot 1, `label="cup"` for
+    --label cup. `objslam.sources.SourceOptions` lists them. Dropped data are logged as warnings and counted in the log's
+    `reading`. LogError if the recording cannot be read, ConfigError for a wrong option.
     """
     known = [field.name for field in fields(SourceOptions)]
     if unknown := [name for name in options if name not in known]:
-        raise ConfigError(f"there is no option {unknown[0]!r} of a recording", hint=f"there are {', '.join(known)}")
+        raise ConfigError(f"there is no option {unknown[0]!r} of a recording", hint=f"the options are {', '.join(known)}")
     ledger = Ledger()
     found = read_recording(Path(path), ledger, SourceOptions(**options))
     _tell(ledger.lines())
@@ -66,8 +66,8 @@ def run(
         detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
         map: the map of another day, or its file or result folder. If the drive is found in it, the result is in its frame,
             and its objects count as priors. `Result.localised` says whether.
-        progress: is told the stage's name, the work done, and the total work, 0 if that is unknown.
-        changes: more changes, which win over `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
+        progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
+        changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
         LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.
         DetectorError: the model cannot be used. TypeError: `log` is no log.
@@ -102,9 +102,9 @@ def map_log(
     progress: Progress,
     known: PriorMap | None = None,
 ) -> tuple[RunResult, types.Log]:
-    """Return the result of a run, and the log with the boxes that the `detector` found, if there is one.
+    """Return the result of a run, and the log. If there is a `detector`, the log has the boxes that it found.
 
-    known: the map of another day in which the drive is to be found.
+    known: the map of another day, which the drive may be found in.
     """
     from objslam.mapping import pipeline
 
@@ -114,7 +114,7 @@ def map_log(
 
 
 def find_boxes(log: types.Log, detector: Path, settings: Settings, ledger: Ledger, progress: Progress) -> types.Log:
-    """Return the log with the boxes that a detector finds in its images, or found in an earlier run."""
+    """Return the log with the boxes that a detector finds in its images. Boxes from an earlier run are read from a cache."""
     from objslam.detection import default_cache, detect_log, load_detector
 
     network = load_detector(detector, settings.detector)

@@ -21,7 +21,7 @@ from objslam.results.object_map import ObjectMap
 
 @dataclass(frozen=True)
 class _Run:
-    """What the writer of a result folder needs. detected: whether a detector found the boxes of the log."""
+    """The data for writing a result folder. detected: whether a detector found the boxes of the log."""
 
     result: RunResult
     log: types.Log | None
@@ -94,10 +94,10 @@ class Result:
 
     @property
     def assessment(self) -> Assessment:
-        """What to think of the result, with the reasons. OutputError for a result of an older version."""
+        """Whether the result can be used, with the reasons. OutputError for a result of an older version."""
         found = self.summary.get("assessment")
         if found is None:
-            raise OutputError("this result is from an older version, which judged nothing", hint="run again")
+            raise OutputError("this result is from an older version, without an assessment", hint="run again")
         return Assessment(found["level"], tuple(found["reasons"]))
 
     @property
@@ -123,7 +123,7 @@ class Result:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many data were dropped, by reason."""
+        """The numbers of dropped data by reason."""
         return dict(self.summary.get("dropped", {}))
 
     def __repr__(self) -> str:

@@ -14,10 +14,10 @@ from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
-_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances; outside them a miss tells nothing.
-_CORE_SHARE = 0.8  # The share of a class's boxes, of its strongest objects, that sets its distances. Others may be phantoms.
-_FRONT_SHARE = 0.95  # The least share of an object's boxes from one half space for the object to have a front.
-_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it, in m and as a share of its distance.
+_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
+_CORE_SHARE = 0.8  # The strongest objects, with this share of a class's boxes, set its distances. Others may be phantoms.
+_FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
+_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it: in m, and as a share of its distance.
 _SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. More are finer.
 _SAME_SIDE = np.cos(np.radians(45.0))  # The cosine of the turn within which a side looks alike. A smaller one counts more.
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
@@ -25,9 +25,9 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera: (F, 4,
-    4). A usable box is at least `margin` px and the share `margin_share` of its size away from the image edge. A negative
-    margin allows any box."""
+    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
+    (F, 4, 4). The distance of a usable box from the image edge is at least `margin` px, and at least `margin_share` of its
+    size. A negative margin allows any box."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -72,9 +72,9 @@ def detection_history(
 ) -> DetectionHistory:
     """Return where the objects are or should be detected.
 
-    An object should be detected if its box lies in the image, at a usual distance of its class or of itself, is not occluded
-    by a closer box, and shows the object's front if it has one. matched: (R,) the object of each observation, -1 for none.
-    position, label: (N, 3) m and (N,), of the objects.
+    An object should be detected under four conditions. Its box lies in the image. Its distance is usual for its class or for
+    itself. No closer box hides it. The camera sees its front, if it has one. matched: (R,) the object of each observation,
+    -1 for none. position, label: (N, 3) m and (N,), of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)

@@ -145,7 +145,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         console().print(calibration_table(calibration))
     if noise := result.summary.get("noise"):
         found = {name: factor for name, factor in noise.items() if name != "shrinkage"}
-        say("noise, times that of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
+        say("noise, as a multiple of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(
@@ -182,17 +182,18 @@ def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
 
 
 def calibration_table(calibration: dict[str, Any]) -> Table:
-    """Return a table of the shared errors, and which of them the log does not determine."""
+    """Return a table of the shared errors. It marks the errors that the log does not determine."""
     from rich.table import Table
 
     pairs = "; ".join(" and ".join(pair) for pair in calibration["traded_off"])
     table = Table(
         title="errors that all measurements share", caption=f"this log cannot tell apart: {pairs}" if pairs else None
     )
-    for name in ("error", "found", "sigma", "prior sigma", "unit", ""):
-        table.add_column(name, justify="left" if name in ("error", "unit", "") else "right")
+    for name in ("error", "found", "sigma", "prior sigma", "unit", "told by"):
+        words = name in ("error", "unit", "told by")
+        table.add_column(name, justify="left" if words else "right", no_wrap=True)
     for name, of in calibration["parameters"].items():
         numbers = (f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
-        remark = "" if of["observable"] else "not observable from this log"
-        table.add_row(name, *numbers, of["unit"], remark, style="" if of["observable"] else "dim")
+        source = "the log" if of["observable"] else "the prior"
+        table.add_row(name, *numbers, of["unit"], source, style="" if of["observable"] else "dim")
     return table

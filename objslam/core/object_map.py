@@ -19,7 +19,7 @@ FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
 _SHOWN = 20  # The most objects in the text of a map. A larger number makes it longer.
-_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows and columns of the covariance in a row.
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Entries of the covariance in a table row.
 
 COLUMNS: dict[str, str] = {
     **{"id": "int64", "label": "string", "status": "string"},
@@ -162,7 +162,7 @@ class ObjectMap:
 
     @property
     def positions(self) -> Floats:
-        """(N, 3) m, the positions of all objects. That of an unresolved object is a guess on its ray, or NaN."""
+        """(N, 3) m, the positions of all objects. The position of an unresolved object is a guess on its ray, or NaN."""
         return np.array([o.position for o in self.objects], dtype=np.float64).reshape(-1, 3)
 
     @property

@@ -18,7 +18,7 @@ from objslam.core.trace import Round
 from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.alternation import Solution
+from objslam.mapping.solution import Solution
 
 if TYPE_CHECKING:
     from objslam.graph.maps.prior_map import MappedDrive

@@ -19,7 +19,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import seen_something, solve
+from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
@@ -32,6 +32,7 @@ from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
+from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
 
@@ -109,7 +110,7 @@ def run(
                 described, residual = describe(solution, cameras, settings, trusted=trusted)
                 objects = with_map(described, where, known)
     path = log.robot_path
-    assert path is not None  # build_keyframes raises LogError otherwise
+    assert path is not None  # Otherwise build_keyframes has raised LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
@@ -117,7 +118,7 @@ def run(
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # the ledger has its drops already
+                before = reconstruct(log, path, settings, Ledger(), progress)  # The second call counts the drops.
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
@@ -149,7 +150,7 @@ def run(
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
     """Return the path through the solved poses (K, 4, 4). In joint mode it follows the odometry between keyframes."""
-    # The localisation between two keyframes would bring back its jitter.
+    # Between two keyframes, the path follows the odometry. The localisation would bring back its jitter.
     after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
     way = log.odometry
     if settings.mode == "fixed" or way is None or way is path:
@@ -161,7 +162,7 @@ def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Fl
 
 
 def chosen_poses(log: Log, settings: Settings) -> Log:
-    """Return the log with the poses that the settings choose. LogError if it has none of them."""
+    """Return the log with the poses that the settings choose. LogError if the log lacks them."""
     use = settings.poses.use
     if use == "auto":
         return log
@@ -171,7 +172,7 @@ def chosen_poses(log: Log, settings: Settings) -> Log:
 
 
 def with_mode_of(log: Log, settings: Settings) -> Settings:
-    """Return the settings with the mode that `auto` means for a log with the chosen poses."""
+    """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
     if settings.mode != "auto":
         return settings
     return settings.model_copy(update={"mode": "joint" if log.localization is None else "fixed"})

@@ -19,7 +19,7 @@ from objslam.live.session.session import Session
 from objslam.live.session.snapshots import Describer
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
-from objslam.sources.journal import file as journals
+from objslam.sources.journal import journal as journals
 from objslam.sources.log_folder import write_log_folder
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))

@@ -55,6 +55,11 @@ def test_the_rays_meet_their_objects_as_the_settings_promise(whole, ledger):
     assert not any("miss their objects" in warning for warning in ledger.warnings)
 
 
+def test_the_clock_and_the_association_settle(whole, ledger):
+    """The clock is known to a millisecond, and the association swung between two states that differ by half of that."""
+    assert not any("still change" in warning for warning in ledger.warnings)
+
+
 def test_the_room_has_what_it_has(whole):
     count = Counter(whole[0])
     assert (count["tv"], count["keyboard"], count["mouse"], count["teddy bear"], count["cat"]) == (2, 2, 2, 1, 0)
