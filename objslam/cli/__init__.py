@@ -16,7 +16,7 @@ from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
 from objslam.cli.info import info
 from objslam.cli.journal import journal_app
-from objslam.cli.live import live
+from objslam.cli.live_command.command import live
 from objslam.cli.maps import diff_results, merge_results, register_results
 from objslam.cli.report import report_result
 from objslam.cli.run import run

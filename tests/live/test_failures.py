@@ -24,7 +24,7 @@ from objslam.sources.log_folder import write_log_folder
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
 QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
-live_command = importlib.import_module("objslam.cli.live")  # the name in objslam.cli is the function
+live_command = importlib.import_module("objslam.cli.live_command.command")
 PATIENCE = 60  # s until a wait counts as one for ever
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
-from objslam.cli.live_status import status_line, times
+from objslam.cli.live_command.status import status_line, times
 from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import progress_bar, say
-from objslam.cli.live_drive import LatestObjects, drive, finish
+from objslam.cli.live_command.drive import LatestObjects, drive, finish
 from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
