@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from objslam.association.observations import extents
+from objslam.association.visibility import seen_from
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
@@ -106,16 +107,10 @@ def describe(
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
-                seen_from=_distances(estimate.positions[j], origins[kept]) if known else None,
+                seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
-
-
-def _distances(position: Floats, origins: Floats) -> tuple[float, float]:
-    """Return the least and the greatest distance (m) of a position (3,) from the origins (n, 3) of its rays."""
-    distance = np.linalg.norm(origins - position, axis=1)
-    return round(float(distance.min()), 3), round(float(distance.max()), 3)
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
