@@ -36,9 +36,9 @@ _NOISIER = 1.5
 """The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
 A larger factor explores fewer logs twice."""
 _CLEAR = 0.95
-"""The share of rays that agree with their object from which on a log is not explored again, whatever its noise. A larger share
-explores more logs twice. Maps that show objects twice explained at most 0.93 of the rays in simulation, and real odometry that
-is noisier than nominal leaves good maps with 0.98."""
+"""The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
+twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map of a real robot, with an
+odometry four times noisier than nominal, explains 0.98."""
 _LOOSE = 3.0
 """The factor on the noise of the odometry in this exploration if the solve found only the rays to be noisy. A larger factor
 suits worse odometry, and loses more objects of good odometry."""
