@@ -32,7 +32,7 @@ from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.optimizers import build_graph
 from objslam.graph.variables import make_values
 from objslam.mapping import pipeline
-from objslam.mapping.alternation import seen_something
+from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 

@@ -1,4 +1,4 @@
-"""Arrays of a user become the arrays of the data types. A wrong value raises ValueError and names its row."""
+"""Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names its row."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ def as_camera(camera: Camera) -> Camera:
 def as_poses(values: ArrayLike) -> Floats:
     """Return poses (N, 4, 4) from rows (N, 3) x, y, yaw, rows (N, 7) x, y, z, qx, qy, qz, qw, or matrices (N, 4, 4).
 
-    Units are m and rad. ValueError if the shape is another, or if a pose is not finite and rigid.
+    Units are m and rad. ValueError for another shape, or if a pose is not finite and rigid.
     """
     given = np.asarray(values, dtype=np.float64)
     if given.shape[1:] == (4, 4):
@@ -48,7 +48,7 @@ def as_poses(values: ArrayLike) -> Floats:
 
 
 def as_pose(values: ArrayLike) -> Floats:
-    """Return one pose (4, 4), from what `as_poses` takes for one row."""
+    """Return one pose (4, 4) from a row or a matrix, as `as_poses` takes them."""
     return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
 
 
@@ -71,7 +71,7 @@ def as_boxes(values: ArrayLike, where: str) -> Floats:
 
 
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
-    """Return one number for each box (M,) from one list for each frame. Without `values`, all are `unknown`."""
+    """Return one number for each box (M,) from one list for each frame. Without `values`, each number is `unknown`."""
     if values is None:
         return np.full(sum(counts), unknown)
     lists = [np.asarray(one, dtype=np.float64).reshape(-1) for one in values]

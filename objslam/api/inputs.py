@@ -70,7 +70,7 @@ class Detections(types.Detections):
 
         stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names.
         scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where unknown.
-        track_ids: for each frame B integers, -1 where unknown. whole: whether the image's edge cuts no box off.
+        track_ids: for each frame B integers, -1 where unknown. whole: True if boxes are not cut off at the image's edge.
         ValueError names what is wrong.
         """
         frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
@@ -113,8 +113,8 @@ class Log(types.Log):
     ) -> Self:
         """Make a log from arrays. A path is a `Trajectory`, or the stamps and poses of `Trajectory.from_arrays`.
 
-        cameras, detections: one of each, or as many of one as of the other. odometry: odom_T_base. localization: map_T_base.
-        At least one of the two is needed. ValueError names what is wrong.
+        cameras, detections: a camera and its detections, or sequences of equal length. odometry: odom_T_base. localization:
+        map_T_base. A log needs at least one of these two paths. ValueError names what is wrong.
         """
         lenses = [as_camera(one) for one in ([cameras] if isinstance(cameras, Camera) else cameras)]
         boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
@@ -126,14 +126,14 @@ class Log(types.Log):
         return cls(name, views, _path(odometry), _path(localization))
 
     def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
-        """Return the log with other boxes: those of its only camera, or those of each camera by its name.
+        """Return the log with other boxes. They are for its only camera, or there are detections for each camera name.
 
-        ValueError if the names are not those of the cameras.
+        ValueError if the given names differ from the names of the cameras.
         """
         names = [camera.camera.name for camera in self.cameras]
         found = {names[0]: detections} if isinstance(detections, types.Detections) and len(names) == 1 else detections
         if isinstance(found, types.Detections) or set(found) != set(names):
-            raise ValueError(f"the boxes must be those of the cameras {', '.join(names)}, by their names")
+            raise ValueError(f"detections must be given by camera name, for exactly these cameras: {', '.join(names)}")
         return replace(self, cameras=tuple(replace(one, detections=found[one.camera.name]) for one in self.cameras))
 
     def __repr__(self) -> str:

@@ -14,13 +14,14 @@ from objslam.core import types
 from objslam.core.result import RunResult
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
+from objslam.io.views_parquet import Views
 from objslam.mapping.checks.assessment import Assessment
 from objslam.results.object_map import ObjectMap
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What the writer of a result folder needs. detected: whether a detector found the boxes of the log."""
+    """The data for writing a result folder. detected: whether a detector found the boxes of the log."""
 
     result: RunResult
     log: types.Log | None
@@ -93,11 +94,27 @@ class Result:
 
     @property
     def assessment(self) -> Assessment:
-        """What to think of the result, with the reasons. OutputError for a result of an older version."""
+        """Whether the result can be used, with the reasons. OutputError for a result of an older version."""
         found = self.summary.get("assessment")
         if found is None:
-            raise OutputError("this result is from an older version, which judged nothing", hint="run again")
+            raise OutputError("this result is from an older version, without an assessment", hint="run again")
         return Assessment(found["level"], tuple(found["reasons"]))
+
+    @property
+    def views(self) -> Views | None:
+        """Where each image was taken, which tells what could have been seen. None for a result of an older version."""
+        from objslam.results import read
+
+        if self._run is None:
+            return None if self.folder is None else read.load_views(self.folder)
+        run = self._run.result
+        margins = run.settings.rays.border, run.settings.rays.border_share
+        return None if run.views is None else Views.of(run.views, run.cameras, *margins)
+
+    @property
+    def localised(self) -> bool:
+        """Whether the drive was found in the map of another day, so that the result is in the frame of that map."""
+        return bool(self.summary.get("localisation", {}).get("localised", False))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -106,7 +123,7 @@ class Result:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many data were dropped, by reason."""
+        """The numbers of dropped data by reason."""
         return dict(self.summary.get("dropped", {}))
 
     def __repr__(self) -> str:

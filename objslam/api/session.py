@@ -22,9 +22,9 @@ from objslam.results.object_map import ObjectMap
 class Session(LiveSession):
     """A map that grows while data are pushed, in a thread of its own.
 
-    Use it in a `with` block: it starts the session, and ends it. Push cameras first, then poses and boxes, from any thread.
-    A push returns False if the message is dropped; `snapshot().dropped` counts the reasons. `result` ends the session and
-    solves the whole map once more.
+    A `with` block starts and ends the session. Push cameras first, then poses and boxes, from any thread. A push returns
+    False if the message is dropped. `snapshot().dropped` counts the reasons. `result` ends the session and solves the whole
+    map once more.
 
         with objslam.Session() as session:
             session.push_camera(camera)
@@ -34,8 +34,8 @@ class Session(LiveSession):
             result = session.result()
 
     settings: as in `objslam.run`; the mode is always joint. journal: a file that keeps every accepted message, so that a
-    killed program loses nothing. resume: whether to continue an existing journal. patient: whether frames of any age are
-    accepted, for a program that waits for the session (`wait`) now and then, such as a replay.
+    killed program loses nothing. resume: whether to continue an existing journal. patient: whether old frames are accepted
+    too. It is for a program that waits for the session (`wait`) now and then, such as a replay.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Session(LiveSession):
 
 
 def _pose(values: ArrayLike) -> Any:
-    """Return a pose (4, 4), or the values as they are if they are no pose, because the session counts what it refuses."""
+    """Return a pose (4, 4). Values that are no pose are returned unchanged, and the session refuses and counts them."""
     try:
         return as_pose(values)
     except (TypeError, ValueError):

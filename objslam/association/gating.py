@@ -1,17 +1,18 @@
 """Gate matches between rays and landmarks, and assign at most one ray of a frame to each landmark."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from objslam.association.landmarks import Landmarks
 from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import range_costs, variance
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 TRACK_GAIN = 2.0
-"""The cost reduction of a match if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
+"""A match costs less by this if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
 more."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
@@ -74,8 +75,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of the pairs that may be within the gate, by a lower bound on their deviation. The
-    bound takes only matrix products, which are fast."""
+    """Return the rays and the landmarks of the pairs that may be within the gate. A lower bound on the deviation decides. It
+    takes only matrix products, which are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -108,8 +109,9 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
     """Return the landmark (R,) of each ray, or -1, in the assignment with the least total cost.
 
-    A landmark gets at most one ray per frame. Each frame is solved separately. Parts of a frame that share no ray and no
-    landmark are also solved separately. Only a part with several rays and several landmarks needs the Hungarian method.
+    A landmark gets at most one ray per frame. Each frame is solved separately. So are parts of a frame that share no ray and
+    no landmark. In most parts, the best edge of each ray, or of each landmark, is the solution. The Hungarian method solves
+    the rest.
     cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
     """
     from scipy.sparse import coo_array
@@ -125,20 +127,35 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     size = len(frame) + len(places)
     graph = coo_array((np.ones(len(ray)), (ray, len(frame) + place)), shape=(size, size))
     part = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[ray]
-    order = np.lexsort((landmark, ray, -gain, part))
-    ray, landmark, gain, part, place = ray[order], landmark[order], gain[order], part[order], place[order]
-    first = np.flatnonzero(np.diff(part, prepend=-1))
-    end = np.append(first[1:], len(part))
-    one_ray = np.minimum.reduceat(ray, first) == np.maximum.reduceat(ray, first)
-    one_place = np.minimum.reduceat(place, first) == np.maximum.reduceat(place, first)
-    simple = one_ray | one_place  # A part with one ray or one place takes its best edge.
-    chosen[ray[first[simple]]] = landmark[first[simple]]
-    for i, j in zip(first[~simple].tolist(), end[~simple].tolist(), strict=True):
+    rest = np.arange(len(ray))
+    for one, other in ((ray, place), (place, ray)):
+        best, apart = _best_of_each(one[rest], other[rest], landmark[rest], gain[rest], part[rest])
+        taken = rest[best[apart[best]]]
+        chosen[ray[taken]] = landmark[taken]
+        rest = rest[~apart]
+    order = np.lexsort((landmark[rest], ray[rest], part[rest]))
+    rest = rest[order]
+    ray, landmark, gain, part = ray[rest], landmark[rest], gain[rest], part[rest]
+    bounds = np.flatnonzero(np.diff(part, prepend=-1, append=-1)).tolist()
+    for i, j in pairwise(bounds):
         rows, r = np.unique(ray[i:j], return_inverse=True)
         columns, c = np.unique(landmark[i:j], return_inverse=True)
-        first, second = pair_up(r, c, gain[i:j], (len(rows), len(columns)))
-        chosen[rows[first]] = columns[second]
+        row, column = pair_up(r, c, gain[i:j], (len(rows), len(columns)))
+        chosen[rows[row]] = columns[column]
     return chosen
+
+
+def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
+    """Return the best edge of each value of `one`, and (E,) whether the edges belong to a part without conflicts.
+
+    A part has no conflict if the best edges of its values of `one` differ in `other`. Then these edges are the best
+    assignment of the part, because no assignment can gain more. If gains are equal, the lowest landmark is taken.
+    """
+    order = np.lexsort((landmark, -gain, one))
+    best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
+    by_other = best[np.argsort(other[best], kind="stable")]
+    twice = np.flatnonzero(np.diff(other[by_other]) == 0)
+    return best, ~np.isin(part, part[by_other[twice]])
 
 
 def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tuple[Ints, Ints]:
@@ -158,7 +175,7 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
         first, second = linear_sum_assignment(dense, maximize=True)
         real = dense[first, second] > 0
         return first[real], second[real]
-    # Every row of the sparse table needs a pair. So each row also gets a column of its own that stands for no pair.
+    # Every row of the sparse table needs a pair. So each row also gets its own extra column, which stands for no pair.
     each = np.arange(rows)
     value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # Entries of 0 would not count as possible pairs.
     entries = (np.append(row, each), np.append(column, columns + each))
@@ -168,8 +185,8 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """Return the cost reduction (E,) of each edge. It is 0 unless most other boxes of the ray's track, and at least two,
-    have the landmark of the edge.
+    """Return the cost reduction (E,) of each edge. An edge has one if most other boxes of the ray's track, and at least two,
+    have the landmark of the edge. Otherwise it is 0.
 
     track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """

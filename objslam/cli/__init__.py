@@ -16,6 +16,7 @@ from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
 from objslam.cli.info import info
 from objslam.cli.live import live
+from objslam.cli.merge import diff_results, merge_results
 from objslam.cli.register import register_results
 from objslam.cli.report import report_result
 from objslam.cli.run import run
@@ -35,6 +36,8 @@ app.command()(calibrate)
 app.command(name="eval")(evaluate_result)
 app.command(name="report")(report_result)
 app.command(name="register")(register_results)
+app.command(name="merge")(merge_results)
+app.command(name="diff")(diff_results)
 app.command()(view)
 app.command()(demo)
 app.command()(convert)

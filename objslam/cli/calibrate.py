@@ -46,7 +46,7 @@ def calibrate(
 
     settings = settings_of(mode or "joint", config, ["output.recording=false", *(set_ or ())])
     if settings.calibration.use is False:
-        raise ConfigError("nothing to calibrate", hint="calibrate needs another value than calibration.use=false")
+        raise ConfigError("nothing to calibrate", hint="leave out calibration.use=false")
     if settings.mode == "fixed":
         settings = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"use": True})})
     _check_target(out, overwrite)
@@ -65,7 +65,7 @@ def calibrate(
         report(ledger)
     if not found:
         raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
-    if settings.calibration.file is not None:  # what it knew is the prior of all logs, also of what they do not have
+    if settings.calibration.file is not None:  # The file is the prior of all logs. The result keeps its other errors.
         known = load_calibration(Path(settings.calibration.file))
         found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)
@@ -77,7 +77,7 @@ def calibrate(
 
 
 def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: Ledger, show: Progress) -> Calibration:
-    """Return the shared errors of one log. ConfigError if it lacks the poses for it, SolveError if the estimation fails."""
+    """Return the shared errors of one log. ConfigError if the log lacks the poses, SolveError if the estimation fails."""
     from objslam.errors import ConfigError, SolveError
     from objslam.mapping import pipeline
     from objslam.sources import read
@@ -96,14 +96,14 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
 
 
 def _of_several(show: Progress, number: int, total: int) -> Progress:
-    """Return a progress that also says which of several logs is in work."""
+    """Return a progress function that also names the present log, if there are several."""
     prefix = f"log {number} of {total}: " if total > 1 else ""
     show(f"{prefix}reading", 0, 0)
     return lambda stage, done, count: show(f"{prefix}{stage}", done, count)
 
 
 def _check_target(out: Path, overwrite: bool) -> None:
-    """Raise OutputError if the file cannot be written, or is there already and shall not be replaced."""
+    """Raise OutputError if the file cannot be written, or if it exists and `overwrite` is False."""
     from objslam.errors import OutputError
 
     if out.is_dir() or not out.absolute().parent.is_dir():

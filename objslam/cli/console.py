@@ -42,7 +42,7 @@ def console(stderr: bool = False) -> Console:
     """Return the console of stdout or stderr, with the width of the terminal, or 120 columns if it is no terminal.
 
     Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
-    console prints each text and each table cell as it is: [red] and :smile: stay, and `printable` replaces the rest.
+    console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.
     """
     from rich.console import Console
 

@@ -50,12 +50,12 @@ def doctor(
     for message in messages:
         say(f"wrong: {message}")
     if not messages:
-        refuted = "; the joint solve explains the boxes that fit poorly above" if found.findings else ""
+        refuted = ": the boxes that fit poorly above agree after the joint solve" if found.findings else ""
         say(f"nothing wrong was found{refuted}")
 
 
 def _solved(log: Log, settings: Settings, show: Progress) -> list[str] | None:
-    """Return the messages of the findings that a solve leaves, None if the solve fails."""
+    """Return the messages of the findings that a run still has after its solve. None if the solve fails."""
     from objslam.core.diagnostics import Ledger
     from objslam.errors import SolveError
     from objslam.mapping.pipeline import run

@@ -68,6 +68,8 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
                 bringing.join(_POLL)
+                for tick in feed.ticks:
+                    tick()
                 for warning in feed.adapter.ledger.warnings[shown:]:
                     shown += 1
                     say(f"warning: {warning}", stderr=True)

@@ -62,13 +62,13 @@ class _Rates:
         found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
-            f"{found if snapshot.keyframes else ''}{shown} | {_lost(snapshot, ledger)} | lag {1e3 * snapshot.lag:.0f} ms | "
+            f"{found if snapshot.keyframes else ''}{_lost(snapshot, ledger)} | {shown} | lag {1e3 * snapshot.lag:.0f} ms | "
             f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, '')}"
         ).rstrip(" |")
 
 
 def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
-    """Return a text of how much was dropped, with the most frequent reason, and of how much the settings leave unused."""
+    """Return a text with the number of dropped data, the most frequent reason, and the numbers of unused data by kind."""
     from objslam.core.snapshot import NOT_USED
 
     dropped = Counter(snapshot.dropped) + Counter(ledger.dropped)
@@ -78,6 +78,6 @@ def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
 
 
 def times(snapshot: Snapshot, then: str) -> str:
-    """Return a text of median and 99th percentile of the update times, then `then`. It is empty if no update was timed."""
+    """Return a text with the median and the 99th percentile of the update times, followed by `then`. "" without updates."""
     median, most = snapshot.update
     return f"update p50 {1e3 * median:.1f} ms, p99 {1e3 * most:.1f} ms{then}" if most > 0 else ""

@@ -65,9 +65,9 @@ class Odometry(Section):
     yaw_per_rad: NotNegative = 0.05
     """Standard deviation of the heading in rad after 1 rad of turning."""
     floor_xy: Positive = 1e-3
-    """Standard deviation of the position in m that each keyframe step has even if the robot is at rest."""
+    """Standard deviation of the position in m that each keyframe step has even if the robot stands still."""
     floor_yaw: Positive = 1e-3
-    """Standard deviation of the heading in rad that each keyframe step has even if the robot is at rest."""
+    """Standard deviation of the heading in rad that each keyframe step has even if the robot stands still."""
 
 
 class Planar(Section):
@@ -161,7 +161,7 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames at rest are keyframes too."""
+    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames without motion are keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
     """Camera rotation in degrees from the last keyframe to a new keyframe. A frame also becomes a keyframe if it shows a
     label that no keyframe at the current place shows."""

@@ -12,7 +12,7 @@ from objslam import config
 from objslam.core.coco import COCO_NAMES
 from objslam.errors import ConfigError, DetectorError
 
-_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # Those of COCO's 91 class numbers that have no class.
+_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers among COCO's 91 that have no class.
 _BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
 _MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
 

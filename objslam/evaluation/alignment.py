@@ -20,7 +20,7 @@ _MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pair
 _DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences.
 _MAX_TRIPLED = 80  # If there are more correspondences than this, triples of them are sampled. 80 have 82,160 triples.
 _MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
-_MAX_TRIPLES = 1000  # The same for alignments of three objects. Fewer suffice, because more of them are right.
+_MAX_TRIPLES = 1000  # The maximum number of initial transforms from triples. Fewer suffice, because more of them are right.
 _MAX_REFINED = 12  # This many of the best initial transforms are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _ON_A_LINE = 0.02
@@ -31,7 +31,7 @@ _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that s
 
 @dataclass(frozen=True)
 class Transform:
-    """The transform from a point to scale * rotation @ point + translation. `pose` (4, 4) has rotation and translation."""
+    """The transform of a point into scale * rotation @ point + translation. `pose` (4, 4) has rotation and translation."""
 
     pose: Floats
     scale: float = 1.0
@@ -124,9 +124,9 @@ def _refine(
 
 
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
-    """Return the best initial transforms. Each aligns two map objects, or one if no two fit, with true objects.
+    """Return the best initial transforms. Each aligns two map objects with two true objects.
 
-    For se3 and sim3, each aligns three map objects, if three fit.
+    For se3 and sim3, each aligns three objects. If no three or no two objects fit, fewer objects are aligned.
     """
     i, k = np.nonzero(same)
     if kind in ("se3", "sim3"):

@@ -18,7 +18,7 @@ MAX_TRUTH_GAP = 1.0
 INSIDE_95 = 5.991
 """The squared Mahalanobis distance within which 95 % of honest errors lie (chi-squared, 2 degrees of freedom)."""
 INSIDE_95_3D = 7.815
-"""The same for an error in x, y and z (chi-squared, 3 degrees of freedom)."""
+"""`INSIDE_95` for an error in x, y and z (chi-squared, 3 degrees of freedom)."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class ObjectScores:
 
 @dataclass(frozen=True)
 class PathScores:
-    """The absolute trajectory error (ATE; Sturm et al., IROS 2012) at those timestamps of the path that have a true pose."""
+    """The absolute trajectory error (ATE; Sturm et al., IROS 2012) at the timestamps of the path with a true pose."""
 
     errors: Floats  # The translation errors (N,) in m after the alignment of the path.
     errors_with_map: Floats | None  # Errors (N,) in m after the alignment of the objects; None if no true objects exist.
@@ -177,7 +177,7 @@ def _score_objects(
 
 
 def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
-    """A match with its offset (3,) after the alignment, and the offset in units of the object's own covariance."""
+    """Return a match. offset: (3,) m, after the alignment. The covariance of the object gives its Mahalanobis distance."""
     if found.covariance is None:
         return Match(found, true, offset, None, None)
     turn = transform.scale * transform.pose[:3, :3]

@@ -1,6 +1,7 @@
-"""Errors that the boxes of an object share: the centre of a box is not that of the object, and errs alike from one side.
+"""Errors that the boxes of an object share. The centre of a box is not the centre of the object, and from one side all boxes
+have about the same offset.
 
-More rays from the same side do not average such an error out, so that many of them count as few (Kish 1965).
+More rays from the same side do not average such an error out. So many of these rays count as few (Kish 1965).
 """
 
 from dataclasses import dataclass, replace
@@ -15,37 +16,37 @@ from objslam.core.camera import Camera
 from objslam.core.geometry import evenly_spread, is_planar
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
-from objslam.mapping.alternation import Solution
+from objslam.mapping.solution import Solution
 
 _SIDES = 103
-"""The number of sides from which an object can be seen, evenly over the sphere. They are 20 degrees apart. Rays from a side
-count as one measurement. More sides are finer, and slower."""
+"""The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All rays from one side
+count as one measurement. A larger number is finer and slower."""
 _ALIKE = np.radians(20.0)
-"""The turn (rad) of an object at which the errors of its boxes have the correlation 1/2. A larger angle averages them out
-later. The errors of a detector on three objects of YCB-Video fall to a half within 5 to 20 degrees."""
+"""The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
+angle, more views are needed to average them out. On three objects of YCB-Video, it is 5 to 20 degrees for a detector."""
 _WITHIN = 0.7
-"""The variance of the mean error over a side, as a share of the variance from one direction: two directions in a side are 10
-degrees apart in the mean, at which the correlation is 0.7. A larger share finds smaller errors."""
+"""The variance of the mean error over one side, as a share of the variance in one direction. Two directions in a side are 10
+degrees apart on average, and their correlation is 0.7. A larger share finds smaller errors."""
 _SHARES = 81
-"""The number of values of the share that are compared, from 0 to `_WIDEST` times the prior. More are finer, and slower."""
+"""The number of tried values of the share, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 4.0
-"""The largest share that is compared, in standard deviations of its prior. A larger value admits worse detectors."""
+"""The largest tried value of the share, in standard deviations of its prior. A larger value admits worse detectors."""
 _LOOSE = 1.0
-"""The standard deviation (m) of an object's place before its rays count. A larger value leaves more to the rays."""
+"""The standard deviation (m) of an object's position before its rays count. A larger value leaves more to the rays."""
 _POOLED = 20.0
-"""The number of rays at which the scatter of an object's rays and that of all rays have equal weight. A larger number trusts
-the scatter of all rays for longer."""
+"""The number of an object's rays at which their scatter weighs as much as the scatter of all rays. A larger number gives the
+scatter of all rays more weight."""
 
 
 @dataclass(frozen=True)
 class Sides:
     """C sides from which one object was seen.
 
-    alike: (C, C) the covariance of the errors of two sides, over the variance of an error. mean: (C, A) rad, by how much the
-    rays of a side miss the object along A axes, in azimuth and elevation. white: (C,) rad, the standard deviation of this
-    mean if each ray errs by itself. shift: (C, A, 3) rad per m, its derivative by the object's place. offset: (C, A, 3) rad,
-    its derivative by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3) m, how far such an offset
-    moves the object.
+    alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
+    side miss the object along A axes, in azimuth and elevation. white: (C,) rad, the standard deviation of this mean if the
+    rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset:
+    (C, A, 3) rad, its derivative by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3) m, how far
+    such an offset moves the object.
     """
 
     alike: Floats
@@ -78,10 +79,10 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return a solution whose covariances hold the errors that boxes share.
+    """Return a solution whose covariances contain the errors that boxes share.
 
-    The centre of an object's boxes is off by a share of the object's size: once from all sides, and once more as a
-    function of the side. `rays.box_sigma` is the prior of the share. If it has its default, the rays tell the share.
+    The centre of an object's boxes is off by a share of the object's size. One offset is equal from all sides, and another
+    depends on the side. `rays.box_sigma` is the prior of the share. At its default value, the share is estimated from rays.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
@@ -91,7 +92,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
     learnt = prior == type(settings.rays)().box_sigma if told == "auto" else told
-    # Solved poses follow the boxes, but a pose in the plane cannot follow them up and down.
+    # Solved poses follow the boxes. A planar pose cannot follow them up and down, so the elevation shows the error.
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base)
     share = (
@@ -106,7 +107,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
 
 
 def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
-    """Return by how much (3, 3) m^2 the offsets of boxes widen the covariance of an object.
+    """Return the covariance (3, 3) m^2 that the offsets of boxes add to the covariance of an object.
 
     extent: (2,) m, its width and height. share: the standard deviation of an offset, as a share of the size.
     """
@@ -115,7 +116,7 @@ def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
-    """Return the used rays of objects that have a place, if their boxes show a size."""
+    """Return the used rays of objects with a position, if their boxes show a size."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
@@ -133,8 +134,8 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict[int, Sides]:
     """Return the sides of each object (N, 3) m that has rays.
 
-    plain: whether positions are those of Eq. 1, which adds up unit vectors. Then a ray pulls with the inverse of its
-    deviation, else with that of the square of it.
+    plain: whether Eq. 1 gave the positions. Eq. 1 adds up unit vectors, so a ray pulls with the inverse of its standard
+    deviation. In the other solves it pulls with the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
     lattice = evenly_spread(_SIDES)
@@ -179,17 +180,17 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
 
 
 def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
-    """The weighted sums (C, 2, D) of values (R, 3, D) in each cell (R,), along the two axes (C, 3, 2) of the cell."""
+    """Return the weighted sums (C, 2, D) of values (R, 3, D) in each cell (R,), along the two axes (C, 3, 2) of the cell."""
     sums = np.zeros((len(axes), *values.shape[1:]))
     np.add.at(sums, cell, weight[:, None, None] * values)
     return np.einsum("cia,cid->cad", axes, sums)
 
 
 def _share(seen: list[Sides], prior: float) -> float:
-    """Return the share of their size by which boxes err together: the root of the mean of its square, given the rays.
+    """Return the share of their size by which boxes err together: the root mean square of the share, given the rays.
 
-    The places of the objects are unknown, so that the restricted likelihood counts (Patterson and Thompson 1971). The prior
-    is one half of a Gaussian (Gelman 2006), which lets the share vanish if the sides agree.
+    The positions of the objects are unknown, so the restricted likelihood is used (Patterson and Thompson 1971). The prior
+    is a half-normal distribution (Gelman 2006). So the share can be 0 if the sides agree.
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = -0.5 * (shares / prior) ** 2
@@ -210,7 +211,7 @@ def _share(seen: list[Sides], prior: float) -> float:
 
 
 def _azimuth_elevation(directions: Floats) -> Floats:
-    """Return the unit axes (n, 3, 2) of azimuth and elevation across each direction (n, 3), none of which is vertical."""
+    """Return the unit axes (n, 3, 2) of azimuth and elevation across each direction (n, 3). No direction may be vertical."""
     azimuth = np.cross([0.0, 0.0, 1.0], directions)
     azimuth /= np.linalg.norm(azimuth, axis=1, keepdims=True)
     return np.stack([azimuth, np.cross(directions, azimuth)], axis=2)

@@ -1,19 +1,19 @@
-"""A solution and its log without the shared errors that the solve found."""
+"""A solution and its log without the shared errors that the solve estimated."""
 
 from dataclasses import replace
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.alternation import Solution, with_noise_of
 from objslam.mapping.checks.shared_errors import warn_of_large_errors
+from objslam.mapping.solution import Solution, with_noise_of
 
 
 def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple[Solution, Log]:
-    """Return a solution with the prior of its shared errors and the drift at the stamps of its keyframes, and the log
-    without these errors. Warn of those that are large.
+    """Return a solution and the log without its shared errors. Warn of large errors.
 
-    errors: those that the solve estimated.
+    The calibration of the solution gets the prior of the shared errors. Its keyframes get the drift at their stamps. errors:
+    the errors that the solve estimated.
     """
     calibration = solution.estimate.calibration
     if calibration is None:

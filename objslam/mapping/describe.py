@@ -17,17 +17,18 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
-from objslam.mapping.alternation import Solution
+from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
+from objslam.mapping.solution import Solution
 
 
 def make_result(
     solution: Solution, objects: ObjectMap, residual: Floats, summary: dict[str, Any], settings: Settings, **more: Any
 ) -> RunResult:
-    """Return the result of a solution that `describe` described, and judge it in the summary.
+    """Return the result of a solution with the map by `describe`, and add the judgement to the summary.
 
-    more: the fields that the solution does not tell.
+    more: the fields that are not in the solution.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -57,8 +58,8 @@ def describe(
 ) -> tuple[ObjectMap, Floats]:
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
-    The numbers of rays and frames in the map leave out rejected rays, unless all rays of the object are rejected.
-    trusted: whether positions can be relied on. If not, all objects are unresolved.
+    The map counts the rays and frames of an object without its rejected rays. If all its rays are rejected, it counts all.
+    trusted: whether positions are reliable. If not, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
@@ -104,9 +105,16 @@ def describe(
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
+                seen_from=_distances(estimate.positions[j], origins[kept]) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
+
+
+def _distances(position: Floats, origins: Floats) -> tuple[float, float]:
+    """Return the least and the greatest distance (m) of a position (3,) from the origins (n, 3) of its rays."""
+    distance = np.linalg.norm(origins - position, axis=1)
+    return round(float(distance.min()), 3), round(float(distance.max()), 3)
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
@@ -126,10 +134,11 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Return the content of summary.json. counts: how many images, frames and boxes the driver found.
+    """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
-    `map_frame` in it says what fixed the frame of the map: `localization`, or `odometry` if nothing absolute did. `planar`
-    says whether the measured path has one height, roll and pitch.
+    Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
+    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
+    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
@@ -141,6 +150,7 @@ def summarise(
         "mode": settings.mode,
         "map_frame": "localization" if solution.keyframes.localized_every else "odometry",
         "planar": is_planar(solution.keyframes.map_T_base),
+        "up": up_axis(solution.keyframes),
         "counts": {
             **counts,
             "keyframes": len(solution.keyframes),

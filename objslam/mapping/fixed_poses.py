@@ -1,4 +1,4 @@
-"""Find and place objects at given poses. A calibration of the cameras against these poses alternates with that."""
+"""Find objects and their positions at given poses. A calibration of the cameras can alternate with this."""
 
 from __future__ import annotations
 
@@ -24,16 +24,18 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _ROUNDS = 8
-"""The most rounds of association and calibration. More rounds are slower. Two or three are usual."""
-_SAME = 0.2
-"""The change of the shared errors, in standard deviations, below which they have converged. A larger one ends sooner."""
+"""The most rounds of association and calibration. Two or three are usual. More rounds are slower."""
+_SAME = 0.1
+"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. A tenth of
+the noise moves hardly a ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared errors
+does not work: with precise errors, the association can swing between two states for ever."""
 _EXPLAINED = 0.5
-"""The share of rays below which an association explains too few. A larger share tries another association more often."""
+"""An association explains too few rays below this share. A larger share tries another association more often."""
 
 
 @dataclass(frozen=True)
 class FixedPoses:
-    """What objects at given poses are found from.
+    """The input of an association at given poses.
 
     frames, rays: all keyframes with a pose, also without rays. seen, rays_seen: the keyframes that have a ray, and the rays
     with indices into them.
@@ -47,13 +49,13 @@ class FixedPoses:
     settings: Settings
 
     def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
-        """Return the same with shared errors (P,) taken out."""
+        """Return the same input without shared errors (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
         seen, rays_seen, _ = errors.at(theta, drift=False)
         return replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
 
     def associate(self, more: Floats | float = 0.0) -> Association:
-        """Associate the rays. more: (R,) rad, the noise of their directions beside that of boxes and poses."""
+        """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
         from objslam.association.global_association import associate_globally
         from objslam.graph.fixed_pose_triangulation import pose_noise
 
@@ -73,7 +75,7 @@ class FixedPoses:
         )
 
     def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
-        """Place the objects of an association, and record a round. parameters: the shared errors that are taken out."""
+        """Triangulate the objects of an association, and record a round. parameters: the shared errors that were removed."""
         from objslam.graph import batch_solver
         from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -91,27 +93,28 @@ class FixedPoses:
 
 def calibrate_fixed(
     at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
-) -> tuple[FixedPoses, Association, Estimate, list[dict[str, int]]]:
+) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
-    The association allows for what the errors can still be: at first their prior, then what the last fit left of it. The
-    covariance of the errors enters that of the objects. Returns what was solved, without the errors, the association, the
-    estimate, and the number of objects in each round.
+    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
+    The covariance of the errors is added to the covariance of the objects. Returns the input without the errors, the
+    association, the estimate, and the number of objects in each round.
     """
-    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
     noise = pose_noise(errors.rays, errors.keyframes, at.settings)
-    rounds: list[dict[str, int]] = []
+    told = noise_of_errors(every, calibration)
+    rounds: tuple[dict[str, int], ...] = ()
     for number in range(_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
-        association = now.associate(noise_of_errors(every, calibration))
+        association = now.associate(told)
         if (plain := _explains_far_more(now, association)) is not None:
             association = plain
-        rounds.append({"objects": association.count})
+        rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
         placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)
@@ -120,9 +123,11 @@ def calibrate_fixed(
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             return now, association, replace(estimate, calibration=calibration), rounds
-        moved = np.abs(found.calibration.values - calibration.values)
-        calibration = found.calibration
-        if (moved < _SAME * calibration.sigma).all():
+        allowed = np.hypot(noise[0], told)
+        turned = turned_by_errors(every, calibration.values, found.calibration.values)
+        calibration, told = found.calibration, noise_of_errors(every, found.calibration)
+        changes = turned / allowed, np.hypot(noise[0], told) / allowed - 1
+        if all(np.sqrt((change**2).mean()) < _SAME for change in changes):
             break
     else:
         ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")
@@ -132,10 +137,10 @@ def calibrate_fixed(
 
 
 def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
-    """Return the association without shared errors, None if it does not explain far more rays than that with them, `wide`.
+    """Return the association without shared errors if it explains far more rays than the association `wide`. Else None.
 
-    What the errors can be is many times the noise of a ray. On a short drive among many objects of one label, nothing can
-    be told apart then. Errors that are small enough not to matter leave objects to be found without them.
+    `wide` allows for shared errors, which may be many times the noise of a ray. On a short drive among many objects of one
+    label, such wide gates confuse all objects. If the true errors are small, the objects are found without this allowance.
     """
     explained = (wide.object >= 0).sum()
     if explained > _EXPLAINED * len(wide.object):
@@ -145,7 +150,7 @@ def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
 
 
 def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
-    """Return an estimate with the covariance that the shared errors leave in its objects."""
+    """Return an estimate with the covariance of the shared errors added to its objects."""
     from objslam.graph.marginals import largest_sigma
 
     told = found.calibration

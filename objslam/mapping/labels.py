@@ -1,4 +1,4 @@
-"""Judge whether labels tell objects apart: whether each label is one object."""
+"""Judge whether each label belongs to a single object."""
 
 from collections.abc import Callable
 
@@ -14,28 +14,28 @@ from objslam.core.types import Association, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
-"""The number and the share of a label's rays that must disagree with its object before a second object is assumed. Larger
+"""A label gets a second object if at least this number and this share of its rays disagree with the first one. Larger
 values accept fewer second objects."""
 _JUDGEMENTS = 2
-"""How often labels are judged again with the noise that the last solve found. Rejected rays hide noise, so the second time
-finds more of it. More judgements are slower."""
+"""How often labels are judged again with the noise of the last solve. Rejected rays hide noise, so the second judgement
+finds more noise. More judgements are slower."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which labels are not judged again. A larger change ends sooner."""
+"""The relative change of the noise below which labels are not judged again. A larger value ends sooner."""
 
 _CLOCKS = (-1.0, 1.0, -2.0, 2.0)
-"""The clocks that are tried, in standard deviations of their prior. A solve finds a clock that is within one of them, so
-closer ones are slower and find the same. Farther ones find clocks that the prior excludes."""
+"""The tried clock offsets, in standard deviations of their prior. A solve finds a clock within one standard deviation, so
+closer values are slower and find nothing new. Farther values find clocks that the prior excludes."""
 _SHORT = 500
-"""The largest number of keyframes of a log whose clocks are tried. A larger number is slower. Longer logs tell the clock."""
+"""Clock offsets are tried only for a log with at most this many keyframes. Longer logs determine the clock by themselves."""
 
 _LARGER = 1.5
-"""The factor on the noise of the settings above which a warning names it. A larger factor names less."""
+"""A warning names noise that is larger than the settings by more than this factor. A larger factor names less."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     """Return whether to try one object for each label.
 
-    association.method decides. If it is auto, this is tried if no keyframe has two rays of one label.
+    association.method decides. With `auto`, the answer is yes if no keyframe has two rays of one label.
     """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
@@ -44,9 +44,10 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:
-    """Return whether every label is one object: no label has many rejected rays.
+    """Return whether every label is one object, because no label has many rejected rays.
 
-    A label whose object has no position tells nothing. Its rays may have too little parallax. False if none has a position.
+    A label whose object has no position is ignored, because its rays may have too little parallax. False if no object has a
+    position.
     """
     placed = np.isfinite(estimate.positions[:, 0])
     held = association.object >= 0
@@ -56,10 +57,10 @@ def labels_tell(association: Association, estimate: Estimate) -> bool:
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
-    """Return the shared errors (P,) from which a solve of a short log ends where the labels tell, None if there are none.
+    """Return shared errors (P,) from which a solve of a short log ends with one object for each label. None if none do.
 
-    With a wrong clock, the start of a solve rejects true rays, and a short log has too few others to find the clock from.
-    So solves begin with each clock of a coarse grid. solve: solves once, from shared errors.
+    With a wrong clock, the start of a solve rejects true rays. A short log has too few other rays to find the clock. So a
+    solve starts from each clock of a coarse grid. solve: solves once, from shared errors.
     """
     clocks = np.array([kind(name) == "clock" for name in errors.names], dtype=bool)
     if not clocks.any() or len(errors.keyframes) > _SHORT:
@@ -75,12 +76,12 @@ def clock_explains(association: Association, errors: SharedErrors, solve: Callab
 def noise_explains(
     association: Association, estimate: Estimate, errors: SharedErrors, solve: Callable[[SharedErrors], Estimate]
 ) -> Estimate | None:
-    """Return the solution with one object for each label in which the labels tell, None if there is none.
+    """Return the solution with one object for each label if larger noise makes all labels agree. None otherwise.
 
-    With too little noise in the settings, poses cannot move as far as they should, and the rays of one object seem to be
-    those of several. So all noise is estimated, also if the settings say it, and the labels are judged with it.
+    With too little noise in the settings, poses cannot move far enough. Then rays of one object look like rays of several
+    objects. So all noise is estimated, even if the settings fix it, and the labels are judged with this noise.
 
-    estimate: the solution in which they do not tell. errors: those that the next solve starts from. solve: solves once.
+    estimate: the solution in which labels disagree. errors: the start of the next solve. solve: solves once.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise
@@ -96,7 +97,7 @@ def noise_explains(
 
 
 def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> None:
-    """Warn of noise in the settings that is too small, by the noise of an estimate in which the labels tell."""
+    """Warn if the settings have less noise than an estimate in which the labels agree."""
     said = errors.with_unknown_noise().unknown_noise - errors.unknown_noise
     if estimate.noise is None or not said:
         return

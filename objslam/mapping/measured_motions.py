@@ -1,4 +1,4 @@
-"""Compute the motions by odometry between the poses of a result, for exports and for other optimisers."""
+"""Compute the motions by odometry between the poses of a result, for exports and other optimisers."""
 
 from dataclasses import replace
 

@@ -19,7 +19,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import seen_something, solve
+from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
@@ -28,15 +28,24 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
+from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 
 
-def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
+def run(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Progress = lambda stage, done, total: None,
+    known: PriorMap | None = None,
+) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
+    known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
     LogError if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
     or does not fit the log.
     """
@@ -80,7 +89,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
             say(diagnosis, ledger)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
-    objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
+    trusted = not diagnosis.spoilt
+    objects, residual = describe(solution, cameras, settings, trusted=trusted)
     if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
         calibrated = estimate.calibration is not None
         missing = check_residuals(
@@ -89,8 +99,17 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
+    where = None
+    if known is not None:
+        with _stage("localize", seconds, progress):
+            where = localize(solution, objects, known, errors, settings, ledger)
+            if where.solution is not None and where.map_T_drive is not None:
+                solution, log = where.solution, moved_log(log, where.map_T_drive)
+                keyframes, estimate = solution.keyframes, solution.estimate
+                described, residual = describe(solution, cameras, settings, trusted=trusted)
+                objects = with_map(described, where, known)
     path = log.robot_path
-    assert path is not None  # build_keyframes raises LogError otherwise
+    assert path is not None  # Otherwise build_keyframes has raised LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
@@ -98,7 +117,7 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # the ledger has its drops already
+                before = reconstruct(log, path, settings, Ledger(), progress)  # The second call counts the drops.
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
@@ -113,6 +132,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
+            **({} if where is None else {"localisation": where.told}),
+            **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
         },
         settings=settings,
         cameras=cameras,
@@ -122,12 +143,20 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         surface=surface,
         surface_before=before,
         residual_before=residual_before,
+        views=_views(log, settings, path_after),
     )
+
+
+def _views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
+    """Return all camera frames of a log without errors, at the poses of the solved path."""
+    frames = build_keyframes(log, settings, Ledger())
+    at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
+    return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:
     """Return the path through the solved poses (K, 4, 4). In joint mode it follows the odometry between keyframes."""
-    # The localisation between two keyframes would bring back its jitter.
+    # Between two keyframes, the path follows the odometry. The localisation would bring back its jitter.
     after = correct_path(path, keyframes.stamps, keyframes.map_T_base, map_T_base)
     way = log.odometry
     if settings.mode == "fixed" or way is None or way is path:
@@ -139,7 +168,7 @@ def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Fl
 
 
 def chosen_poses(log: Log, settings: Settings) -> Log:
-    """Return the log with the poses that the settings choose. LogError if it has none of them."""
+    """Return the log with the poses that the settings choose. LogError if the log lacks them."""
     use = settings.poses.use
     if use == "auto":
         return log
@@ -149,7 +178,7 @@ def chosen_poses(log: Log, settings: Settings) -> Log:
 
 
 def with_mode_of(log: Log, settings: Settings) -> Settings:
-    """Return the settings with the mode that `auto` means for a log with the chosen poses."""
+    """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
     if settings.mode != "auto":
         return settings
     return settings.model_copy(update={"mode": "joint" if log.localization is None else "fixed"})

@@ -28,19 +28,19 @@ from objslam.io.text import read_bytes
 from objslam.mapping.progress import Progress
 
 _BLOCK = 6
-"""The number of voxels along the edge of a block. 6 takes a tenth less time and a quarter less memory than 8. A larger
-number is slower. 16 takes twice the time."""
+"""The number of voxels along the edge of a block. Compared with 8, a value of 6 takes a tenth less time and a quarter less
+memory. A larger number is slower: 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""The number of blocks for which the grid has room at first. A larger number takes more memory in a small scene. The present
-number is enough for a room. The grid doubles its room when it is full."""
+"""The number of blocks for which the grid has room at first. It is enough for a room. A larger number takes more memory in a
+small scene. The grid doubles its room when it is full."""
 _SPARE = 1024
-"""The number of blocks in the grid that stay free. A larger number wastes more memory. Open3D enlarges the grid by itself if
-one call touches more blocks than are free, and it counts blocks that exist already too."""
+"""The number of blocks in the grid that stay free. A larger number takes more memory. If one call touches more blocks than
+are free, Open3D itself enlarges the grid. It counts even the touched blocks that exist already."""
 _AHEAD = 4
 """The number of images that are decoded ahead. A larger number takes more memory."""
 _TOUCH = 4
-"""The step (px) at which Open3D samples a depth image to find the blocks that the image touches. It must equal Open3D's own
-step. A larger step drops more images as out of reach."""
+"""The step (px) at which Open3D samples a depth image to find the touched blocks. It must equal Open3D's own step. A larger
+step wrongly drops images as out of reach."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def reconstruct(
 ) -> Surface | None:
     """Fuse the depth images of a log, at the poses of a path (map_T_base), into a surface.
 
-    Depth images contain z at the pixels of the camera image. The ledger counts the depth images that have no pose, no colour
-    image within 20 ms or no depth in reach. It also counts images that are damaged or do not have the camera's size. Blocks
-    beyond reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be
-    imported, the ledger gets a warning and the result is None.
+    Depth images contain z at the pixels of the camera image. The ledger counts unused depth images: without a pose, without
+    a colour image within 20 ms, without depth in reach, damaged, or of another size than the camera's. Blocks beyond
+    reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be imported,
+    the ledger gets a warning and the result is None.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
@@ -71,14 +71,14 @@ def reconstruct(
         return _fuse(shots, tuple(c.camera for c in log.cameras), settings, ledger, progress)
     except ImportError as error:
         ledger.warn(f"no reconstruction: Open3D cannot be imported ({error}); tools/setup.sh names the libraries it needs")
-    except RuntimeError as error:  # from Open3D, for example out of memory on a GPU
-        reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # without colours and signature
+    except RuntimeError as error:  # Open3D raises it, for example if a GPU is out of memory.
+        reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # Without colour codes and signature.
         ledger.warn(f"no reconstruction: Open3D failed ({reason})")
     return None
 
 
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
-    """Choose depth images that have a pose and, if all cameras have colour, a colour image, in the order of time.
+    """Choose depth images that have a pose, in the order of time. If all cameras have colour, they also need a colour image.
 
     Every reconstruction.stride-th image is chosen. If more than reconstruction.max_frames are left, they are thinned evenly.
     """
@@ -121,7 +121,7 @@ def _fuse(
         lenses = [Lens.of(camera) for camera in cameras]
 
         def load(shot: Shot) -> tuple[Shot, NDArray[np.float32] | None, NDArray[np.float32] | None, Ledger]:
-            noted = Ledger()  # threads cannot share a ledger
+            noted = Ledger()  # Threads cannot share a ledger.
             return shot, *load_shot(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
 
         for done, (shot, depth, colour, noted) in enumerate(ahead(load, shots, _AHEAD)):
@@ -183,7 +183,7 @@ def load_shot(
     if raw is None:
         return None, None
     depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
-    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # NaN compares false
+    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # Comparisons with NaN are False.
     if not depth[::_TOUCH, ::_TOUCH].any():
         ledger.drop("depth images without a depth in reach", where=str(shot.depth))
         return None, None
@@ -216,7 +216,7 @@ class Grid:
         self._max_blocks = chosen.max_blocks
         self._max_depth = chosen.max_depth
         self._truncation = max(chosen.truncation / chosen.voxel, 2.0)  # voxels
-        # Colours are floats, because Open3D rounds averages of 16-bit colours down, which darkens walls by a tenth.
+        # Colours are floats. With 16-bit colours, Open3D rounds averages down, which darkens walls by a tenth.
         names, channels = (("tsdf", "weight", "color"), (1, 1, 3)) if coloured else (("tsdf", "weight"), (1, 1))
         first = min(_FIRST_BLOCKS, self._max_blocks)
         dtypes = (o3d.core.float32,) * len(names)
@@ -241,7 +241,7 @@ class Grid:
             self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
 
     def _with_room(self, touched: Any) -> Iterator[Any]:
-        """Yield those touched blocks (M, 3) that exist or find room, in portions so small that Open3D does not add room."""
+        """Yield the touched blocks (M, 3) that exist or find room, in small portions, so that Open3D does not add room."""
         hashmap = self._grid.hashmap()
 
         def room() -> int:
@@ -263,7 +263,7 @@ class Grid:
         """Return the triangles between voxels that at least `min_views` depth images saw, or None without triangles."""
         if not self.blocks:
             return None
-        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D requires more than its limit
+        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D requires a weight above its limit.
         if not len(mesh.triangle.indices):
             return None
         colours = None

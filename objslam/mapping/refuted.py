@@ -1,8 +1,8 @@
-"""Findings that the solve refutes: a joint solve may correct what a quick look at the boxes takes for wrong input.
+"""Remove findings that the solve refutes. A quick check of the boxes may report wrong input that a joint solve corrects.
 
-The quick look holds odometry and calibration as they are, for some seconds each. A camera that is turned by some degrees and
-late by a tenth of a second lets few boxes fit then, and few boxes fit many hypotheses by chance. Objects that are seen under
-little parallax in one half of a log get no point there. So the solved map answers the same question again.
+The quick check keeps odometry and calibration fixed within windows of some seconds. If a camera is turned by some degrees
+and late by a tenth of a second, few boxes fit. Then several hypotheses fit the few boxes by chance. Objects with little
+parallax in one half of a log get no point there. So the solved map repeats the test.
 """
 
 from dataclasses import replace
@@ -17,32 +17,33 @@ from objslam.errors import ObjslamError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
-from objslam.mapping.alternation import Solution, seen_something, solve
+from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.halves import check_halves, seen_in_both
 from objslam.mapping.checks.mixture import find_mixture
 from objslam.mapping.progress import Progress
+from objslam.mapping.solution import Solution, seen_something
 
 _EXPLAINED = 0.85
-"""The share of the rays in each half of a log from which on a solve explains the boxes. A larger share refutes fewer
-findings. Clean simulated logs have 0.92 and more, those with one of 20 kinds of wrong boxes or cameras at most 0.76."""
+"""A solve explains the boxes if it explains at least this share of the rays in each half of a log. A larger share refutes
+fewer findings. Clean simulated logs have 0.92 and more. Logs with one of 20 faults of boxes or cameras have at most 0.76."""
 _NOISE = 2.0
-"""The largest noise of rays and odometry, times that of the settings, with which the log put right must be explained. With
-enough noise everything fits. Simulated logs that are put right have at most 1.6."""
+"""The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With enough
+noise, everything fits. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
-"""How much more of the rays the log put right must explain. A larger share refutes more findings."""
+"""A finding stands only if its corrected log explains more rays by this share. A larger share refutes more findings."""
 _IN_BOTH = 0.4
-"""The share of the explained rays of a half that must belong to objects seen in both halves (`seen_in_both`), for the halves
-to agree. A larger share refutes fewer findings. Simulated clean logs with such a finding have 0.63 and more. Those of two
-recordings have at most 0.23 if the solve explains the rays of both."""
+"""The halves of a log agree if at least this share of a half's explained rays belongs to objects in both halves
+(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs with such a finding have 0.63 and more. Logs of
+two recordings have at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
-    """Return the diagnosis of a log without the findings that rest on the boxes alone, and that a joint solve refutes.
+    """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: of the log as it is. If it explains the boxes, they are right. Else the log is put right as a finding says, and
-    solved. If this explains the boxes no better, the finding is wrong.
+    solution: of the unchanged log. If it explains the boxes, they are right. Otherwise, the log is corrected as a finding
+    says, and solved again. If the corrected log explains the boxes no better, the finding is wrong.
     """
     kept = tuple(
         one
@@ -60,7 +61,7 @@ def _refuted(
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
-        # Where labels do not name the objects, an object that is there twice would explain the boxes of both halves.
+        # If labels do not name the objects, two copies of one object could explain the boxes of both halves.
         return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
     if explained:
         return True
@@ -88,24 +89,24 @@ def _solved(log: Log, settings: Settings, progress: Progress) -> Solution:
 
 
 def _explained(solution: Solution) -> Bools:
-    """(R,) the rays that agree with their object."""
+    """Return a mask (R,) of the rays that agree with their object."""
     return np.asarray((solution.estimate.weight > 0) & (solution.association.object >= 0))
 
 
 def _late(solution: Solution) -> Bools:
-    """(R,) the rays in the second half of the log."""
+    """Return a mask (R,) of the rays in the second half of the log."""
     stamps = solution.keyframes.stamps[solution.rays.keyframe]
     return np.asarray(stamps > np.median(stamps))
 
 
 def _least_explained(solution: Solution) -> float:
-    """The share of explained rays in the half that has fewer of them."""
+    """Return the share of explained rays in the half with the smaller share."""
     explained, late = _explained(solution), _late(solution)
     return float(min(explained[mask].mean() if mask.any() else 0.0 for mask in (late, ~late)))
 
 
 def _noise(solution: Solution, *, rays_only: bool = False) -> float:
-    """The largest factor on the noise of rays and odometry."""
+    """Return the largest factor on the noise of rays and odometry."""
     found = solution.estimate.noise
     if found is None:
         return 1.0
@@ -113,7 +114,7 @@ def _noise(solution: Solution, *, rays_only: bool = False) -> float:
 
 
 def _halves_agree(solution: Solution) -> bool:
-    """Return whether the rays of both halves fit the solved objects, and these are the same objects."""
+    """Return whether the rays of both halves fit the solved objects, and both halves see the same objects."""
     explained, late = _explained(solution), _late(solution)
     if check_halves(late, explained) is not None:
         return False

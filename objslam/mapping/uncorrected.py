@@ -1,4 +1,4 @@
-"""The residuals that the rays would have if the shared errors were left in the measurements."""
+"""The residuals of the rays if the shared errors are not corrected."""
 
 import numpy as np
 
@@ -6,15 +6,14 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import angles_off, interpolate, inverse
 from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.alternation import Solution
+from objslam.mapping.solution import Solution
 
 
 def uncorrected_residual(errors: SharedErrors, solution: Solution, path: Trajectory) -> Floats | None:
     """Return the angles (R,), rad, between the rays as measured and their objects, NaN without an object.
 
-    As measured means that the shared errors have the mean of their prior: the frames their stamps, and the cameras their
-    place on the robot. The objects and the solved path at its full rate stay, so this shows what the correction changed.
-    None if no shared errors were estimated.
+    The rays as measured have the shared errors at the mean of their prior. The objects and the solved path at its full rate
+    stay the same, so the angles show the effect of the correction. None if no shared errors were estimated.
     """
     if solution.estimate.calibration is None:
         return None

@@ -23,10 +23,10 @@ from objslam.triangulation.point_to_lines import PointSolution, minimise_distanc
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
 """The view in which wrong boxes are uniformly distributed: a cone with 45 degrees half angle. Unit: 2 pi sr."""
-_NOISE_SIGMAS = 3.0  # The standard deviations of noise below which a smaller deviation of a ray scores no better.
-_MOST_NOISE = 0.25  # The largest share of the view for noise. A larger one lets very noisy rays agree with any point.
+_NOISE_SIGMAS = 3.0  # Below this many standard deviations of noise, a smaller deviation of a ray scores no better.
+_MOST_NOISE = 0.25  # Noise takes at most this share of the view. With more, very noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
-_MAX_ROUNDS = 20  # The most alternations of Eq. 1 and selection, which end earlier once the agreement stops growing.
+_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
 
 
 def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
@@ -105,8 +105,8 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
     """Return for each object the midpoint (B, 3) of two rays with which its rays agree most. NaN if no midpoint exists.
 
     objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
-    that many equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of this
-    pair in its part. The result of an object depends on its own rays alone.
+    `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
+    this pair in its part. The result of an object depends on its own rays alone.
     """
     xp = module_of(bundle.origin)
     points = xp.full((len(bundle.number), 3), xp.nan, dtype=bundle.origin.dtype, device=bundle.origin.device)
@@ -165,8 +165,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that the ray of a wrong box is as close to the points (B, H, 3) as each ray is. It is
-    1 for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return the probability (B, H, n) that a wrong box gives a ray as close to the points (B, H, 3) as each ray is. It is 1
+    for a ray that points away from the point, and for a ray that is not `real`."""
     xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]

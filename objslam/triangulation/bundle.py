@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from objslam.core.array_module import Tensor, indices_of, module_of
 
 _SIMILAR = (2, 32)
-"""A block holds objects with up to a n + b rays, if its smallest has n. Larger values make fewer blocks with more filler.
-With these, half of a block is filler at worst, unless its objects have so few rays that filler costs nothing."""
+"""The numbers a and b. If the smallest object of a block has n rays, its largest object has at most a n + b rays. Larger
+numbers make fewer blocks with more filler. With these numbers, at most half of a block is filler. Only blocks of objects
+with very few rays have more, where filler costs nothing."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,10 @@ class Bundle:
         return Bundle(self.origin[use], self.direction[use], self.sigma[use], self.position_sigma, index, number)
 
     def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into blocks of at most `most` places for rays, or of one object.
+        """Split objects, given by their indices, into blocks. A block of several objects has at most `most` places for rays.
 
-        A block holds the objects (B,), the indices of their rays (B, n), and which of these are real. The others only fill
-        the rows of objects with fewer rays.
+        A block holds the objects (B,), the indices of their rays (B, n), and which of these indices are real. The other
+        indices only fill the rows of objects with fewer rays.
         """
         xp = module_of(self.number)
         first = xp.cumsum(self.number, 0) - self.number

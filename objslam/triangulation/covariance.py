@@ -8,7 +8,7 @@ from objslam.triangulation.lines import Lines
 
 _EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
 _PLACES = 1 << 13  # The most places for rays of the objects that `parallax` compares together. A larger number needs memory.
-_RANGE_ITERATIONS = 30  # The iterations of the range fit, which starts at the median range. All objects take as many.
+_RANGE_ITERATIONS = 30  # The iterations of the range fit of every object. The fit starts at the median range.
 
 
 def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:

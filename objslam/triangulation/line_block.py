@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from objslam.core.array_module import Tensor, as_type, contiguous, module_of, rows
 from objslam.triangulation.bundle import Bundle
 
-_FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # Where the nine entries of a symmetric matrix lie among its six.
+_FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # The place of each of the nine entries of a symmetric matrix among its six values.
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,9 @@ def full(six: Tensor) -> Tensor:
 
 
 def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Return x (3, B) with A x = b by Cramer's rule, and how regular A is: its determinant over the cube of its mean
-    eigenvalue, (B,), from 0 to 1. a: (6, B) positive semidefinite. b: (3, B). Where A is singular, x is useless."""
+    """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1. The regularity is the
+    determinant over the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x is
+    useless."""
     xx, yy, zz, xy, xz, yz = a
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * c0 + xy * c1 + xz * c2

@@ -87,9 +87,9 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
     """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return values as `newton`.
 
-    The line holds the optimum of Eq. 1 on itself if the gradient of the other distances there is not above 1 across the line
-    (Kuhn, Math. Programming 4, 1973). This proves the optimum, and the norm returned is the smallest subgradient. Otherwise
-    the optimum lies beside the line. Newton steps start there.
+    The optimum of Eq. 1 lies on the line if the gradient of the other distances, across the line, is at most 1 (Kuhn, Math.
+    Programming 4, 1973). This proves the optimum, and the returned norm is the smallest subgradient. Otherwise the optimum
+    lies beside the line. Newton steps start there.
     """
     xp = module_of(start)
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))

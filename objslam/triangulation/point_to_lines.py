@@ -24,9 +24,9 @@ from objslam.triangulation.newton import approach, newton, off_nearest_line
 from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most rays in one block. Fewer need more calls, and torch pays more for a call. More leave a CPU cache, or
-need more memory on CUDA: 1 kB a ray. Measured for the CPU: four times as many take 1.1 (numpy) and 1.2 times (torch) as
-long. The number for CUDA was not measured."""
+"""The most rays in one block. A smaller number needs more calls, and a call of torch costs more than a call of numpy. A
+larger number does not fit into the cache of a CPU, or needs more memory on CUDA: 1 kB a ray. On the CPU, blocks four times
+as large take 1.1 (numpy) and 1.2 times (torch) as long. The number for CUDA was not measured."""
 _ROUNDS = 3
 """The most rounds with Newton steps for the objects with a line near the solution. `smoothed_newton` solves the rest."""
 _LEAST_REGULAR = 1e-6
@@ -36,7 +36,7 @@ _LEAST_REGULAR = 1e-6
 @dataclass(frozen=True)
 class PointSolution:
     """Solutions of Eq. 1. point: (N, 3) m. determined: (N,) whether the rays fix the point. gradient: (N,) norm of the
-    gradient, NaN if they do not. iterations: the number of solver iterations."""
+    gradient, NaN if the rays do not fix the point. iterations: the number of solver iterations."""
 
     point: Tensor
     determined: Tensor

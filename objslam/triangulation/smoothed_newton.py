@@ -8,7 +8,7 @@ from objslam.triangulation.line_block import LineBlock, apply, dot, full, norm, 
 _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block earlier.
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
 _LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
-_ON_LINE = (1e-7, 1e-5)  # The tried values of `on_line` in `_exact_optimum` (in mean distances).
+_ON_LINE = (1e-7, 1e-5)  # The values of `on_line` that `_exact_optimum` is tried with (in mean distances).
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
 

@@ -21,8 +21,8 @@ from objslam.triangulation.lines import Lines
 from objslam.triangulation.point_to_lines import least_squares, minimise_distances
 
 _LARGE = 200_000
-"""The least number of rays for torch, which runs on CUDA if there is a card. Below it, numpy on one core is as fast, and
-spares the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
+"""The number of rays from which on torch does the work, on CUDA if there is a card. Below it, numpy on one core is as fast.
+numpy also saves the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray. It must be finite and above 0 if the ray's `needed` is finite (default: for all rays)."""
+    """Return one value per ray. A value must be finite and above 0 if `needed` (R,) is finite there, or without `needed`."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():

@@ -65,7 +65,7 @@ def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
             show(snapshot, Ledger())
     finally:
         terminal.console.cache_clear()
-    assert "0 objects, 0 unresolved | odometry " in screen.getvalue()
+    assert "0 objects, 0 unresolved | dropped 2 (frame too late) | " in screen.getvalue()
     lines = [""]
     for part in re.split(r"(\x1b\[[0-9?]*[A-Za-z]|\r|\n)", screen.getvalue()):
         if part == "\n":

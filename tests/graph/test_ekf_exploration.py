@@ -11,7 +11,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.ekf_exploration import explore, is_sure
-from objslam.mapping.alternation import seen_something
+from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=3"))

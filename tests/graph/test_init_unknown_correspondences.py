@@ -10,7 +10,7 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.graph.init_unknown_correspondences import _planar_sigmas
 from objslam.graph.loop_closure import distribute_correction
 from objslam.mapping import pipeline
-from objslam.mapping.alternation import rays_moved
+from objslam.mapping.joint_alternation import rays_moved
 from objslam.simulation import preset, simulate
 
 STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}

@@ -19,10 +19,11 @@ from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
-from objslam.mapping.alternation import Solution, solve, without_errors
+from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.solution import Solution, without_errors
 
 
 def finish(m: MapState, name: str, path: Path | None) -> RunResult:
@@ -84,7 +85,7 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     It follows the odometry, if there is one, because the localisation jitters.
     """
     way = log.odometry or log.localization
-    assert way is not None  # without a path there is no keyframe
+    assert way is not None  # There is no keyframe without a path.
     before, _ = interpolate(way.stamps, way.poses, np.clip(stamps, way.stamps[0], way.stamps[-1]), np.inf)
     return correct_path(way, stamps, before, map_T_base)
 

@@ -1,4 +1,4 @@
-"""Find out whether the input is wrong: tests on the log, on the residuals of a solution, and of what-if changes to the log.
+"""Find out whether the input is wrong, by tests on the log, on the residuals of a solution, and on changed copies.
 
-Nothing here changes a map. The checks say what is wrong in words, and whether positions can be relied on.
+Nothing here changes a map. The checks say in words what is wrong, and whether the positions are reliable.
 """

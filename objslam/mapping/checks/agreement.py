@@ -1,7 +1,7 @@
 """Measure quickly how well the boxes of a log agree: fit points to the rays of each label, and count the boxes that fit.
 
-Poses are taken as they are. Odometry drifts, so a log without a localisation is cut into short windows, each with points of
-its own.
+Poses are not corrected. Odometry drifts, so a log without a localisation is cut into short windows. Each window has its own
+points.
 """
 
 from collections.abc import Iterator
@@ -18,38 +18,39 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 
 FRAMES = 600
-"""The most frames that are looked at; more frames tell more surely and take longer."""
+"""The most frames that are examined. More frames give a more certain answer and take longer."""
 _WINDOWS = 6
-"""The number of windows of a log without a localisation. More windows see more of the log, with fewer frames each."""
+"""The number of windows of a log without a localisation. More windows cover more of the log, with fewer frames each."""
 _WAY, _TURN = 5.0, 5.0
-"""The way (m) and the turn (rad) in a window. Larger values see objects from more places, with more drift."""
+"""The distance (m) and the turn (rad) that a window covers. Larger values see objects from more places, with more drift."""
 _DRIFT_YAW, _DRIFT_XY = 0.015, 0.03
-"""The errors (rad, m) of odometry within a window that a ray may have. Larger values let wrong input fit as well."""
+"""The errors (rad, m) of odometry within a window that a ray may have. With larger values, wrong input may fit too."""
 _SIGMAS = 3.0
-"""The deviation of a ray from its point up to which it fits. A larger value lets more false rays fit."""
+"""The deviation of a ray from its point, in standard deviations, up to which it fits. A larger value lets false rays fit."""
 _PAIRS = 96
-"""The number of pairs of rays that are tried for a point. More pairs find points with fewer rays, and take longer."""
+"""The number of tried pairs of rays for a point. More pairs find points with fewer rays, and take longer."""
 _JUDGES = 400
-"""The most rays of a label that choose among the points that are tried. More choose better, and take longer in a crowd."""
+"""The most rays of a label that choose among the tried points. More rays choose better, and take longer in a crowd."""
 _FEWEST = 4
 """The fewest rays of a point. Fewer rays agree by chance."""
 _LEAST_ANGLE = np.radians(4.0)
-"""The least angle between the rays of a point (rad). Rays with a smaller angle agree whatever the input."""
+"""The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
 _COST = 3.0
-"""The boxes that a point must explain before it counts: its three coordinates. A larger number trusts small points less."""
+"""The number of boxes that a point must explain before it counts, one for each coordinate. A larger number drops points with
+few boxes."""
 _MOST_POINTS = 40
 """The most points of one label in a window. More points explain more boxes by chance."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well boxes agree. share: of the boxes that fit a point. score: the same, a box counting less the worse
-    it fits, and each point costing three boxes.
+    """How well boxes agree. share: the share of the boxes that fit a point. score: the share with weights and costs. A box
+    that fits worse has less weight, and each point costs three boxes.
 
-    boxes: how many boxes there are, with those that give no ray. keyframes, rays: what was measured. point: (R,) the
-    index into points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1.
+    boxes: the number of boxes, including boxes without a ray. keyframes, rays: the measurements. point: (R,) the index into
+    points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1.
     """
 
     share: float
@@ -64,7 +65,7 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Part:
-    """A bounded part of a log.
+    """A part of a log with a limited number of frames.
 
     window: for each camera, the window of each of its frames. drifts: whether the poses are odometry.
     """
@@ -80,7 +81,7 @@ class Part:
 
     @property
     def crowd(self) -> float:
-        """How many boxes of its label a box has in its frame on average, with itself. In a crowd, rays meet by chance."""
+        """The mean number of boxes in a box's frame with its label, itself included. In a crowd, rays meet by chance."""
         counts = [np.zeros(0)]
         for one in self.log.cameras:
             if one.detections is not None and len(one.detections):
@@ -91,7 +92,7 @@ class Part:
 
 
 def bounded_part(log: Log, settings: Settings) -> Part:
-    """Return at most `FRAMES` frames of a log: spread evenly, or in short windows if the poses are odometry."""
+    """Return at most `FRAMES` frames of a log. They are spread evenly, or in short windows if the poses are odometry."""
     stamps = np.sort(np.concatenate([c.detections.frame_stamps for c in log.cameras if c.detections is not None]))
     drifts = log.localization is None
     if not drifts:
@@ -121,7 +122,7 @@ def bounded_part(log: Log, settings: Settings) -> Part:
 
 
 def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None = None) -> Agreement | None:
-    """Return how well the boxes of a log agree, where `log` has the frames of the part. None if no frame has a pose.
+    """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose.
 
     window: for each camera, other windows of its frames.
     """
@@ -147,14 +148,14 @@ def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...]
 
 
 def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:
-    """Return the errors of poses (rad, m) that a ray may have."""
+    """Return the pose errors (rad, m) that a ray may have."""
     if part.drifts:
         return _DRIFT_YAW, _DRIFT_XY
     return settings.localization.yaw, settings.localization.xy
 
 
 def _window_length(log: Log, settings: Settings) -> float:
-    """Return for how many seconds the odometry goes or turns as far as a window is long."""
+    """Return the time (s) in which the odometry moves or turns as far as a window covers."""
     path = log.odometry
     if path is None or len(path) < 2:
         return np.inf
@@ -191,7 +192,7 @@ def _fit_points(
 def _points_of(
     origins: Floats, directions: Floats, tolerance: Floats, place: float, rng: np.random.Generator
 ) -> Iterator[tuple[Ints, Floats, Floats]]:
-    """Yield the rays of each point, the point (3,), and how well each of the rays fits, from the best point on."""
+    """Yield for each point its rays, the point (3,), and how well each ray fits. The best point comes first."""
     left = np.arange(len(origins))
     for _ in range(_MOST_POINTS):
         if len(left) < _FEWEST:
@@ -203,7 +204,7 @@ def _points_of(
         few = rng.choice(len(left), _JUDGES, replace=False) if len(left) > _JUDGES else slice(None)
         best = where[int(_fit(o[few], d[few], t[few], place, where).sum(axis=1).argmax())]
         fit = _fit(o, d, t, place, best[None])[0]
-        for _ in range(2):  # least squares over the rays that fit
+        for _ in range(2):  # Each pass is a least-squares fit to the rays that fit now.
             inside = fit > 0
             if inside.sum() < _FEWEST:
                 return

@@ -1,4 +1,4 @@
-"""Tests of the stamps and the boxes of a log: do they belong to the poses and to the images of the calibration?"""
+"""Tests of the stamps and the boxes of a log: do they fit the times of the poses and the images of the calibration?"""
 
 from collections.abc import Iterator
 
@@ -9,25 +9,25 @@ from objslam.core.types import Detections, Log
 from objslam.mapping.checks.finding import Finding
 
 _OVERLAP = 0.5
-"""The least share of frames within the time of the poses. A larger share finds fault with logs that begin late."""
+"""The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
 _UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
-"""Units of time, by how many of them are a second."""
+"""The name of each unit of time, by its number in a second."""
 _FEWEST = 20
-"""The fewest boxes that are judged, except whether they lie between 0 and 1. A few boxes may lie anywhere."""
+"""The fewest boxes that are judged. The test for boxes between 0 and 1 needs fewer. A few boxes may lie anywhere."""
 _PART = 0.9
-"""The share of boxes that must be odd. A smaller share finds fault with logs of a few odd boxes."""
+"""The share of boxes that must look wrong. A smaller share also reports logs with a few wrong boxes."""
 _WITHOUT_AREA = 0.2
-"""The share of boxes without area above which the corners are not x1 y1 x2 y2. No detector writes such boxes."""
+"""If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes."""
 _OUTSIDE = 0.1
-"""The share of boxes with a centre outside the image above which they belong to a larger image."""
+"""If more than this share of the boxes has its centre outside the image, the boxes belong to a larger image."""
 _LEAST_SPAN = 0.55
-"""The share of the image's width and height that the boxes of a long log reach. A larger share warns more often."""
+"""The least share of the image's width and height that the boxes of a long log cover. A larger share warns more often."""
 _LONG = 200
-"""The number of boxes from which on they should reach most of the image."""
+"""The number of boxes from which on a log is long, so that its boxes should cover most of the image."""
 
 
 def check_stamps(log: Log) -> Finding | None:
-    """Return whether the frames of a log were taken at other times than its poses."""
+    """Return a finding if the frames of a log were taken at other times than its poses."""
     path = log.localization or log.odometry
     stamps = [c.detections.frame_stamps for c in log.cameras if c.detections is not None]
     if path is None or not stamps or not sum(map(len, stamps)):
@@ -56,7 +56,7 @@ def check_stamps(log: Log) -> Finding | None:
 
 
 def check_boxes(log: Log) -> list[Finding]:
-    """Return what is wrong with the boxes of a log, seen from their corners alone."""
+    """Return the findings about the boxes of a log, from their corners alone."""
     found: list[Finding] = []
     for one in log.cameras:
         if one.detections is not None and len(one.detections):

@@ -1,4 +1,4 @@
-"""Run all checks of the input of a log: those of the log itself, and those on how well its boxes agree."""
+"""Run all checks of the input of a log: the checks of the log itself, and the checks of how well its boxes agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,33 +24,34 @@ from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdic
 from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
-"""The share of boxes that fit below which a run tries hypotheses. A larger share costs more runs a few seconds."""
+"""If fewer than this share of the boxes fit, a run tries hypotheses. A larger share costs more runs a few seconds."""
 _FITTING = 0.82
-"""How well the boxes that fit must do so on average (`Agreement.fit`), for Gaussian noise 0.9. A larger value costs more
-runs a few seconds."""
+"""If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9. A
+larger value costs more runs a few seconds."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
-"""The offsets (s) of a clock that every run tries. A clock that is off by more fits better already on the way to it."""
+"""The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of these offsets."""
 _CROWD = 5.0
-"""The crowd (`Part.crowd`) above which rays meet anywhere and tell nothing. A larger crowd takes longer."""
+"""The crowd (`Part.crowd`) above which rays meet anywhere and show nothing. A larger value takes longer."""
 _FEWEST = 60
-"""The fewest boxes of a log that are judged by how they agree. Fewer boxes agree by chance."""
+"""The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
 _MOVED = 0.05
-"""The rotation (rad) of a camera between the halves of a log from which on it was moved. A larger one warns less often."""
+"""If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
+less often."""
 _MOVED_BY_ODOMETRY = 0.1
-"""As `_MOVED`, for poses that are odometry, whose drift looks like a rotation."""
+"""`_MOVED` for poses by odometry. Their drift looks like a rotation."""
 _MOVED_SIGMAS = 6.0
-"""How many standard deviations this rotation must be away from 0. A larger number warns less often."""
+"""The least size of this rotation in standard deviations. A larger number warns less often."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
-"""The offsets (s) of a clock from which small errors are looked for as well. More offsets take longer."""
+"""The other clock offsets (s) from which the search for small errors starts. More offsets take longer."""
 _GAIN_MOVED = 0.03
-"""The least growth of the score when each half has its own camera rotation. A larger one names fewer moved cameras."""
+"""The least growth of the score if each half has its own camera rotation. A larger value reports fewer moved cameras."""
 _GAIN = 0.02
-"""The least growth of the score when small errors are taken out. A larger one names fewer errors."""
+"""The least growth of the score if small errors are removed. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a log. trials: the hypotheses that were tried, with the log as it is first; empty if none were.
+    """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
     errors: small errors of the calibration that a run does not correct, None if there are none.
     """
@@ -61,12 +62,12 @@ class Diagnosis:
 
     @property
     def spoilt(self) -> bool:
-        """Whether no position of the map can be relied on."""
+        """Whether the input makes all positions of the map unreliable."""
         return any(finding.spoils for finding in self.findings)
 
     @property
     def refutable(self) -> bool:
-        """Whether a solve that explains the boxes may refute a finding."""
+        """Whether a solve that explains the boxes may refute one of the findings."""
         return any(finding.basis != "log" for finding in self.findings)
 
     def with_findings(self, more: Sequence[Finding]) -> Self:
@@ -77,7 +78,7 @@ class Diagnosis:
 def diagnose(
     log: Log, settings: Settings, progress: Progress = lambda stage, done, total: None, *, thorough: bool = False
 ) -> Diagnosis:
-    """Return what is wrong with a log. thorough: whether to try hypotheses even if nothing is odd.
+    """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
     LogError if the stamps of the frames and those of the poses have different units.
     """
@@ -109,7 +110,7 @@ def diagnose(
             errors = _small_errors(part, found, settings)
             if errors is not None:
                 cause = f"at the given poses the boxes fit best with {errors.in_words()}: {errors.causes()}"
-                # The objects are given the covariance that such an error causes.
+                # The objects get the covariance that such an error causes.
                 findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
@@ -117,7 +118,7 @@ def diagnose(
 
 
 def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
-    """Return whether few boxes fit, whether those that fit do so poorly, or whether more fit with another clock."""
+    """Return whether few boxes fit, whether the fitting boxes fit poorly, or whether another clock fits better."""
     if found is None or found.share < _ALARM or found.fit.sum() < _FITTING * (found.point >= 0).sum():
         return True
     trials = [agreement(part, later(part.log, offset), settings) for offset in _ALARM_CLOCKS]
@@ -125,12 +126,12 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 
 def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErrors | None:
-    """Return small errors that are worth a warning, and that a run in this mode does not estimate."""
+    """Return small errors that need a warning, because a run in this mode does not estimate them."""
     if part.drifts or settings.mode == "joint":
         return None
     noise = pose_noise(part, settings)
     start, best, log = found, 0.0, part.log
-    for offset in _CLOCKS:  # a clock that is far off loses the rays that would tell it
+    for offset in _CLOCKS:  # With a large clock error, the rays that would show the error do not fit.
         moved = later(part.log, offset)
         trial = agreement(part, moved, settings)
         if trial is not None and trial.score > start.score + _GAIN:
@@ -150,7 +151,7 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
 
 
 def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
-    """Return whether one half of the log fits worse than the other, or whether a camera was turned between them."""
+    """Return findings if one half of the log fits worse than the other, or if a camera was turned between the halves."""
     middle = float(np.median(found.keyframes.stamps))
     late = found.keyframes.stamps[found.rays.keyframe] > middle
     if min(late.sum(), (~late).sum()) < _FEWEST:

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""A finding: the result of a check that found a fault."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -8,10 +8,10 @@ from typing import Any, Literal
 class Finding:
     """One thing that is wrong with the input.
 
-    name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the positions
-    of a map cannot be relied on, because the error is not corrected. basis: what says so. "log" is the input itself. The
-    others are how well boxes agree at the given poses: all "boxes", those of the "halves" of the log, or those of single
-    "frames". A joint solve may refute these.
+    name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
+    the positions of a map unreliable. It does if the error is not corrected. basis: the evidence. "log" is the input itself.
+    The other values stand for the agreement of boxes at the given poses: of all "boxes", in the "halves" of the log, or in
+    single "frames". A joint solve may refute these.
     """
 
     name: str
@@ -20,5 +20,5 @@ class Finding:
     basis: Literal["log", "boxes", "halves", "frames"] = "log"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what summary.json holds."""
+        """Return the entry of summary.json."""
         return {"name": self.name, "message": self.message, "spoils_positions": self.spoils}

@@ -1,4 +1,4 @@
-"""Compare the halves of a log: how many rays of each fit, and whether both see the same objects."""
+"""Compare the halves of a log: the shares of fitting rays, and the objects that both halves see."""
 
 import numpy as np
 
@@ -6,15 +6,15 @@ from objslam.core.arrays import Bools, Ints
 from objslam.mapping.checks.finding import Finding
 
 _HALF = 0.5
-"""The share of rays that fit in one half of a log, compared with the other half, below which the halves differ. A larger
-share finds smaller differences."""
+"""The halves of a log differ if the share of fitting rays in one half is below this multiple of the share in the other half.
+A larger value finds smaller differences."""
 _FEW, _PART = 2, 0.1
-"""The fewest rays, and the least share of all its rays, by which an object is seen in a half. Smaller values take chance for
-an object. Of the boxes of another recording, about a tenth fit an object of the same label by chance."""
+"""A half sees an object if it has at least this number and this share of the object's rays. With smaller values, a chance
+fit counts as an object. About a tenth of the boxes of another recording fit an object of their label by chance."""
 
 
 def check_halves(late: Bools, fits: Bools) -> Finding | None:
-    """Return whether one half of the log fits worse than the other.
+    """Return a finding if one half of the log fits worse than the other half.
 
     late: (R,) whether a ray is in the second half. fits: (R,) whether it fits its object.
     """
@@ -30,9 +30,9 @@ def check_halves(late: Bools, fits: Bools) -> Finding | None:
 
 
 def seen_in_both(late: Bools, fits: Bools, owner: Ints) -> float:
-    """Return the share of the fitting rays of a half that belong to objects which the other half sees as well.
+    """Return the share of a half's fitting rays whose objects the other half sees too: the larger share of both halves.
 
-    It is that of the half with the larger share: a robot that goes on to new places sees most of the old ones no more.
+    A robot that drives on to new places no longer sees most of the old objects, so the smaller share tells less.
     late, fits: as in `check_halves`. owner: (R,) the object of each ray, -1 for none.
     """
     count = int(owner.max(initial=-1)) + 1

@@ -1,4 +1,4 @@
-"""What may be wrong with a log, each as a change that would put it right."""
+"""Hypotheses about wrong input. Each is a change that would correct the log."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ _OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.
 _SIDES = {"ahead": 0, "to the left": 90, "back": 180, "to the right": -90}
 """The usual directions of a camera (degrees)."""
 _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
-"""The factors between the size of the image that the boxes belong to and the size in the calibration."""
+"""The tried sizes of the images of the boxes, as multiples of the image size in the calibration."""
 _SQUARES = (320, 416, 512, 640)
-"""The sides (px) of the square images that detectors often take."""
+"""The sides (px) of square images that detectors often use."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
-"""The offsets (s) of a clock that are tried. `small_errors` finds smaller ones."""
+"""The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible cause of wrong input. what: what the log would be like with it put right. cause: the probable mistake."""
+    """A possible fault of the input. what: a description of the corrected log. cause: the probable mistake."""
 
     name: str
     what: str
@@ -35,7 +35,7 @@ class Hypothesis:
 
 
 def hypotheses(log: Log) -> Iterator[Hypothesis]:
-    """Yield each hypothesis that a log allows."""
+    """Yield each hypothesis that applies to a log."""
     yield from _mounts(log)
     yield from _paths(log)
     yield from _boxes(any(one.camera.sees_size for one in log.cameras))
@@ -92,7 +92,7 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
 
 
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes. sized: whether the boxes have a size, which some of them take for something else."""
+    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Some hypotheses change its meaning."""
 
     def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
         def put_right(log: Log) -> Log:
@@ -168,7 +168,7 @@ def _mounted(pose: Floats, turn: Floats) -> Floats:
 
 
 def w_last(poses: Floats) -> Floats:
-    """Return poses (..., 4, 4) whose quaternions had their w first and were read as if it were last."""
+    """Return poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
     read = quaternion_from_rotation(poses[..., :3, :3])
     return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
@@ -179,7 +179,7 @@ def yaws(poses: Floats) -> Floats:
 
 
 def _yaw_times(poses: Floats, factor: float) -> Floats:
-    """Return poses with other headings."""
+    """Return poses with their headings multiplied by a factor."""
     yaw = factor * yaws(poses)
     return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
 
@@ -187,7 +187,8 @@ def _yaw_times(poses: Floats, factor: float) -> Floats:
 def _from_degrees(poses: Floats) -> Floats:
     """Return poses whose headings (degrees) were taken for radians.
 
-    A heading in degrees is known up to 2 pi, that is 6.3 degrees. A robot turns evenly, and drives where it heads.
+    A rotation matrix keeps a heading modulo 2 pi, so multiples of 6.3 degrees are lost here. Two assumptions restore them: a
+    robot turns evenly, and it drives in the direction of its heading.
     """
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     steps = np.diff(said)

@@ -1,4 +1,4 @@
-"""Find boxes of another recording among those of a log: whole frames fit, or whole frames do not."""
+"""Find boxes of another recording in a log: nearly all boxes of a frame fit, or hardly any."""
 
 import numpy as np
 
@@ -7,25 +7,25 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _RAYS, _FRAMES = 3, 40
-"""The fewest rays of a frame, and the fewest such frames, that are judged. Fewer rays fit or not by chance."""
+"""The fewest rays of a judged frame, and the fewest such frames. Fewer rays may all fit, or all miss, by chance."""
 _BAD, _GOOD = 0.34, 0.67
-"""The shares of fitting rays up to which a frame is bad, and from which on it is good. Values farther apart find fewer."""
+"""A frame is bad up to the first share of fitting rays, and good from the second on. Values farther apart find fewer."""
 _LEAST = 0.2
-"""The least share of bad and of good frames. A larger share finds less of another recording."""
+"""The least share of bad and of good frames. A larger value needs more frames of the other recording."""
 _DISPERSION = 1.6
-"""How many times more the shares of frames vary than false boxes at random let them. Clean logs have 0.8 to 1.0, and
-those with half of the boxes from another recording 2.1 to 2.6."""
+"""The least variance of the frames' shares of fitting rays, as a multiple of the variance by random false boxes. Clean logs
+have 0.8 to 1.0. Logs with half of the boxes from another recording have 2.1 to 2.6."""
 
 
 def check_mixture(found: Agreement, part: Part) -> Finding | None:
-    """Return whether some frames belong to another recording. Odometry drifts within windows, so it cannot tell."""
+    """Return a finding if some frames belong to another recording. None for odometry, which drifts within windows."""
     if part.drifts:
         return None
     return find_mixture(found.rays.keyframe, found.point >= 0)
 
 
 def find_mixture(frame: Ints, fits: Bools) -> Finding | None:
-    """Return whether rays fit by whole frames. frame: (R,) the frame of each ray. fits: (R,) whether it fits its object."""
+    """Return a finding if rays fit by whole frames. frame: (R,) the frame of each ray. fits: (R,) whether a ray fits."""
     frames = int(frame.max(initial=-1)) + 1
     number, fitting = np.bincount(frame, minlength=frames), np.bincount(frame[fits], minlength=frames)
     judged = number >= _RAYS

@@ -1,4 +1,4 @@
-"""Tests of the poses of a log: can a robot move like this?"""
+"""Tests of the poses of a log: can a robot move in this way?"""
 
 from collections.abc import Iterator
 
@@ -11,40 +11,40 @@ from objslam.core.types import Log, Trajectory
 from objslam.mapping.checks.finding import Finding
 
 FASTEST = 40.0
-"""The typical speed (m/s) above which poses are not in metres. It is that of a car on a motorway. A larger speed warns less
+"""The typical speed (m/s) above which poses are not in metres: the speed of a car on a motorway. A larger speed warns less
 often."""
 _FASTEST_TURN = 8.0
 """The typical turn rate (rad/s) above which headings are not in radians. A larger rate warns less often."""
 _JUMP = 5.0
-"""The speed (m/s) above which a step of an otherwise slow path may be a jump, as live.max_speed."""
+"""The speed (m/s) above which a step of an otherwise slow path may be a jump. It equals live.max_speed."""
 _JUMP_TURN = 20.0
-"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump, as four times live.max_speed."""
+"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. It is four times live.max_speed."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
-"""The way (m) and the turn (rad) of a step that may be a jump. Larger values leave out small corrections."""
+"""The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
 _TIMES = 20.0
-"""How many times faster than the robot's usual speed a jump is. A larger number warns less often."""
+"""The least speed of a jump as a multiple of the robot's usual speed. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
-"""The way (m) and turn (rad) between two poses below which the robot stands."""
+"""The distance (m) and turn (rad) between two poses below which the robot stands still."""
 _FROZEN_SECONDS = 8.0
-"""The shortest time (s) without motion that may be a frozen path. Robots that stop for long have boxes that stop too."""
+"""The shortest time (s) without motion that may be a frozen path. While a robot really stands, its boxes stand too."""
 _MOVING_PX = 12.0
-"""The spread (px) of the boxes of one label about their median, within seconds, from which on a camera moves."""
+"""The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
 _LEAST_STEP = 0.01
-"""The least step (m) of a path whose direction is judged, for shorter steps are noise."""
+"""The least step (m) of a path whose direction is judged. Shorter steps are noise."""
 _PIECE = 1.0
-"""The time (s) over which ways are compared. A longer time suits noisy poses."""
+"""The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
-"""The least way in such a time, as a share of the longest. Shorter ways are noise."""
+"""The least distance in such a time, as a share of the longest one. Shorter distances are noise."""
 _OTHER_SCALE = 0.1
-"""The least difference of the two ways, as a logarithm. Real odometry errs by up to 8 %. A larger one warns less often."""
+"""The least logarithm of the ratio of the two distances. Real odometry errs by up to 8 %. A larger one warns less often."""
 _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 
 
 def check_path(log: Log) -> list[Finding]:
-    """Return what is wrong with the poses of a log, seen from the poses alone, and from whether the boxes move."""
+    """Return the findings about the poses of a log, from the poses and from the motion of the boxes."""
     found: list[Finding] = []
     for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
         if path is not None and len(path) > _FEWEST_STEPS:
@@ -56,7 +56,7 @@ def check_path(log: Log) -> list[Finding]:
 
 
 def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Finding]:
-    """Compare how far the robot went by its localisation and by its odometry, in pieces of time."""
+    """Compare the distances that the localisation and the odometry measure in the same pieces of time."""
     begin, end = max(localization.stamps[0], odometry.stamps[0]), min(localization.stamps[-1], odometry.stamps[-1])
     times = np.arange(begin, end, _PIECE)
     if len(times) < _FEWEST_STEPS:
@@ -99,7 +99,7 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
         )
         return
     fast = float(np.quantile(speed[moving], 0.9)), float(np.quantile(rate[moving], 0.9))
-    # A gap in the poses is no jump, for the speed over the gap is what a robot can do.
+    # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
     jumps = (speed > max(_JUMP, _TIMES * fast[0] / 4)) & (way > _JUMP_WAY)
     jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1] / 4)) & (angle > _JUMP_ANGLE)
     if jumps.any():
@@ -114,12 +114,12 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
 
 
 def log_is_split(way: Floats, jumps: Bools) -> bool:
-    """Return whether jumps of a localisation do not cancel: it went to another map, and did not correct itself only once."""
+    """Return whether the jumps of a localisation do not cancel. Then it changed to another map. One jump is a correction."""
     return bool(jumps.any() and way[jumps].max() > 1.0)
 
 
 def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
-    """Find long times without motion in which boxes move."""
+    """Find long times in which the poses stand still while the boxes move."""
     way, angle = steps(path.poses)
     still = (way < _STILL) & (angle < _STILL)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
@@ -139,7 +139,7 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
 
 
 def _boxes_move(log: Log, start: float, end: float) -> bool:
-    """Return whether most labels have boxes that go through the image between two stamps."""
+    """Return whether the boxes of most labels move through the image between two stamps."""
     moving, still = 0, 0
     for one in log.cameras:
         found = one.detections
@@ -157,7 +157,7 @@ def _boxes_move(log: Log, start: float, end: float) -> bool:
 
 
 def steps(poses: Floats) -> tuple[Floats, Floats]:
-    """Return the way (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
+    """Return the distance (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
     way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turn = rotation_vector(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
     return way, np.asarray(np.linalg.norm(turn, axis=1))
@@ -166,8 +166,8 @@ def steps(poses: Floats) -> tuple[Floats, Floats]:
 def straightness(path: Trajectory) -> float | None:
     """Return how much a robot drives along one direction of its base: 1 for wheels, near 0 for poses with wrong axes.
 
-    It is the length of the mean direction of motion in base, of the motions that are long enough to have a direction. None
-    if there are too few of them, or if the robot hardly turns, for then all axes fit.
+    It is the length of the mean direction of motion in base. Motions that are too short have no direction and do not count.
+    None if too few motions count, or if the robot hardly turns. All axes fit a robot that does not turn.
     """
     if len(path) < _FEWEST_STEPS:
         return None
@@ -184,7 +184,7 @@ def straightness(path: Trajectory) -> float | None:
     first, last, direction = first[kept], last[kept], way[kept] / length[kept, None]
     if np.linalg.norm(direction.mean(axis=0)) > 0.9:
         return None
-    # The base between the two poses: its axes are the mean of both, to first order.
+    # The base between the two poses has, to first order, the mean axes of both.
     middle = path.poses[first, :3, :3] + path.poses[last, :3, :3]
     in_base = np.einsum("nji,nj->ni", middle, direction)
     size = np.linalg.norm(in_base, axis=1, keepdims=True)

@@ -8,45 +8,45 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _FEWEST = 40
-"""The fewest ranges that are judged. Fewer ranges tell a scale poorly."""
+"""The fewest ranges that are judged. A few ranges show a scale error poorly."""
 _POINTS = 4
-"""The fewest points whose ranges are judged. Fewer points may have been placed wrongly by chance."""
+"""The fewest points whose ranges are judged. A few points may be at wrong positions by chance."""
 _PARALLAX = np.radians(20.0)
-"""The least angle (rad) between the rays of a point that tells a distance. A larger angle leaves fewer points."""
+"""The least angle (rad) between the rays of a point for a reliable distance. A larger angle leaves fewer points."""
 _SPREAD = 0.1
-"""The most by which the ratios of half of the points may differ from their median, as a share. A wrong unit or scale is the
-same for all points, while points that are placed wrongly differ."""
+"""The most by which half of the points' ratios may differ from their median, as a share. A wrong unit or scale is equal for
+all points. The ratios of points at wrong positions differ."""
 _SPREAD_OF_UNITS = 0.3
-"""As `_SPREAD`, for a factor so large that it must be a unit."""
+"""`_SPREAD` for a factor so large that it must be a unit."""
 _LEAST = 0.04
-"""The least share by which ranges must be wrong. Smaller shares come from the depth of things and from cameras that are
-turned a little: in simulation up to 0.03, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
+"""The least error of the ranges, as a share. Smaller errors also come from the depth of things and from cameras that are
+turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
 often."""
 _SPOILING = 0.06
-"""The share from which on a wrong scale spoils the positions. A larger share spoils fewer maps."""
+"""The error from which on a wrong scale makes positions unreliable. A larger share gives up fewer maps."""
 _SIGMAS = 5.0
-"""How many standard deviations the share must be away from 0. A larger number warns less often."""
+"""The least error in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
-"""Metres in other units of length."""
+"""The name of each unit of length, by its number in a metre."""
 _CLOSE = 0.25
-"""The logarithm up to which a factor is one of these units."""
+"""A factor is one of these units if the logarithm of their ratio is below this."""
 _UNIT = 0.7
-"""The logarithm of a factor from which on no error of a calibration explains it."""
+"""The logarithm of a factor above which no calibration error explains the factor."""
 _GROUP = 8
-"""The fewest boxes of a label in a window whose ranges tell a factor. Fewer boxes tell it poorly."""
+"""The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which a label is one thing in a window. In a larger crowd, ends of ranges lie apart."""
+"""The crowd (`Part.crowd`) up to which a label in a window is one thing. In a larger crowd, its ranges end at several."""
 _LEAST_BY_ODOMETRY = 0.18
-"""The least share by which ranges must be wrong by odometry, which joint mode corrects by several percent itself."""
+"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
-"""The factors on ranges that are tried; a larger number finds the best more exactly."""
+"""The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5
-"""The share of the spread without ranges to which the right ranges must bring the ends together. A smaller share leaves
-fewer labels that tell a factor."""
+"""With the right factor, the ends of the ranges must come together to this share of their spread at very long ranges. A
+smaller share accepts fewer labels."""
 
 
 def check_ranges(found: Agreement, part: Part) -> Finding | None:
-    """Return whether ranges are too long or too short for the way of the robot."""
+    """Return a finding if the ranges are too long or too short for the motion of the robot."""
     if not part.drifts:
         return _by_bearings(found)
     if part.crowd <= _ALONE:
@@ -56,9 +56,9 @@ def check_ranges(found: Agreement, part: Part) -> Finding | None:
 
 
 def _by_spread(found: Agreement, part: Part) -> Finding | None:
-    """Judge ranges by odometry: with ranges of the right length, the boxes of a label in a window lie at one place.
+    """Judge ranges by odometry: ranges of the right length end at one place for each label in a window.
 
-    Bearings alone place points poorly in a short window.
+    Bearings alone give poor positions in a short window.
     """
     rays = found.rays
     origins, directions = rays.in_map(found.keyframes.map_T_camera)
@@ -84,20 +84,20 @@ def _frames(found: Agreement) -> tuple[list[int], list[int]]:
 
 
 def _best_factor(origins: Floats, directions: Floats, ranges: Floats) -> float:
-    """Return the factor on ranges (n,) that brings their ends closest together for their length, 0 if none does."""
+    """Return the factor on ranges (n,) for which their ends lie closest together, relative to their length. 0 if none."""
     ends = origins + _FACTORS[:, None, None] * (ranges[:, None] * directions)
     spread = np.linalg.norm(ends - np.median(ends, axis=1, keepdims=True), axis=2)
     relative = np.median(spread, axis=1) / (_FACTORS * np.median(ranges))
     best = int(relative.argmin())
-    # At very long ranges only the directions count: they must disagree, or the robot stood still.
+    # At very long ranges only the directions count. If they agree, the robot stood still and no factor can be found.
     return float(_FACTORS[best]) if relative[best] < _TELLS * relative[-1] and 0 < best < len(_FACTORS) - 1 else 0.0
 
 
 def _by_bearings(found: Agreement) -> Finding | None:
-    """Judge ranges by the places where bearings meet.
+    """Judge ranges by the positions where bearings meet.
 
-    A range ends on the surface of a thing and a bearing goes to its centre, so a constant difference is no error. Both the
-    ratio and the growth of the range with the distance must be wrong.
+    A range ends on the surface of a thing, and a bearing goes to its centre. So a constant difference is no error. A wrong
+    scale changes both the ratio and the growth of the range with the distance.
     """
     rays = found.rays
     held = (found.point >= 0) & np.isfinite(rays.range)
@@ -137,7 +137,7 @@ def _by_bearings(found: Agreement) -> Finding | None:
 
 
 def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
-    """Return the finding for ranges that are a factor too long. spoils: whether a wrong scale spoils the positions."""
+    """Return the finding for ranges that are too long by a factor. spoils: whether this makes positions unreliable."""
     for factor, unit in _UNITS.items():
         if abs(np.log(ratio / factor)) < _CLOSE:
             return Finding(

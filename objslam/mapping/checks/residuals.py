@@ -1,4 +1,4 @@
-"""A check of a map at fixed poses: whether rays miss their objects by more than the settings promise."""
+"""A check of a map at fixed poses: whether rays miss their objects by more than the noise in the settings."""
 
 import numpy as np
 
@@ -11,21 +11,21 @@ from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.mapping.checks.finding import Finding
 
 _MOST = np.sqrt(2.0)
-"""The residuals, as a multiple of the noise that the settings promise, above which a run warns. From this value on, half of
-their variance or more comes from what the settings do not know. A larger value warns less often."""
+"""A run warns if the residuals exceed this multiple of the noise in the settings. From this value on, at least half of their
+variance has a cause that the settings do not contain. A larger value warns less often."""
 _SIGMAS = 3.0
-"""How many standard deviations the multiple must be above `_MOST`. A larger number asks for longer logs."""
+"""The least excess of the multiple over `_MOST`, in its standard deviations. A larger number warns only for longer logs."""
 _MEDIAN_SIGMA = 0.72
-"""The standard deviation of the multiple from one ray, 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
-median m. That from n independent rays is smaller by the root of n."""
+"""The standard deviation of the multiple from one ray: 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
+median m. From n independent rays, it is smaller by the root of n."""
 
 
 def misses(
     objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, residual: Floats, settings: Settings
 ) -> float:
-    """Return the median residual of the objects that are ok, as a multiple of the noise that counts for it; NaN without.
+    """Return the median residual of the objects that are ok, as a multiple of its expected noise. NaN without such objects.
 
-    At fixed poses, the noise of the localisation counts too. residual: (R,) rad between each ray and its object.
+    At fixed poses, the noise of the localisation is part of it. residual: (R,) rad between each ray and its object.
     """
     held = _held(objects, association)
     if not held.any():
@@ -39,9 +39,9 @@ def misses(
 
 
 def _held(objects: ObjectMap, association: Association) -> Bools:
-    """Return the rays (R,) of objects that are ok."""
+    """Return a mask (R,) of the rays whose objects are ok."""
     ok = np.array([one.status == "ok" for one in objects.objects] + [False])
-    held: Bools = ok[association.object]  # -1, no object, indexes the last
+    held: Bools = ok[association.object]  # The index -1 (no object) gives the last entry.
     return held
 
 
@@ -55,10 +55,10 @@ def check_residuals(
     *,
     calibrated: bool,
 ) -> Finding | None:
-    """Return whether the rays miss the objects that are ok by far more than the noise of boxes and of the localisation.
+    """Return a finding if the rays miss the objects that are ok by far more than the noise of boxes and localisation.
 
     residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
-    All rays of an object count, also rejected ones. Rays of one keyframe share the error of its pose, so they count as one.
+    All rays of an object count, also rejected ones. Rays of one keyframe share its pose error, so they count as one.
     """
     held = _held(objects, association)
     if not held.any():

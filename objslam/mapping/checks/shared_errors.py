@@ -1,4 +1,4 @@
-"""A check of the shared errors that names wrong input: an error far beyond its prior has a cause."""
+"""A check of the shared errors that names wrong input, because an error far beyond its prior has a cause."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.mapping.checks.finding import Finding
 
 MOST_SIGMAS = 3.0
-"""The size of a shared error, in standard deviations of its prior, above which the user is warned. A larger value warns less
+"""A shared error of more than this many standard deviations of its prior causes a warning. A larger value warns less
 often."""
 
 _CAUSES = {
@@ -25,9 +25,9 @@ _CAUSES = {
 
 
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
-    """Warn of each shared error that is far from what its prior expected, and name what may be wrong.
+    """Warn of each shared error that is far from the mean of its prior, and name the probable cause.
 
-    The prior is that of the settings, or a calibration file. An error as in the file is large, but no surprise.
+    The prior is from the settings or from a calibration file. A large error causes no warning if the file already has it.
     """
     for name, of in calibration.to_dict()["parameters"].items():
         expected = of["prior_mean"]
@@ -42,9 +42,9 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
 
 
 def uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
-    """Return a finding for each shared error that ended at its bound (P,): the true one is larger, and is not corrected.
+    """Return a finding for each shared error that ended at its bound (P,). The true error is larger and is not corrected.
 
-    An error that was expected there, by a calibration file, is one that the file tells.
+    There is no finding for an error that a calibration file already places at the bound.
     """
     ended = np.abs(calibration.values) >= 0.999 * bounds
     ended &= np.abs(calibration.values - calibration.expected) > calibration.prior

@@ -1,6 +1,6 @@
-"""Estimate small errors of the calibration at given poses: what camera rotation, clock or focal length fits the rays best.
+"""Estimate small errors of the calibration at given poses: the camera rotation, clock or focal length that fits best.
 
-The points of an `Agreement` move with the errors. One error after the other is taken in, the one that explains most first.
+The points of an `Agreement` move with the errors. Errors are added one by one. The error that explains most comes first.
 """
 
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ from objslam.graph.calibration.fixed_pose_calibration import PointSystem, linear
 from objslam.mapping.checks.agreement import Agreement
 
 _PRIORS = {"clock": 0.3, "yaw": 0.2, "tilt": 0.2, "roll": 0.2, "focal": 0.2, "translation": 0.3}
-"""Wide prior standard deviations of the errors that are looked for (s, rad, share, m). They bound the search."""
+"""Wide prior standard deviations of the examined errors (s, rad, share, m). They bound the search."""
 _HARMFUL = {"clock": 0.12, "yaw": 0.035, "tilt": 0.035, "roll": 0.035, "focal": 0.05, "x": 0.1, "y": 0.1}
-"""The sizes (s, rad, share, m) from which on an error is worth a warning. Smaller ones are those of a usual calibration."""
+"""The sizes (s, rad, share, m) above which an error causes a warning. A usual calibration has smaller errors."""
 _USUAL = {"focal": 0.05, "translation": 0.1}
-"""The priors (share, m) that a user is advised to give to errors that the settings hold. A larger prior lets a run find a
+"""The priors (share, m) that a warning recommends for errors that the settings keep at 0. A larger prior lets a run find a
 larger error."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
 """The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
 _LEAST_SHARE = 0.04
-"""The least decrease as a share of all squared deviations. Rays of a real log are never independent, so many small
-deviations are no proof. A larger value finds fewer errors."""
+"""The least decrease as a share of all squared deviations. Rays of a real log are not independent, so the sum of many small
+deviations proves nothing. A larger value finds fewer errors."""
 _ROUNDS = 6
-"""The number of Gauss-Newton steps. More are more exact."""
+"""The number of Gauss-Newton steps. A larger number is more exact."""
 _CLOCK_SIGMA = 0.05
-"""The standard deviation (s) of a clock that was found by trial. A larger value says less about the clock."""
+"""The standard deviation (s) of a clock offset from the tried values. A larger value makes the clock less certain."""
 
 CAUSES = {
     "clock": "the clock of the camera and that of the poses differ",
@@ -43,14 +43,14 @@ CAUSES = {
     "x": "base_T_camera is moved forward or back",
     "y": "base_T_camera is moved aside",
 }
-"""What is wrong if an error of each kind is large."""
+"""The cause that a large error of each kind indicates."""
 
 
 @dataclass(frozen=True)
 class SmallErrors:
     """Errors that explain the residuals. names, values (P,), sigma (P,): in the units of `core.calibration`.
 
-    errors: the measurements with these errors taken out. estimated: the names of those that the run itself estimates.
+    errors: the measurements without these errors. estimated: the names of the errors that the run itself estimates.
     """
 
     errors: SharedErrors
@@ -61,12 +61,12 @@ class SmallErrors:
 
     @property
     def harmful(self) -> tuple[str, ...]:
-        """The names of the errors that are worth a warning: the large ones that the run does not estimate."""
+        """The names of the errors that need a warning: large errors that the run does not estimate."""
         named = zip(self.names, self.values.tolist(), strict=True)
         return tuple(n for n, v in named if abs(v) > _HARMFUL[kind(n)] and n not in self.estimated)
 
     def corrected(self, log: Log) -> Log:
-        """Return a log with the errors taken out."""
+        """Return a log without the errors."""
         every = np.zeros(len(self.errors.names))
         for name, value in zip(self.names, self.values.tolist(), strict=True):
             every[self.errors.names.index(name)] = value
@@ -86,32 +86,32 @@ class SmallErrors:
         return ", ".join(parts)
 
     def remedy(self, settings: Settings) -> str:
-        """Return the options with which a run estimates the harmful errors. settings: of the run that does not."""
+        """Return the options with which a run estimates the harmful errors. settings: of a run that does not."""
         held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
         return " ".join(f"--set {option}" for option in options)
 
     def causes(self) -> str:
-        """Return what is probably wrong."""
+        """Return the probable causes."""
         return "; ".join(dict.fromkeys(CAUSES[kind(name)] for name in self.harmful))
 
 
 def shared(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors:
-    """Return the errors that are looked for, as parameters of the measurements."""
+    """Return the examined errors, as parameters of the measurements."""
     of = settings.calibration.model_copy(
         update={**_PRIORS, "use": True, "file": None, "scale": 0.0, "turn_scale": 0.0, "turn_bias": 0.0, "range_scale": 0.0}
     )
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
     found = shared_errors(log, keyframes, rays, wide)
-    assert found is not None  # every log has a camera, and every camera a clock
+    assert found is not None  # Every log has a camera, and every camera has a clock.
     return found
 
 
 def find_small_errors(
     log: Log, found: Agreement, settings: Settings, noise: tuple[float, float], kinds: tuple[str, ...] = _KINDS
 ) -> SmallErrors | None:
-    """Return the errors that explain the residuals of the rays that fit, None if there are none.
+    """Return the errors that explain the residuals of the fitting rays, None if there are none.
 
     noise: the errors of the poses (rad, m).
     """
@@ -150,7 +150,7 @@ def find_small_errors(
 
 
 def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
-    """Return errors of a log whose frames were moved by an offset (s) as errors of the log itself."""
+    """Return the errors of a log, from the errors of the same log with its frames moved by an offset (s)."""
     own = shared(log, found.keyframes, found.rays, settings)
     values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)
     sigmas = dict.fromkeys(values, _CLOCK_SIGMA)
@@ -161,7 +161,7 @@ def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agree
 
 
 def _gain(system: PointSystem, which: list[int]) -> float:
-    """By how much these errors decrease the cost."""
+    """Return the decrease of the cost by these errors."""
     if not which:
         return 0.0
     at = np.ix_(which, which)
@@ -169,6 +169,6 @@ def _gain(system: PointSystem, which: list[int]) -> float:
 
 
 def _step(system: PointSystem, which: list[int]) -> tuple[Floats, Floats]:
-    """The step of these errors, and that of the points (N, 3)."""
+    """Return the step of these errors, and the step of the points (N, 3)."""
     step = np.linalg.lstsq(system.matrix[np.ix_(which, which)], -system.vector[which], rcond=1e-9)[0]
     return np.asarray(step), np.asarray(system.own + system.back[:, :, which] @ step)

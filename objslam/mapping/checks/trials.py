@@ -1,4 +1,4 @@
-"""Try hypotheses about wrong input on a bounded part of a log, and name the one that explains the log much better."""
+"""Try hypotheses about wrong input on a part of a log, and name the hypothesis that explains the log much better."""
 
 from dataclasses import dataclass
 
@@ -11,25 +11,25 @@ from objslam.mapping.checks.path import straightness
 from objslam.mapping.progress import Progress
 
 _TIMES, _MORE = 1.2, 0.06
-"""By what factor, and by how much, the score must grow for a hypothesis to hold. Larger values name fewer causes."""
+"""A hypothesis must raise the score by this factor and by this difference. Larger values name fewer causes."""
 _CROWD = 1.4
-"""The crowd (`Part.crowd`) from which on rays meet by chance. The anonymous posts of the MRCLAM robots have 1.9."""
+"""The crowd (`Part.crowd`) above which rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
-"""As `_TIMES` and `_MORE`, in a crowd."""
+"""`_TIMES` and `_MORE` in a crowd."""
 _MORE_BOXES = 25
-"""How many more boxes must fit. A larger number asks for longer logs."""
+"""The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85
-"""The straightness of a path below which its axes may be wrong, and that which they must give when they are put right. Of
-real logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59."""
+"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second one. In real logs,
+hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59."""
 _NOT_WORSE = 0.8
-"""The share of the score that a hypothesis about the axes of a path must keep. Boxes of sparse logs tell little of axes."""
+"""A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes."""
 _EQUAL = 0.95
-"""The share of the best score from which on another hypothesis is as good. A larger share names fewer alternatives."""
+"""Another hypothesis is as good as the best if it has this share of its score. A larger share names fewer alternatives."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What a hypothesis explains. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown."""
+    """The test of a hypothesis. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown."""
 
     hypothesis: Hypothesis | None
     score: float
@@ -38,7 +38,7 @@ class Trial:
 
 
 def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Settings, progress: Progress) -> list[Trial]:
-    """Return a trial of the log as it is, and then one for each hypothesis, the best first."""
+    """Return a trial of the unchanged log, followed by one for each hypothesis. The best hypothesis comes first."""
     first = Trial(None, before.score if before else 0.0, before.share if before else 0.0, _straight(log))
     every = list(hypotheses(part.log))
     trials = []
@@ -53,14 +53,14 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
 
 def verdict(trials: list[Trial], part: Part) -> Finding | None:
-    """Return the hypothesis that explains the boxes, or the path, much better than the log as it is."""
+    """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log."""
     first, rest = trials[0], trials[1:]
     times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
 
     def holds(trial: Trial) -> bool:
         more = trial.score > max(times * first.score, first.score + least)
         more &= (trial.score - first.score) * part.boxes > _MORE_BOXES
-        # Boxes alone must not make a straight path crooked.
+        # Better boxes are no reason to make a straight path crooked.
         return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
 
     def straightens(trial: Trial) -> bool:
@@ -81,7 +81,7 @@ def verdict(trials: list[Trial], part: Part) -> Finding | None:
 
 
 def crooked(log: Log) -> bool:
-    """Return whether the path of a log goes in directions that do not fit its headings."""
+    """Return whether the directions of a log's path do not fit its headings."""
     straight = _straight(log)
     return straight is not None and straight < _CROOKED
 

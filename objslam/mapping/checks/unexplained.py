@@ -1,4 +1,4 @@
-"""A check of the association: how many boxes belong to no object."""
+"""A check of the association: the number of boxes without an object."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Association, Rays
 
 _USUAL = 0.12
-"""The usual share of boxes that are false or show moving objects. A larger share warns less often."""
+"""The usual share of boxes that are false or show moving objects. With a larger share, there are fewer warnings."""
 _IMPLAUSIBLE = 0.4
-"""The share of boxes without an object above which the input may be wrong. In simulation it is 0.1 for right input, and
-at least 0.5 for swapped axes, mirrored images or boxes of another image size. A larger share warns less often."""
+"""If more than this share of the boxes has no object, the input may be wrong. In simulation, right input has 0.1. Swapped
+axes, mirrored images or boxes of another image size have at least 0.5. A larger share warns less often."""
 _INPUT = "the stamps, base_T_camera, the axes of the poses, and that boxes are x1 y1 x2 y2 in px of this image size"
 
 

@@ -1,4 +1,4 @@
-"""What a run makes of the findings: warnings, and larger covariances where a known error shifts objects."""
+"""The consequences of findings: warnings, and larger covariances if a known error shifts objects."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.small_errors import shared
 
 _STEPS = 2
-"""The number of steps of a point to the rays without an error. The rays hardly move, so few steps are enough."""
+"""The number of Gauss-Newton steps of a point. A small error hardly moves the rays, so few steps are enough."""
 
 
 def say(diagnosis: Diagnosis, ledger: Ledger) -> None:
-    """Warn of each finding, and of what it means for the objects."""
+    """Warn of each finding, and of its consequences for the objects."""
     for finding in diagnosis.findings:
         ledger.warn(finding.message)
     if diagnosis.spoilt:
@@ -27,7 +27,7 @@ def say(diagnosis: Diagnosis, ledger: Ledger) -> None:
 def widened(
     objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, weight: Floats, diagnosis: Diagnosis
 ) -> ObjectMap:
-    """Return the objects with the covariance that small errors of the calibration cause, if the run left such errors in.
+    """Return the objects with the covariance of small calibration errors added, if the run did not correct such errors.
 
     association: of the rays. weight: (R,) their robust weights.
     """

@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Array, Floats
 from objslam.output.plot.style import colours_of
 
-_LINE = 300  # The width of a line is the longer side of the image over this number. A larger number draws thinner lines.
+_LINE = 300  # A line is as wide as the longer side of the image divided by this. A larger number draws thinner lines.
 
 
 Plate = tuple[int, int, int, int]

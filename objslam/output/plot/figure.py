@@ -36,14 +36,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one size (px) at points (n, 2), m. A dot has a rim of another colour."""
+    """Marks of one size (px) at points (n, 2), m. A dot has a rim of another colour. turn: rad, where a triangle points."""
 
     points: Floats
-    kind: Literal["dot", "cross"]
+    kind: Literal["dot", "cross", "triangle"]
     colour: Colour
     rim: Colour
     size: float
     name: str = ""
+    turn: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,13 @@ Shape = Segments | Line | Marks | Area
 class Figure:
     """A picture of a map from above.
 
-    low, high: (2,) m, the corners of the shown area. scale: px/m. shapes: what is drawn, the lowest first. legend: entries
-    for shapes that are not in the picture as they are. note: a remark at the upper right.
+    axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m.
+    shapes: what is drawn, the lowest first. legend: entries for shapes that are not in the picture as they are. note: a
+    remark at the upper right.
     """
 
     title: str
+    axes: tuple[str, str]
     low: Floats
     high: Floats
     scale: float

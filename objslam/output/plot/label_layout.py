@@ -86,7 +86,10 @@ def _counts(points: Floats, frame: Floats) -> Floats:
 
 
 def _covered(boxes: Floats, counts: Floats, origin: Floats) -> Floats:
-    """Return how many points lie in the pixels that each box (A, 4) touches. counts: of `_counts`. origin: of the area."""
+    """Return how many points (A,) lie in the pixels that each box (A, 4) touches.
+
+    counts: the table of `_counts`. origin: (2,) the lower left corner of its area.
+    """
     pixels = np.floor(boxes).astype(np.int64) - np.tile(np.floor(origin).astype(np.int64), 2) + [0, 0, 1, 1]
     x1, y1, x2, y2 = np.clip(pixels, 0, np.tile(np.array(counts.shape) - 1, 2)).T
     return np.asarray(counts[x2, y2] - counts[x1, y2] - counts[x2, y1] + counts[x1, y1])

@@ -1,6 +1,8 @@
 """The picture map.png: the map from above."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -8,6 +10,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
+from objslam.frontend.up import from_above, up_axis
 from objslam.output.plot.canvas import text_width
 from objslam.output.plot.figure import Area, Figure, Label, Line, Marks, Segments, Shape
 from objslam.output.plot.label_layout import needs_leader, place_labels
@@ -24,6 +27,8 @@ _CROSS = 17.0  # The cross of a true object has this width and height, px.
 _DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start of the path, have these diameters, px.
 _ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, a corner fits between two.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map and its smallest width, px.
+_EDGE = 0.985  # The triangle of a far object is this share of the way from the centre of the picture to its edge.
+_TRIANGLE = 18.0  # The triangle of a far object has this length, px.
 _PATH = 2.0  # The width, px, of a path.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
 _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # Colours of the path before, and of the path after.
@@ -38,51 +43,63 @@ def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
 
 def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     """Return what the picture of a map shows."""
-    points = np.array([o.position[:2] for o in result.map.objects]).reshape(-1, 2)
-    crosses = np.array([o.position[:2] for o in truth.objects] if truth else []).reshape(-1, 2)
-    shown, low, high = _frame(result, points, crosses)
+    plane = from_above(up_axis(result.keyframes))
+    points = result.map.positions[:, plane]
+    crosses = np.array([o.position[plane] for o in truth.objects] if truth else []).reshape(-1, 2)
+    shown, low, high = _frame(result, plane, points, crosses)
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
     scale = _LONG_SIDE / float((high - low).max())
     wider = (
         np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
     )  # a narrow map has room at its sides
-    below, dots = _objects(result, points)
-    shapes = [*_rays(result), *_paths(result), *below]
+    low, high = low - wider, high + wider
+    below, dots = _objects(result, plane, points)
+    shapes = [*_rays(result, plane), *_paths(result, plane), *below]
     if len(crosses):
         shapes.append(Marks(crosses, "cross", _BLACK, _BLACK, _CROSS, "ground truth"))
+    ok = np.array([o.status == "ok" for o in result.map], dtype=bool)
+    far = ok & ~shown & np.isfinite(points).all(axis=1)
+    at, beyond = _at_edge(points[far], low, high)
+    dots += _far([o for o, is_far in zip(result.map, far.tolist(), strict=True) if is_far], result, at, (low + high) / 2)
     figure = Figure(
-        title=_title(result, int((~shown).sum())),
-        low=low - wider,
-        high=high + wider,
+        title=_title(result),
+        axes=("xyz"[plane[0]], "xyz"[plane[1]]),
+        low=low,
+        high=high,
         scale=scale,
         shapes=(*shapes, *dots),
         legend=_legend(result),
     )
-    labels = _labels(figure, result, points, shown, crosses)
-    left_out = int(shown.sum()) - len(labels)
-    note = f"{left_out} labels have no room" if left_out else ""
-    return Figure(figure.title, figure.low, figure.high, scale, figure.shapes, figure.legend, labels, note)
+    names = np.array([_shortened(" ".join(name.split())) for name in captions(result.map)], dtype=object)
+    names[far] = [f"{name}, {away:.1f} m out" for name, away in zip(names[far], beyond, strict=True)]
+    points[far] = at
+    rims = [_ellipse(o, plane) for o, seen in zip(result.map, shown.tolist(), strict=True) if seen]
+    outlines = np.concatenate([np.zeros((0, 2)), *(rim for rim in rims if rim is not None)])
+    path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS)][:, plane, 3]
+    labels = _labels(figure, result, points, shown | far, names, (path, crosses, outlines))
+    left_out = int((shown | far).sum()) - len(labels)
+    return replace(figure, labels=labels, note=f"{left_out} labels have no room" if left_out else "")
 
 
-def _frame(result: RunResult, points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
+def _frame(result: RunResult, plane: list[int], points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
     """Return a mask (N,) of the shown objects, and the lower left and the upper right corner of the shown area, m."""
-    path = result.map_T_base[:, :2, 3]
+    path = result.map_T_base[:, plane, 3]
     shown, low, high = frame_objects(np.concatenate([points, crosses]), path)
     side = (high - low).max()
     half = np.full_like(points, np.nan)  # The half sides of the boxes around the shown 2-sigma ellipses.
     for j, o in enumerate(result.map.objects):
         if o.status == "ok" and o.covariance is not None and shown[j]:
-            half[j] = 2 * np.sqrt(np.maximum(np.diag(o.covariance)[:2], 0.0))
+            half[j] = 2 * np.sqrt(np.maximum(np.diag(o.covariance)[plane], 0.0))
     drawn = np.isfinite(half).all(axis=1)
     corners = np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
     # A path with much drift, or a huge ellipse, must not shrink the rest of the map.
-    before = np.clip(result.path.poses[:, :2, 3], low - 0.15 * side, high + 0.15 * side)
+    before = np.clip(result.path.poses[:, plane, 3], low - 0.15 * side, high + 0.15 * side)
     both = np.concatenate([before, np.clip(corners, low - side, high + side), [low, high]])
     return shown[: len(points)], both.min(axis=0), both.max(axis=0)
 
 
-def _rays(result: RunResult) -> list[Shape]:
+def _rays(result: RunResult, plane: list[int]) -> list[Shape]:
     kinds, ends = ray_kinds(result), ray_ends(result)
     used, out = kinds["used"], kinds["rejected"]
     many = f"rejected rays ({int(out.sum()):,})"
@@ -91,12 +108,14 @@ def _rays(result: RunResult) -> list[Shape]:
         index = sample(mask, most)
         if len(index):
             opacity = float(np.clip(150 / len(index), 0.25, 0.9))  # Many lines are fainter, so that objects stay visible.
-            shapes.append(Segments(np.stack([result.origins[index, :2], ends[index, :2]], axis=1), colour, opacity, name))
+            shapes.append(
+                Segments(np.stack([result.origins[index][:, plane], ends[index][:, plane]], axis=1), colour, opacity, name)
+            )
     return shapes
 
 
-def _paths(result: RunResult) -> list[Shape]:
-    before, after = result.path.poses[:, :2, 3], result.path_after.poses[:, :2, 3]
+def _paths(result: RunResult, plane: list[int]) -> list[Shape]:
+    before, after = result.path.poses[:, plane, 3], result.path_after.poses[:, plane, 3]
     moved = not np.array_equal(result.map_T_base, result.keyframes.map_T_base)
     shapes: list[Shape] = [Line(before, _BEFORE, _PATH, "path before", dashed=True)] if moved else []
     shapes.append(Line(after, _AFTER, _PATH, "path after" if moved else "path"))
@@ -105,7 +124,7 @@ def _paths(result: RunResult) -> list[Shape]:
     return shapes
 
 
-def _objects(result: RunResult, points: Floats) -> tuple[list[Shape], list[Shape]]:
+def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[Shape], list[Shape]]:
     """The ellipses and the dashed rays of the objects, and their dots."""
     colours = label_colours(result.map)
     below: list[Shape] = []
@@ -113,12 +132,12 @@ def _objects(result: RunResult, points: Floats) -> tuple[list[Shape], list[Shape
     for o, point in zip(result.map.objects, points, strict=True):
         colour = colours[o.label]
         if o.status == "unresolved":
-            start = o.ray[0][:2] if o.ray is not None else point
+            start = o.ray[0][plane] if o.ray is not None else point
             below.append(Line(np.stack([start, point]), colour, _PATH, dashed=True))
             dots.append(Marks(point[None], "dot", _WHITE, colour, _DOT - 1, ""))
             continue
         dots.append(Marks(point[None], "dot", colour, _WHITE, _DOT))
-        rim = _ellipse(o)
+        rim = _ellipse(o, plane)
         if rim is not None:
             below.append(Area(rim, colour, 0.18))
     return below, dots
@@ -135,49 +154,68 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
     return tuple(entries)
 
 
-def _ellipse(o: MapObject) -> Floats | None:
+def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
     """Return the rim (_ELLIPSE_POINTS, 2), m, of an object's 2-sigma ellipse in the plane, None without a finite
     covariance."""
     if o.status != "ok" or o.covariance is None or not np.isfinite(o.covariance).all():
         return None
     turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
-    values, vectors = np.linalg.eigh(o.covariance[:2, :2])
-    return o.position[:2] + 2 * ((vectors * np.sqrt(np.maximum(values, 0))) @ np.stack([np.cos(turn), np.sin(turn)])).T
+    values, vectors = np.linalg.eigh(o.covariance[np.ix_(plane, plane)])
+    return o.position[plane] + 2 * ((vectors * np.sqrt(np.maximum(values, 0))) @ np.stack([np.cos(turn), np.sin(turn)])).T
 
 
-def _title(result: RunResult, outside: int) -> str:
+def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return the points (F, 2) at the edge of the picture towards far points (F, 2), and the ways (F,) between them, m."""
+    centre, half = (low + high) / 2, (high - low) / 2
+    at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
+    return at, np.linalg.norm(points - at, axis=1)
+
+
+def _far(objects: list[MapObject], result: RunResult, at: Floats, centre: Floats) -> list[Shape]:
+    """Return a triangle at the edge, at (F, 2), for each object that is far outside. It points to the object."""
+    colours = label_colours(result.map)
+    return [
+        Marks(place[None], "triangle", colours[o.label], _WHITE, _TRIANGLE, "", float(np.arctan2(*(place - centre)[::-1])))
+        for o, place in zip(objects, at, strict=True)
+    ]
+
+
+def _title(result: RunResult) -> str:
     resolved, total, rays = len(result.map.resolved()), len(result.map), len(result.rays)
     text = f"{resolved} object{'s' * (resolved != 1)}"
     if total > resolved:
         text += f" and {total - resolved} unresolved"
     text += f" from {rays:,} rays of {len(result.keyframes):,} keyframes, {result.settings.mode} mode"
-    if outside:
-        text += f"\n{outside} object{'s' * (outside != 1)} far outside this picture"
-    return text
+    lost = int((~np.isfinite(result.map.positions).all(axis=1)).sum())
+    return text + (f"\n{lost} of them without a position" if lost else "")
 
 
-def _labels(figure: Figure, result: RunResult, points: Floats, shown: Bools, crosses: Floats) -> tuple[Label, ...]:
-    """Place at most `_MAX_LABELS` labels. An object whose label has no room has none."""
+def _shortened(name: str) -> str:
+    return name if len(name) <= _MAX_LETTERS else name[: _MAX_LETTERS - 1] + "…"
+
+
+def _labels(
+    figure: Figure, result: RunResult, points: Floats, shown: Bools, names: Any, avoid: tuple[Floats, Floats, Floats]
+) -> tuple[Label, ...]:
+    """Place at most `_MAX_LABELS` labels. An object whose label has no room has none.
+
+    names: (N,) the texts. avoid: points (P, 2), m, of the path, of the crosses, and of the ellipses.
+    """
+    path, crosses, outlines = (figure.pixels(part) for part in avoid)
     colours = label_colours(result.map)
     order = np.argsort([-o.rays for o in result.map.objects], kind="stable")
     chosen = [int(j) for j in order if shown[j]][:_MAX_LABELS]
-    names = captions(result.map)
-    lines = [" ".join(names[j].split()) for j in chosen]
-    short = [line if len(line) <= _MAX_LETTERS else line[: _MAX_LETTERS - 1] + "…" for line in lines]
-    sizes = np.array([(text_width(text, FONT), LINE * FONT) for text in short]).reshape(-1, 2)
+    sizes = np.array([(text_width(text, FONT), LINE * FONT) for text in names[chosen]]).reshape(-1, 2)
     anchors = figure.pixels(points[chosen]) if chosen else np.zeros((0, 2))
-    path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS), :2, 3]
-    arms = figure.pixels(crosses)[:, None] + _CROSS / 2 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-    rims = [_ellipse(o) for o, seen in zip(result.map.objects, shown.tolist(), strict=True) if seen]
-    outlines = figure.pixels(np.concatenate([np.zeros((0, 2)), *(rim for rim in rims if rim is not None)]))
+    arms = crosses[:, None] + _CROSS / 2 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     heavy = np.repeat(np.concatenate([arms.reshape(-1, 2), outlines]), _WEIGHT, axis=0)
     frame = np.array([[0, 0], figure.size], dtype=np.float64)
-    corners, found = place_labels(anchors, sizes, frame, np.concatenate([figure.pixels(path), heavy]))
+    corners, found = place_labels(anchors, sizes, frame, np.concatenate([path, heavy]))
     led = needs_leader(anchors, corners, sizes)
     labels = []
     for i in np.flatnonzero(found).tolist():
         near = np.clip(anchors[i], corners[i], corners[i] + sizes[i])
         leader = np.stack([anchors[i], near]) if led[i] else None
         box = np.concatenate([corners[i], corners[i] + sizes[i]])
-        labels.append(Label(short[i], colours[result.map.objects[chosen[i]].label], box, leader))
+        labels.append(Label(names[chosen[i]], colours[result.map.objects[chosen[i]].label], box, leader))
     return tuple(labels)

@@ -53,10 +53,11 @@ def render(figure: Figure) -> bytes:
     if figure.note:
         draw_text(page, figure.note, (left + width - text_width(figure.note, _NOTE), top - LINE * _NOTE - 3), _NOTE, _GREY)
     _draw_ticks(page, ticks, left, top, top + height)
-    across = left + (width - text_width("x (m)", FONT)) / 2
-    draw_text(page, "x (m)", (across, top + height + _TICK + LINE * FONT + 4), FONT, _BLACK)
-    upright = blank(text_width("y (m)", FONT) + 4, round(LINE * FONT) + 4)
-    draw_text(upright, "y (m)", (2, 2), FONT, _BLACK)
+    right, up = (f"{name} (m)" for name in figure.axes)
+    across = left + (width - text_width(right, FONT)) / 2
+    draw_text(page, right, (across, top + height + _TICK + LINE * FONT + 4), FONT, _BLACK)
+    upright = blank(text_width(up, FONT) + 4, round(LINE * FONT) + 4)
+    draw_text(upright, up, (2, 2), FONT, _BLACK)
     turned = np.rot90(upright)
     from_top = top + max((height - turned.shape[0]) // 2, 0)
     shown = turned[: page.shape[0] - from_top]
@@ -101,6 +102,10 @@ def _draw_marks(image: Image, points: Floats, marks: Marks) -> None:
         if marks.kind == "cross":
             for arm in np.eye(2) * marks.size / 2:
                 draw_line(image, np.stack([point - arm, point + arm]), marks.colour, 1)
+        elif marks.kind == "triangle":
+            corners = marks.turn + np.radians([0, 130, 230])
+            rim = point + marks.size / 2 * np.column_stack([np.cos(corners), -np.sin(corners)])
+            draw_area(image, rim, marks.colour, 1.0, 1)
         else:
             draw_dot(image, point, marks.size, marks.colour, marks.rim, 1.0 if marks.rim == (1.0, 1.0, 1.0) else 2.0)
 

@@ -1,4 +1,5 @@
-"""Charts of the residuals against what a shared error makes them depend on; the page's template draws them in SVG."""
+"""Charts of the residuals against turn rate, speed and place in the image, which reveal shared errors. The page's template
+draws them in SVG."""
 
 from dataclasses import dataclass
 
@@ -10,12 +11,12 @@ from objslam.output.plot.style import REJECTED_BELOW
 from objslam.output.report.charts import HEIGHT, WIDTH, axis_end
 
 _BINS = 12
-"""The largest number of points of a curve, each the median of equally many rays; larger shows more detail and noise."""
+"""The most points of a curve. Each point is the median of equally many rays. More points show more detail and more noise."""
 _FEWEST = 15
-"""The smallest number of rays of a point; larger makes curves smoother. The median of 15 rays is known to about 20 %."""
+"""The fewest rays of a point. More rays make curves smoother. The median of 15 rays is known to about 20 %."""
 _HONEST = float(np.sqrt(2 * np.log(2)))
-"""The median length of a normal error along two axes, in standard deviations of one axis (Rayleigh); a larger residual says
-that the noise is larger than the settings say."""
+"""The median length of a normal error along two axes, in standard deviations of one axis (Rayleigh). If the median residual
+is larger, the noise is larger than in the settings."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Point:
 class Trend:
     """Curves of the median residual. `curves` has the points of `before` (empty if unknown) and `after` the calibration.
 
-    below, beside: position and text of each tick. level: the height of the honest residual, None in degrees.
+    below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart in degrees.
     """
 
     title: str
@@ -45,7 +46,7 @@ class Trend:
 def trends(rays: RaysTable) -> list[Trend]:
     """Return the charts of the used rays: in degrees and in sigmas, against turn rate, speed and place in the image.
 
-    A quantity that does not vary, or has too few rays, has no chart.
+    There is no chart for a quantity that does not vary or has too few rays.
     """
     used = (rays.weight >= REJECTED_BELOW) & np.isfinite(rays.residual)
     against = (

@@ -45,7 +45,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: first those of the whole run, then those of the objects in the order of time."""
+    """Return the events of a drive: first the events of the whole run, then the events of objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"

@@ -19,7 +19,7 @@ _MANY = (
     *(_BLUE, _ORANGE, _GREEN, (190, 70, 70), (140, 90, 190), (140, 100, 80)),
     *((220, 120, 190), _GREY, (180, 180, 50), (60, 180, 200)),
 )
-"""The colours of curves that are many; the eleventh curve has the first colour again."""
+"""The colours of a plot with many curves. The eleventh curve has the first colour again."""
 
 
 def log_residuals(recording: Any, result: RunResult) -> None:

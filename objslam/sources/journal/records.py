@@ -26,7 +26,7 @@ from objslam.errors import LogError
 PathKind = Literal["odometry", "localization"]
 
 _POSE = struct.Struct("<c13d")  # The bytes of a pose message: its kind, its stamp and the upper three rows of the matrix.
-_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: those of a pose message, then the camera name's length.
+_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the bytes of a pose message, then the name's length.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
@@ -112,9 +112,9 @@ class NoteMessage:
 
 @dataclass(frozen=True)
 class CalibrationMessage:
-    """The shared errors that a session takes out of its map and of all later messages.
+    """The shared errors that a session corrects in its map and in all later messages.
 
-    keyframe: the number of keyframes that the map had before the session took the errors out.
+    keyframe: the number of keyframes in the map before the correction.
     """
 
     keyframe: int
@@ -194,7 +194,7 @@ def _read_camera(data: bytes) -> CameraMessage:
     if known is None:
         raise ValueError("an unknown lens model")
     inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
-    # Older journals do not store whether boxes show sizes, and only sensors that tell it have a noise of their depths.
+    # Older journals do not store `sees_size`. The noise of depths is stored only if a sensor has its own.
     sees_size = bool(more[0]) if more else True
     noise = RangeNoise(*_array(more[1], (3,)).tolist()) if len(more) > 1 else None
     size = _integer(width), _integer(height)

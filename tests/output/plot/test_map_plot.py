@@ -182,13 +182,51 @@ def test_ellipses_are_two_sigma_in_the_plane() -> None:
         np.testing.assert_allclose(distance, 2.0, rtol=1e-6)
 
 
-def test_a_far_object_is_counted_not_shown() -> None:
+def test_a_triangle_at_the_edge_points_to_a_far_object() -> None:
     positions, labels = clusters()
     positions[3, :2] = [500, -900]
     figure = map_figure(synthetic_result(positions, labels, keyframes=50)[0])
-    assert figure.title.endswith("\n1 object far outside this picture")
-    assert (figure.high - figure.low < [20, 25]).all()
-    assert labels[3] not in texts(figure)
+    low, high = figure.low, figure.high
+    assert (high - low < [20, 25]).all()
+    (triangle,) = (shape for shape in figure.shapes if isinstance(shape, Marks) and shape.kind == "triangle")
+    (at,) = triangle.points
+    assert ((at >= low) & (at <= high)).all()
+    way = np.array([500, -900]) - (low + high) / 2
+    ahead = triangle.turn
+    np.testing.assert_allclose([np.cos(ahead), np.sin(ahead)], way / np.linalg.norm(way), atol=1e-3)
+    (text,) = (text for text in texts(figure) if text.startswith(labels[3]))
+    assert abs(float(text.split(", ")[1].removesuffix(" m out")) - np.linalg.norm([500, -900] - at)) < 0.06
+
+
+def test_a_world_with_y_down_is_drawn_from_above() -> None:
+    """The map of the same drive with every pose and point turned: the picture has the same points, on other axes."""
+    result, _ = synthetic_result(*clusters(), keyframes=50)
+    y_down = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    keyframes = result.keyframes
+    poses = keyframes.map_T_base.copy()
+    poses[:, 2, 3] += np.sin(np.arange(len(poses)))  # held in a hand, for a planar path tells where up is
+    moved = [
+        dataclasses.replace(
+            o, position=y_down[:3, :3] @ o.position, covariance=y_down[:3, :3] @ o.covariance @ y_down[:3, :3].T
+        )
+        for o in result.map.objects
+    ]
+    turned = dataclasses.replace(
+        result,
+        map=dataclasses.replace(result.map, objects=tuple(moved)),
+        keyframes=dataclasses.replace(keyframes, map_T_base=y_down @ poses),
+        map_T_base=y_down @ result.map_T_base,
+        path=dataclasses.replace(result.path, poses=y_down @ result.path.poses),
+        path_after=dataclasses.replace(result.path_after, poses=y_down @ result.path_after.poses),
+        origins=result.origins @ y_down[:3, :3].T,
+        directions=result.directions @ y_down[:3, :3].T,
+    )
+    before, after = map_figure(result), map_figure(turned)
+    assert after.axes == ("x", "z")
+    np.testing.assert_allclose(lines(after)["path after"], lines(before)["path after"], atol=1e-9)
+    for one, other in zip(areas(after), areas(before), strict=True):
+        for corner in np.eye(2):  # eigenvectors have no sign, so the points of an ellipse may come in another order
+            assert (one.rim @ corner).max() == pytest.approx((other.rim @ corner).max(), abs=2e-3)
 
 
 def test_a_path_before_that_drifted_off_does_not_squeeze_the_map() -> None:

@@ -57,9 +57,9 @@ def open_view(where: str, say: Callable[[str], None], image: Image | None = None
 class LiveView:
     """A view that shows the snapshots of a session. If the viewer is too slow, snapshots are dropped and counted.
 
-    A separate process logs the snapshots, and a thread feeds this process, so a hanging viewer cannot block the session or
-    its end. If the viewer is killed, the process tries its address again every few seconds. A new viewer at this address
-    receives the later snapshots.
+    A separate process logs the snapshots, and a thread feeds this process. So a hanging viewer cannot block the session or
+    its end. If the viewer is killed, the process tries to connect to its address every few seconds. A new viewer at this
+    address receives the later snapshots.
     """
 
     def __init__(

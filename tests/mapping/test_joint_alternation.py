@@ -1,0 +1,81 @@
+"""Association and joint solve in turns: what allows for drift, and what the rays decide."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Keyframes, Trajectory
+from objslam.evaluation.evaluate import evaluate
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping.joint_alternation import JointState, _turned_since
+from objslam.mapping.pipeline import run
+from objslam.mapping.solution import seen_something
+from objslam.simulation import DepthNoise, preset, simulate
+
+
+def keyframes_with_drift(heading):
+    """Keyframes whose heading has gathered a variance (K,), rad^2."""
+    count = len(heading)
+    drift = np.zeros((count, 6, 6))
+    drift[:, 2, 2] = heading
+    poses = np.broadcast_to(np.eye(4), (count, 4, 4))
+    none = np.zeros(count, dtype=np.int64)
+    return Keyframes(np.arange(count, dtype=float), none, none, poses, poses, odom_T_base=poses, drift=drift)
+
+
+def test_drift_counts_from_the_nearest_keyframe_with_an_assigned_ray():
+    frames = keyframes_with_drift(np.array([0.0, 1.0, 2.0, 6.0, 7.0, 20.0]))
+    np.testing.assert_allclose(_turned_since(frames, np.array([1, 4, 4])) ** 2, [1, 0, 1, 1, 0, 13])
+
+
+def test_no_drift_is_allowed_where_no_odometry_leads_to_an_assigned_ray():
+    frames = keyframes_with_drift(np.arange(4.0))
+    some = np.array([0])
+    assert not _turned_since(frames, some[:0]).any()
+    assert not _turned_since(replace(frames, drift=None), some).any()
+    assert not _turned_since(replace(frames, localized_every=1.0), some).any()
+    parts = replace(frames, stretch=np.array([0, 0, 1, -1]))
+    np.testing.assert_allclose(_turned_since(parts, some), [0, 1, 0, 0])
+
+
+def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry():
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false", "noise.odometry=false"))
+    loose = {name: 6 * getattr(settings.odometry, name) for name in ("x_per_m", "y_per_m", "yaw_per_m", "yaw_per_rad")}
+    settings = settings.model_copy(update={"odometry": settings.odometry.model_copy(update=loose)})
+    log = simulate(preset("demo", objects=8, classes=2, frames=120, localization=None, odometry=Odometry(), false=0.0), 3)
+    odometry, middle = log.odometry, np.median(log.odometry.stamps)
+    late = odometry.stamps > middle
+    pivot = odometry.poses[late][0]
+    turned = odometry.poses.copy()
+    turned[late] = pivot @ lift_se2(np.array([0.0, 0.0, 0.1])) @ inverse(pivot) @ turned[late]
+    frames = build_keyframes(replace(log, odometry=Trajectory(odometry.stamps, turned)), settings, Ledger())
+    rays = build_rays(log, frames, settings, Ledger())
+    mine, mine_rays = seen_something(frames, rays)
+    cameras = tuple(one.camera for one in log.cameras)
+    state = JointState(frames, rays, mine, mine_rays, cameras, settings, Ledger(), lambda *_: None, None, None)
+
+    early = mine.stamps[mine_rays.keyframe] <= middle
+    first = state.alternated(mine.map_T_base, None).association
+    cut = state.solve("association", replace(first, object=np.where(early, first.object, -1)))
+    plain = cut.alternated(cut.estimate.map_T_base, (cut.association, cut.estimate.positions))
+    followed = cut.drift_followed()
+    assert followed.association.count == 8
+    assert followed.explained == len(rays) - 8 * settings.association.min_rays  # every ray
+    assert plain.explained < 0.9 * followed.explained
+
+
+def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():
+    """The first exploration gates by the noise of the settings, and finds some objects twice."""
+    default = Odometry()
+    noisy = {name: 4 * getattr(default, name) for name in type(default).model_fields if not name.startswith("floor")}
+    changes = {"objects": 8, "classes": 2, "frames": 150, "frame_rate": 2.0, "pixel_sigma": 3.0, "missed": 0.0, "false": 0.0}
+    changes |= {"odometry": default.model_copy(update=noisy), "depth": DepthNoise(), "localization": None}
+    log = simulate(preset("demo", **changes), 7)
+    result = run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
+    score = evaluate(result.map, log.truth, result.path_after, align="se2", radius=1.0).to_dict()
+    assert (score["matched"], score["false"]) == (8, 0)
+    assert score["ate"] < 0.15
