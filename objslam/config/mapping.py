@@ -185,6 +185,11 @@ class Live(Section):
     larger value drops true objects too."""
     ghost_frames: Count = 40
     """Number of frames that should show an object before it can be dropped. A larger value keeps false objects longer."""
+    journal_segment_mb: Annotated[float, Field(ge=0.001)] = 64.0
+    """Size in MB at which a segment of the journal is closed and compressed, and the next one begins."""
+    journal_free_mb: NotNegative = 200.0
+    """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
+    of less than 50 times this size, it is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200

@@ -129,7 +129,12 @@ def write_camera(camera: Camera, path: Path) -> None:
 
 def dump_camera(camera: Camera) -> str:
     """Return the text of a camera file, as `write_camera` writes it."""
-    data = {
+    return _dumped(camera_keys(camera))
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Return the content of a camera file."""
+    return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
         "image_height": int(camera.height),
@@ -141,7 +146,6 @@ def dump_camera(camera: Camera) -> str:
         **({} if camera.sees_size else {"sees_size": False}),
         **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
-    return _dumped(data)
 
 
 def write_mounts(mounts: Mapping[str, Floats], path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +34,8 @@ from objslam.sources.log_folder import resembles_log
 
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
 """The files that a new result replaces or deletes. They include the exports of the older result."""
+_ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
+"""The files of an older result that a live session deletes."""
 
 
 def prepare_output(out: Path) -> None:
@@ -97,14 +100,10 @@ def copy_result(folder: Path, out: Path) -> tuple[str, ...]:
 def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
-    A remaining file would look like a file of the session. objects.json stays, because the session replaces it. summary.json
-    marks the folder as a result, so it is deleted last.
+    A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
+    process is killed in between, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
     """
-    names = tuple(name for name in reversed(_existing_files(out)) if name != files.OBJECTS)
-    with disk_errors(out):
-        for name in names:
-            (out / name).unlink(missing_ok=True)
-    return names
+    return replace_files(out, _ALL_BUT_OBJECTS, {})
 
 
 def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:

@@ -85,8 +85,8 @@ SOURCES = (
     Source(
         "journal",
         "journal.objslam, the journal of a live session",
-        "sources.journal.file:is_journal",
-        "sources.journal.file:read_journal",
+        "sources.journal.segments:is_journal",
+        "sources.journal.log:read_journal",
     ),
     Source(
         "ros",

@@ -20,7 +20,7 @@ from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
-from objslam.sources.journal.file import messages
+from objslam.sources.journal.reader import messages
 from objslam.sources.log_folder import write_log_folder
 
 

@@ -30,6 +30,8 @@ _MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the bytes of 
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
+_STOP_KIND = b"E"
+_LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
 CALIBRATION_KIND = b"S"
 """The first byte of a calibration message."""
 
@@ -122,6 +124,25 @@ class CalibrationMessage:
 
 
 Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | CalibrationMessage
+
+
+def encode_stop(reason: str) -> bytes:
+    """Encode that a session stopped to write the journal, and why."""
+    return _STOP_KIND + json.dumps([reason]).encode()
+
+
+def is_stop(data: bytes) -> bool:
+    """Return whether a record says that a session stopped to write the journal."""
+    return data.startswith(_STOP_KIND)
+
+
+def read_stop(data: bytes) -> str:
+    """Return why a session stopped to write the journal. Raises LogError if the bytes do not say it."""
+    try:
+        (reason,) = json.loads(data[1:])
+    except (ValueError, TypeError, RecursionError) as error:
+        raise LogError(f"journal record that cannot be read: {error}") from error
+    return str(reason)[:_LONGEST_REASON]
 
 
 def encode(message: Message) -> bytes:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import progress_bar, say
-from objslam.cli.live_drive import LatestObjects, drive, finish
+from objslam.cli.live_command.drive import LatestObjects, drive, finish
 from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
@@ -65,7 +65,7 @@ def live(
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
-    from objslam.sources.journal.file import NAME
+    from objslam.sources.journal.segments import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
         raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")
