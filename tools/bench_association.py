@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from peers.drives import drives
 
 from objslam.association.global_association import associate_globally
 from objslam.config import Settings
@@ -34,7 +35,6 @@ from objslam.output.plot.map_plot import draw_map
 from objslam.simulation import DriveSettings, pair, preset, simulate
 from objslam.sources import SourceOptions, read
 from objslam.triangulation.triangulate import triangulate
-from peers.drives import drives
 
 PARTS = ("scenes", "speed", "drift", "mrclam", "unnamed")
 UNNAMED = ("lost in the woods", "Victoria Park")
@@ -191,7 +191,8 @@ def unnamed() -> None:
 
     F1 counts pairs of observations: a pair is right if the run and the names both say that it is one landmark.
     """
-    print(f"{'names hidden':<20}{'landmarks':>10}{'of':>5}{'F1 of pairs':>12}{'path off m':>12}{'dead reckoning m':>18}{'CPU s':>7}")
+    columns = f"{'landmarks':>10}{'of':>5}{'F1 of pairs':>12}{'path off m':>12}{'dead reckoning m':>18}{'CPU s':>7}"
+    print(f"{'names hidden':<20}{columns}")
     data = os.environ.get("OBJSLAM_DATA")
     for name, known in drives(Path(data) if data else None).items():
         if name not in UNNAMED:

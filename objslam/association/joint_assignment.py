@@ -81,7 +81,8 @@ def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     covariance = pairings.covariance[which][:, :, which].reshape(size * dimension, -1)
     precision = np.linalg.inv(covariance)
     pull = (precision @ residual.ravel()).reshape(size, dimension)
-    given_others = _blocks(precision.reshape(size, dimension, size, dimension))
+    each = np.arange(size)
+    given_others = precision.reshape(size, dimension, size, dimension)[each, :, each]
     squared = np.einsum("pi,pi->p", pull, np.linalg.solve(given_others, pull[..., None])[..., 0])
     margin = rarity - 0.5 * (squared - np.linalg.slogdet(given_others / (2 * np.pi))[1])
     if not ((squared <= pairings.gate) & (margin > 0)).all():
