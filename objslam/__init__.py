@@ -11,9 +11,10 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from objslam.api.inputs import Detections, Log, Trajectory
     from objslam.api.mapping import read, run
-    from objslam.api.registration import register
     from objslam.api.result import Result
     from objslam.api.session import Session
+    from objslam.api.sites import diff, merge
+    from objslam.association.registration.object_maps import register
     from objslam.config import Settings
     from objslam.core.camera import Camera
     from objslam.core.object_map import MapObject
@@ -32,6 +33,8 @@ __all__ = [
     "Settings",
     "Trajectory",
     "__version__",
+    "diff",
+    "merge",
     "read",
     "register",
     "run",
@@ -40,7 +43,8 @@ __all__ = [
 _HOMES = {
     **dict.fromkeys(("Detections", "Log", "Trajectory"), "objslam.api.inputs"),
     **dict.fromkeys(("read", "run"), "objslam.api.mapping"),
-    **{"register": "objslam.api.registration"},
+    **dict.fromkeys(("diff", "merge"), "objslam.api.sites"),
+    **{"register": "objslam.association.registration.object_maps"},
     **{"Result": "objslam.api.result", "Session": "objslam.api.session", "Settings": "objslam.config"},
     **{"Camera": "objslam.core.camera", "MapObject": "objslam.core.object_map"},
     **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.results.object_map"},

@@ -1,5 +1,7 @@
 """Errors that a user can correct. Each error names the problem, the place and the remedy."""
 
+import errno
+
 
 def printable(text: str) -> str:
     """Return a text with each character that is not printable as its escape, such as \\x1b. Line breaks (\\n) stay.
@@ -17,6 +19,14 @@ def one_line(text: object) -> str:
     if not said.isprintable():
         said = printable(" ".join(part for line in said.splitlines() if (part := line.strip())))
     return type(text).__name__ if not said and isinstance(text, BaseException) else said
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that there is no memory left: for data, for a thread, or for a library."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    texts = {RuntimeError: "can't start new thread", ImportError: "failed to map segment"}
+    return any(isinstance(error, kind) and text in str(error) for kind, text in texts.items())
 
 
 class ObjslamError(Exception):

@@ -218,7 +218,7 @@ def kill(times: int = 20) -> None:
         quiet = [f"--set={change}" for change in (*QUIET, "rays.pixel_sigma=2")]
         command = [sys.executable, "-m", "objslam", "live", str(source), "-o"]
         subprocess.run([*command, str(whole), "--speed", "0", *quiet], check=True, capture_output=True)
-        from objslam.sources.journal.file import messages
+        from objslam.sources.journal.reader import messages
 
         done, killed, torn, length, sizes = False, 0, 0, 0, [0]
         while not done:

@@ -7,20 +7,24 @@ from collections.abc import Mapping
 from dataclasses import fields
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from objslam.api.inputs import Log
 from objslam.api.result import Result
 from objslam.config import Settings, load_settings
 from objslam.config.presets import find_config
 from objslam.config.settings import change_settings
-from objslam.core import types
+from objslam.core import object_map, types
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.errors import ConfigError
 from objslam.mapping.progress import Progress
+from objslam.results.object_map import ObjectMap
 from objslam.sources import SourceOptions
 from objslam.sources import read as read_recording
+
+if TYPE_CHECKING:
+    from objslam.mapping.localization import PriorMap
 
 Given = Settings | Mapping[str, Any] | str | PathLike[str] | None
 """Settings as a user gives them: a mapping of changes, the name of ready settings, a YAML file, or None for the defaults."""
@@ -49,6 +53,7 @@ def run(
     settings: Given = None,
     *,
     detector: str | PathLike[str] | None = None,
+    map: ObjectMap | str | PathLike[str] | None = None,
     progress: Progress = lambda stage, done, total: None,
     **changes: Any,
 ) -> Result:
@@ -59,6 +64,8 @@ def run(
         settings: changes of the defaults, as {"mode": "joint", "rays.pixel_sigma": 2}; or a YAML file, or the name of ready
             settings such as "odometry".
         detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
+        map: the map of another day, or its file or result folder. If the drive is found in it, the result is in its frame,
+            and its objects count as priors. `Result.localised` says whether.
         progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
         changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
@@ -73,20 +80,37 @@ def run(
         ledger.add(log.reading)
         told = ledger.lines()
     model = None if detector is None else Path(detector)
-    mapped, log = map_log(log, chosen, ledger, model, progress)
+    mapped, log = map_log(log, chosen, ledger, model, progress, None if map is None else prior_map(map))
     _tell(line for line in ledger.lines() if line not in told)
     return Result.of(mapped, log, detected=model is not None)
 
 
+def prior_map(given: ObjectMap | str | PathLike[str]) -> PriorMap:
+    """Return a map of another day for a run. OutputError if its file or folder cannot be read."""
+    from objslam.mapping.localization import PriorMap
+
+    if isinstance(given, object_map.ObjectMap):
+        return PriorMap("the given map", given)
+    return PriorMap(str(given), ObjectMap.load(given))
+
+
 def map_log(
-    log: types.Log, settings: Settings, ledger: Ledger, detector: Path | None, progress: Progress
+    log: types.Log,
+    settings: Settings,
+    ledger: Ledger,
+    detector: Path | None,
+    progress: Progress,
+    known: PriorMap | None = None,
 ) -> tuple[RunResult, types.Log]:
-    """Return the result of a run, and the log. If there is a `detector`, the log has the boxes that it found."""
+    """Return the result of a run, and the log. If there is a `detector`, the log has the boxes that it found.
+
+    known: the map of another day, which the drive may be found in.
+    """
     from objslam.mapping import pipeline
 
     if detector is not None:
         log = find_boxes(log, detector, settings, ledger, progress)
-    return pipeline.run(log, settings, ledger, progress), log
+    return pipeline.run(log, settings, ledger, progress, known), log
 
 
 def find_boxes(log: types.Log, detector: Path, settings: Settings, ledger: Ledger, progress: Progress) -> types.Log:

@@ -14,6 +14,7 @@ from objslam.core import types
 from objslam.core.result import RunResult
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
+from objslam.io.views_parquet import Views
 from objslam.mapping.checks.assessment import Assessment
 from objslam.results.object_map import ObjectMap
 
@@ -98,6 +99,22 @@ class Result:
         if found is None:
             raise OutputError("this result is from an older version, without an assessment", hint="run again")
         return Assessment(found["level"], tuple(found["reasons"]))
+
+    @property
+    def views(self) -> Views | None:
+        """Where each image was taken, which tells what could have been seen. None for a result of an older version."""
+        from objslam.results import read
+
+        if self._run is None:
+            return None if self.folder is None else read.load_views(self.folder)
+        run = self._run.result
+        margins = run.settings.rays.border, run.settings.rays.border_share
+        return None if run.views is None else Views.of(run.views, run.cameras, *margins)
+
+    @property
+    def localised(self) -> bool:
+        """Whether the drive was found in the map of another day, so that the result is in the frame of that map."""
+        return bool(self.summary.get("localisation", {}).get("localised", False))
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from objslam.core.types import Rays
 
 _GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
 _MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y. A larger value costs time.
-_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m); later association corrects the rest.
+_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m). Later association corrects the rest.
 _LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
 _MIN_LEVEL = 0.1  # The least cosine of a ray's elevation by which its heading noise is divided.
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.

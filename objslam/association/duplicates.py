@@ -5,7 +5,8 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""The largest share of frames in which wrong boxes show one object as two. A larger share merges separate objects."""
+"""If two objects are seen together in more than this share of frames, they differ. A larger share merges separate
+objects."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
@@ -18,5 +19,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ, if `together` of the `frames` that show the rarer one show both."""
+    """Return whether two objects differ. `frames` frames show the rarer one, and `together` of these frames show both."""
     return together > TOGETHER * frames

@@ -15,17 +15,18 @@ from objslam.core.geometry import lift_se2
 from objslam.core.types import Rays
 
 POSE = 3
-"""The number of the pose's entries in the state: its errors in yaw (rad), x and y (m), along the axes of map."""
+"""The number of state entries of the pose: its errors in yaw (rad), x and y (m), along the axes of map."""
 _LEAST = 1e-12
-"""The variance added in each correction, which keeps covariances positive definite. A larger variance forgets sooner."""
+"""The variance added in each correction. It keeps covariances positive definite. A larger variance forgets sooner."""
 _LEAST_DISTANCE = 1e-3
-"""The least distance (m) of a landmark that a residual is divided by. A larger one blunts what is right in front."""
+"""The least distance (m) of a landmark by which a residual is divided. With a larger value, landmarks right in front count
+less."""
 
 
 @dataclass
 class Filter:
-    """map_T_base: (4, 4). shared: (S,) errors that all motions share. position: (N, 3) m of landmarks. covariance: of the
-    errors of yaw, x and y, of the shared errors, and of all positions, in this order."""
+    """The state of the filter. map_T_base: (4, 4). shared: (S,) errors that all motions share. position: (N, 3) m of
+    landmarks. covariance: of the errors of yaw, x and y, of the shared errors, and of all positions, in this order."""
 
     map_T_base: Floats
     shared: Floats
@@ -52,8 +53,8 @@ class Filter:
 
 @dataclass(frozen=True)
 class Sight:
-    """R rays as they are seen from the base. offset: (R, 3) m where they begin, direction: (R, 3), both in the frame of the
-    base. sigma: (R,) rad. range, range_sigma: (R,) m, NaN if unknown."""
+    """R rays relative to the base. offset: (R, 3) m, the origins of the rays, and direction: (R, 3), both in the base frame.
+    sigma: (R,) rad. range, range_sigma: (R,) m, NaN if unknown."""
 
     offset: Floats
     direction: Floats
@@ -63,17 +64,17 @@ class Sight:
 
     @classmethod
     def of(cls, rays: Rays, base_T_camera: Floats) -> Self:
-        """Make the sight of rays from cameras at base_T_camera (K, 4, 4)."""
+        """Make the sight from rays of cameras at base_T_camera (K, 4, 4)."""
         return cls(*rays.in_map(base_T_camera), rays.sigma, rays.range, rays.range_sigma)
 
 
 @dataclass(frozen=True)
 class Expected:
-    """P pairs of a ray and a landmark, and how the measured ray differs from the expected one.
+    """P pairs of a ray and a landmark, with the difference between the measured and the expected ray.
 
-    residual: (P, 3), two across the ray (rad), and one of the range (m), which is 0 without a range. by_pose, by_landmark:
-    (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements; without a range, the last one changes
-    no likelihood. ranged: (P,) whether there is a range.
+    residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
+    by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements. Without a range, the last
+    variance is such that it does not change a likelihood. ranged: (P,) whether there is a range.
     """
 
     landmark: Ints
@@ -116,7 +117,8 @@ class Expected:
 def predict(f: Filter, motion: Floats, by_shared: Floats, noise: Floats) -> None:
     """Move the base by a motion (4, 4) without its shared errors.
 
-    by_shared: (3, S) how the shared errors change the motion's yaw, x and y, in the base after it. noise: (3, 3) likewise.
+    by_shared: (3, S) the derivative of the motion's yaw, x and y by the shared errors. noise: (3, 3) the covariance of the
+    motion's yaw, x and y. Both are in the base frame after the motion.
     """
     before = f.map_T_base[:2, 3]
     after = f.map_T_base @ motion
@@ -134,7 +136,7 @@ def predict(f: Filter, motion: Floats, by_shared: Floats, noise: Floats) -> None
 
 
 def individual_covariances(f: Filter, expected: Expected) -> Floats:
-    """Return the covariances (P, 3, 3) of the residuals, each pair alone."""
+    """Return the covariance (P, 3, 3) of the residual of each pair."""
     columns, by_pose, by_landmark = f.columns(expected.landmark), expected.by_pose, expected.by_landmark
     own = f.covariance[columns[:, :, None], columns[:, None, :]]
     cross = by_pose @ f.covariance[:POSE][:, columns].swapaxes(0, 1) @ by_landmark.swapaxes(1, 2)
@@ -163,7 +165,8 @@ def within_reach(f: Filter, sight: Sight, ray: Ints, gate: float) -> Bools:
 
 
 def joint_covariance(f: Filter, expected: Expected) -> Floats:
-    """Return the covariance (P, 3, P, 3) of all residuals. Noise is independent, as two pairs of one ray never both hold."""
+    """Return the covariance (P, 3, P, 3) of all residuals. Their noise is independent, because at most one pair of a ray is
+    true."""
     jacobian = expected.jacobian(f).reshape(-1, len(f.covariance))
     total = jacobian @ f.covariance @ jacobian.T
     total[np.diag_indices(len(total))] += expected.variance.ravel()
@@ -180,14 +183,15 @@ def update(f: Filter, expected: Expected) -> tuple[Floats, Floats]:
 
 
 def differences(f: Filter, one: Ints, two: Ints) -> tuple[Floats, Floats]:
-    """Return the way (P, 3) m from one landmark to the other of each pair, and its covariance (P, 3, 3)."""
+    """Return the offset (P, 3) m from one landmark to the other of each pair, and its covariance (P, 3, 3)."""
     block = f.covariance[f.head :, f.head :].reshape(len(f), 3, len(f), 3)
     mixed = block[one, :, two]
     return f.position[two] - f.position[one], block[one, :, one] + block[two, :, two] - mixed - mixed.swapaxes(1, 2)
 
 
 def joint_differences(f: Filter, one: Ints, two: Ints, sigma: float) -> tuple[Floats, Floats]:
-    """Return the same with the covariance (P, 3, P, 3) of all pairs. sigma: m, an error that each pair has in addition."""
+    """Return the offsets as `differences` does, with the covariance (P, 3, P, 3) of all pairs. sigma: m, an additional error
+    of each pair."""
     jacobian = _apart(f, one, two)
     total = jacobian @ f.covariance @ jacobian.T
     total[np.diag_indices(len(total))] += sigma**2
@@ -195,7 +199,7 @@ def joint_differences(f: Filter, one: Ints, two: Ints, sigma: float) -> tuple[Fl
 
 
 def tie(f: Filter, one: Ints, two: Ints, sigma: float) -> None:
-    """Correct the state so that the landmarks of each pair (P,), (P,) are at one place, up to `sigma` (m)."""
+    """Correct the state so that the landmarks of each pair (P,), (P,) have the same position, up to `sigma` (m)."""
     _correct(f, _apart(f, one, two), (f.position[two] - f.position[one]).ravel(), np.full(3 * len(one), sigma**2))
 
 
@@ -208,7 +212,7 @@ def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
 
 
 def _carried(arm: Floats) -> Floats:
-    """Return how points at offsets (P, 3) m from the base move with its yaw, x and y: (P, 3, 3)."""
+    """Return the derivative (P, 3, 3) of points at offsets (P, 3) m from the base by its yaw, x and y."""
     moved = np.zeros((len(arm), 3, POSE))
     moved[:, 0, 0], moved[:, 1, 0], moved[:, 0, 1], moved[:, 1, 2] = -arm[:, 1], arm[:, 0], 1.0, 1.0
     return moved
@@ -233,7 +237,7 @@ def _correct(f: Filter, jacobian: Floats, innovation: Floats, variance: Floats) 
 
 
 def ends(f: Filter, sight: Sight, ray: Ints) -> tuple[Floats, Floats]:
-    """Return where rays (n,) with ranges end, (n, 3) m in map, with covariances (n, 3, 3) relative to the present pose."""
+    """Return the ends (n, 3), m in map, of rays (n,) with ranges, and covariances (n, 3, 3) relative to the present pose."""
     turn, reach = f.map_T_base[:3, :3], sight.range[ray]
     n = sight.direction[ray] @ turn.T
     along = n[:, :, None] * n[:, None, :]

@@ -1,5 +1,5 @@
 """Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
-landmark that is no object, because rays of different things meet there."""
+landmark without an object: rays of different things meet there."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from objslam.core.statistics import poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger ones mean more similar rates.
-_CLEAR_LEAD = 5.0  # The ln likelihood by which the best concentration must beat a lower one. More drops fewer objects.
+_CLEAR_LEAD = 5.0  # A concentration is excluded if its ln likelihood is this far below the best. More drops fewer objects.
 _POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
-_MOST_PRIOR = 3.0  # The largest prior odds, which a class with few boxes gets. A larger value keeps more weak objects.
-_EXPECTED_STRAYS = 5.0  # The number of stray boxes that each class is assumed to have besides the observed ones.
-_LOG_SIZE = 0.7  # The standard deviation of ln size within a class, which is a factor of 2.
-_PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms, which is a factor of 100.
-_MOST_ODDS = 20.0  # The largest absolute log odds against chance, which only keeps them finite.
+_MOST_PRIOR = 3.0  # The largest prior odds. A class with few boxes has them. A larger value keeps more weak objects.
+_EXPECTED_STRAYS = 5.0  # Each class is assumed to have this number of stray boxes in addition to the observed ones.
+_LOG_SIZE = 0.7  # The standard deviation of ln size within a class. It is a factor of 2 in size.
+_PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms. It is a factor of 100 in size.
+_MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
@@ -28,8 +28,8 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 
 @dataclass(frozen=True)
 class Rates:
-    """Beta distributions of the detection rates in each class. mean: (L,). concentration: the sum of the two parameters,
-    the same for all classes."""
+    """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
+    parameters of a distribution, the same for all classes."""
 
     mean: Floats
     concentration: float
@@ -48,9 +48,9 @@ class Rates:
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
-    """Estimate the rate of each class as the median over its boxes. If they are few, it is near the rate of all classes. The
-    concentration is the lowest one that is not clearly less likely than the best one. Their likelihoods allow for any object
-    to be a phantom."""
+    """Estimate the rate of each class as the median over its boxes. If a class has few boxes, its rate is near the rate of
+    all classes. The concentration is the lowest one whose likelihood is not clearly below the best. The likelihoods allow
+    any object to be a phantom."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
@@ -62,7 +62,7 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
 
 
 def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
-    """Return ln of the probability (N,) of a sequence of detections and misses if the rate is beta distributed."""
+    """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution."""
     from scipy.special import betaln
 
     a, b = concentration * rate, concentration * (1 - rate)
@@ -129,7 +129,7 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """Return for each landmark the total number (N,) of rays of those landmarks of its class that have no more rays."""
+    """Return for each landmark the number (N,) of rays of all landmarks of its class that have no more rays than it has."""
     rank = label * (int(number.max(initial=0)) + 1) + number
     order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))
@@ -141,8 +141,8 @@ def rest_odds(state: State) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
-    the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes.
-    This looks like motion. So only a few rays count, and motion within the object's size does not count.
+    the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
+    which looks like motion. So only a few rays count, and motion within the object's size does not count.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]

@@ -12,7 +12,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 TRACK_GAIN = 2.0
-"""The cost reduction of a match if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
+"""A match costs less by this if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
 more."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
@@ -75,8 +75,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of the pairs that may be within the gate, by a lower bound on their deviation. The
-    bound takes only matrix products, which are fast."""
+    """Return the rays and the landmarks of the pairs that may be within the gate. A lower bound on the deviation decides. It
+    takes only matrix products, which are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -109,9 +109,9 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
     """Return the landmark (R,) of each ray, or -1, in the assignment with the least total cost.
 
-    A landmark gets at most one ray per frame. Each frame is solved separately. Parts of a frame that share no ray and no
-    landmark are also solved separately. Most parts take the best edge of each ray, or of each landmark. The Hungarian method
-    solves the rest.
+    A landmark gets at most one ray per frame. Each frame is solved separately. So are parts of a frame that share no ray and
+    no landmark. In most parts, the best edge of each ray, or of each landmark, is the solution. The Hungarian method solves
+    the rest.
     cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
     """
     from scipy.sparse import coo_array
@@ -149,7 +149,7 @@ def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: In
     """Return the best edge of each value of `one`, and (E,) whether the edges belong to a part without conflicts.
 
     A part has no conflict if the best edges of its values of `one` differ in `other`. Then these edges are the best
-    assignment of the part, because no assignment can gain more. Of equal gains the lowest landmark counts.
+    assignment of the part, because no assignment can gain more. If gains are equal, the lowest landmark is taken.
     """
     order = np.lexsort((landmark, -gain, one))
     best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
@@ -175,7 +175,7 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
         first, second = linear_sum_assignment(dense, maximize=True)
         real = dense[first, second] > 0
         return first[real], second[real]
-    # Every row of the sparse table needs a pair. So each row also gets a column of its own that stands for no pair.
+    # Every row of the sparse table needs a pair. So each row also gets its own extra column, which stands for no pair.
     each = np.arange(rows)
     value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # Entries of 0 would not count as possible pairs.
     entries = (np.append(row, each), np.append(column, columns + each))
@@ -185,8 +185,8 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """Return the cost reduction (E,) of each edge. It is 0 unless most other boxes of the ray's track, and at least two,
-    have the landmark of the edge.
+    """Return the cost reduction (E,) of each edge. An edge has one if most other boxes of the ray's track, and at least two,
+    have the landmark of the edge. Otherwise it is 0.
 
     track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """

@@ -24,22 +24,22 @@ from objslam.core.statistics import grouped_quantile
 from objslam.core.types import Association, Keyframes, Rays
 
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
-_ROUNDS = 12  # The most rounds of merging, and of merging and dropping, which could otherwise repeat without end.
+_ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change. A larger value converges further.
-_SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames; later searches use other frames.
-_FRAMES = 12  # The fewest frames that a search uses, because an object is where rays of several frames meet.
-_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have very many. A larger value costs time.
+_SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames. Later searches use other frames.
+_FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
+_MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
-_PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger one finds fewer, surer points.
+_PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 _FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 
 
 @dataclass(frozen=True)
 class _Task:
-    """Constants of one association. gate: the largest squared deviation of a match. device: the setting
-    of `triangulation`. seed: the seed of the random ray pairs."""
+    """The constants of one association. gate: the largest squared deviation of a match. device: the setting
+    `triangulation.device`. seed: the seed of the random ray pairs."""
 
     gate: float
     settings: config.AssociationSettings
@@ -91,7 +91,7 @@ def associate_globally(
         if state.count <= before:
             break
     state = _add_distant(task, state)
-    for _ in range(_ROUNDS):  # The rays of a dropped landmark may show that two others are one object.
+    for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
         state, likely = _drop_all(task, merged)
         if state.count == merged.count:
@@ -128,7 +128,8 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
 
 
 def _add_distant(task: _Task, state: State) -> State:
-    """Add landmarks where rays without parallax agree. They see distant objects, or come from a robot that hardly moves."""
+    """Add landmarks where rays without parallax agree. Such rays come from distant objects, or from a robot that hardly
+    moves."""
     known = state.count
     state = _alternate(task, _discover(task, state, _TURNS, 0.0), 2)
     index, direction = state.owner, state.obs.direction[state.assigned]
@@ -192,8 +193,8 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
-    Of two neighbours of one label that both fail, the one with more rays is kept in this call. It may get back its boxes
-    from the other one, and is then judged again.
+    If two neighbours of one label both fail, the one with more rays is kept in this call. It may get boxes back from the
+    other one, and is then judged again.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():

@@ -9,11 +9,11 @@ from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, 
 from objslam.core.arrays import Floats, Ints
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
-_LARGE = 1 << 26  # The least number of pairs of a ray and a point for torch. numpy is as fast, but cannot use CUDA.
-_DRAWS_EACH = 8  # The ray pairs drawn for each hypothesis, because most pairs do not meet.
+_LARGE = 1 << 26  # The number of pairs of a ray and a point from which on torch is used. It can use CUDA, numpy cannot.
+_DRAWS_EACH = 8  # The number of ray pairs drawn for each hypothesis. Most pairs of rays do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
-_MIN_LEFT = 0.6  # The share of its support that better points must leave to a point. Else it waits for the next search.
-_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. A larger one would lose millimetres.
+_MIN_LEFT = 0.6  # Without the rays of better points, a point must keep this share of its support, or it waits.
+_SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. Beyond it, millimetres would be lost.
 _RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
 _RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
@@ -21,10 +21,9 @@ _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried a
 
 @dataclass(frozen=True)
 class Search:
-    """Settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: largest squared
-    deviation of a ray that supports a point. parallax: least angle (rad) between the rays of a pair, or 0 to also try
-    distances along single rays. device: the setting
-    `triangulation.device`."""
+    """The settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: largest
+    squared deviation of a ray that supports a point. parallax: least angle (rad) between the rays of a pair. With 0,
+    distances along single rays are tried too. device: the setting `triangulation.device`."""
 
     hypotheses: int
     support: float
@@ -47,7 +46,7 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 
 
 def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
-    """Return the refined points (N, 3) m, out of (H, 3), that have enough support without the rays of better ones."""
+    """Refine points (H, 3) m, and return the points (N, 3) m with enough support without the rays of better points."""
     moved = scorer.load(points)
     xp = module_of(moved)
     for _ in range(_REFINEMENTS):
@@ -67,10 +66,10 @@ def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
 
 
 def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
-    """Return points (H, 3) where two rays of different frames meet, where ranges end, and, if `search.parallax` is 0, along
-    single rays."""
+    """Return points (H, 3) where two rays of different frames meet, and where ranges end. If `search.parallax` is 0, return
+    points along single rays too."""
     n = len(obs)
-    # Few rays have fewer pairs than hypotheses, and trying each pair once is both faster and complete.
+    # If there are fewer pairs than hypotheses, each pair is tried once. This is both faster and complete.
     first, second = np.triu_indices(n, 1) if n * (n - 1) // 2 <= search.hypotheses else _draw(obs, search, rng)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
@@ -92,7 +91,7 @@ def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[
     """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices.
 
     If the first ray has a track, the second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then
-    the number of rays in between is uniform in its logarithm, because near frames more often show the same object.
+    the logarithm of the number of rays in between is uniform, because near frames more often show the same object.
     """
     n, count = len(obs), _DRAWS_EACH * search.hypotheses
     first = rng.integers(n, size=count)
@@ -110,9 +109,9 @@ def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[
 class _Scorer:
     """Scores points by the rays of one label.
 
-    The rays are sorted into slices. Slice k, from 0, holds one more ray of every frame with more than k rays. Frames with
-    more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices gives the
-    best support in each frame.
+    The rays are sorted into slices. Slice k, from 0, holds the (k + 1)-th ray of every frame with more than k rays. Frames
+    with more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices gives
+    the best support in each frame.
     """
 
     def __init__(self, obs: Observations, search: Search, backend: Backend) -> None:
@@ -177,7 +176,7 @@ class _Scorer:
         return best.sum(axis=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
-        """Move points (H, 3) to the least-squares solution of their rays, but not along directions that these do not fix."""
+        """Move points (H, 3) to the least-squares solution of their rays. Directions that the rays do not fix stay."""
         xp = module_of(points)
         information = (support @ self.across).reshape(-1, 3, 3)
         trace = information[:, 0, 0] + information[:, 1, 1] + information[:, 2, 2]

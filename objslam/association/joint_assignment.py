@@ -1,7 +1,7 @@
 """Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
 
-One error of the pose shifts all measurements of a frame. So each pairing that is accepted tells where the others must be. A
-hypothesis grows from its first pairing, best pairing first. Its odds compare it with "all measurements are of new things".
+One error of the pose shifts all measurements of a frame. So each accepted pairing predicts the others. A hypothesis grows
+from its first pairing, and the best pairing is added next. Its odds compare it with "all measurements are of new things".
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Pairings:
     """P possible pairings of a measurement and a landmark, each with D residuals.
 
     row, column: (P,) the measurement and the landmark. residual: (P, D). covariance: (P, D, P, D) of all residuals, with the
-    correlations between pairings. rarity: (P,) minus the log density of residuals of something new. gate: the largest
+    correlations between pairings. rarity: (P,) minus the log density of the residuals of something new. gate: the largest
     squared deviation of a pairing.
     """
 
@@ -33,9 +33,9 @@ class Pairings:
 
 @dataclass(frozen=True)
 class JointAssignment:
-    """The best hypothesis. chosen: (n,) its pairings. margin: (n,) by how much the log odds of the best hypothesis exceed
-    those of the best one without each pairing. rival: (n,) whether the latter pairs the measurement with another landmark.
-    odds: the log odds of the whole over "everything is new"."""
+    """The best hypothesis. chosen: (n,) its pairings. margin: (n,) the log odds of the best hypothesis minus the log odds of
+    the best hypothesis without this pairing. rival: (n,) whether this other hypothesis pairs the measurement with another
+    landmark. odds: the log odds of the best hypothesis over "everything is new"."""
 
     chosen: Ints
     margin: Floats
@@ -102,7 +102,7 @@ def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float
         if tried[seed]:
             continue
         chosen, total = _grow(pairings, odds, allowed, seed)
-        tried[chosen] = True  # a hypothesis with this pairing is there already
+        tried[chosen] = True  # This hypothesis covers all its pairings as seeds.
         if total > most:
             best, most = chosen, total
     return best, most
@@ -135,13 +135,13 @@ def _grow(pairings: Pairings, odds: Floats, allowed: Bools, seed: int) -> tuple[
 
 
 def _blocks(covariance: Floats) -> Floats:
-    """Return the covariance (P, D, D) of each pairing alone."""
+    """Return the covariance (P, D, D) of each single pairing."""
     each = np.arange(len(covariance))
     return covariance[each, :, each]
 
 
 def _odds(pairings: Pairings, residual: Floats, blocks: Floats, which: Ints | slice = slice(None)) -> Floats:
-    """Return the log odds (p,) of pairings over new things; -inf for one outside the gate."""
+    """Return the log odds (p,) of pairings over new things. It is -inf for a pairing outside the gate."""
     r, s = residual[which], blocks[which]
     squared = np.einsum("pi,pi->p", r, np.linalg.solve(s, r[..., None])[..., 0])
     spread = np.linalg.slogdet(2 * np.pi * s)[1]

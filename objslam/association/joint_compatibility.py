@@ -1,6 +1,6 @@
 """Test the joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-The gates of such landmarks are wide and may contain unknown objects. So one pose error must explain the offsets of all
+The gates of such landmarks are wide and may contain unknown objects. So a single pose error must explain the offsets of all
 landmarks together.
 """
 
@@ -54,11 +54,11 @@ def jointly_compatible(
 
 
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
-    """Return the expected number (n,) of unknown objects per steradian along each ray that have the label of its landmark.
+    """Return the expected number (n,) of unknown objects per steradian along each ray. They have the label of its landmark.
 
-    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. There
-    are assumed to be as many unknown objects per known one, spread evenly over the room. They are visible up to the end of
-    the room, but not beyond the greatest distance at which a landmark was seen.
+    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. The
+    assumed ratio of unknown to known objects is the same. Unknown objects are spread evenly over the room. They are visible
+    up to the end of the room, but not beyond the greatest distance at which a landmark was seen.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -13,14 +13,14 @@ from objslam.core.statistics import grouped_median, poisson_tail
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object."""
 _MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
-_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log. A larger one fuses labels sooner.
+_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log. With more, more labels fuse.
 
 
 def fused_labels(state: State, gate: float) -> Bools:
-    """Return which labels (N, L) each landmark accepts: its own, and labels whose unassigned boxes it explains.
+    """Return which labels (N, L) each landmark accepts: its own label, and labels whose unassigned boxes it explains.
 
     An explained box lies on the landmark, in a frame in which the landmark has no box of its own. The explained boxes of a
-    label must have the landmark's size. They must be more than strays would be, and fewer than the landmark's own boxes.
+    label must have the landmark's size. There must be more of them than by chance, and fewer than the landmark's own boxes.
     """
     obs, accepts = state.obs, state.landmarks.accepts
     count, labels = accepts.shape

@@ -27,7 +27,7 @@ class Landmarks:
 
     @classmethod
     def new(cls, position: Floats, noise: Floats, label: Ints, labels: int) -> Self:
-        """Create landmarks at exact positions. Each accepts one label (N,). labels: the number of all labels."""
+        """Create landmarks at exact positions. Each accepts its own label (N,). labels: the number of all labels."""
         accepts = np.zeros((len(position), labels), dtype=bool)
         accepts[np.arange(len(position)), label] = True
         return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
@@ -37,15 +37,15 @@ class Landmarks:
         return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])
 
     def and_also(self, other: Self) -> Self:
-        """Return these landmarks, followed by the other ones."""
+        """Return these landmarks, followed by the landmarks of `other`."""
         return type(self)(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class PredictedLandmarks:
-    """Predicted positions in the next frame of a live session: first of its landmarks, then of its candidates, n in all.
+    """Predicted positions in the next frame of a live session, n in all: of its landmarks, then of its candidates.
     landmarks: the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays
-    have only a label in common. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry
+    were grouped by label alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry
     at the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark
     was seen."""
 
@@ -126,7 +126,7 @@ class State:
 
     @cached_property
     def class_noise(self) -> Floats:
-        """Ratio (L,) of the actual to the nominal noise of the rays of each class. It is nearly 1 if they are few."""
+        """Ratio (L,) of the actual to the nominal noise of the rays of each class. With few rays, it is near 1."""
         labels, label = len(self.unassigned), self.label[self.owner]
         number = np.bincount(label, minlength=labels)
         middle = np.nan_to_num(grouped_median(self.deviation, label, labels)) / RAYLEIGH_MEDIAN
@@ -134,8 +134,8 @@ class State:
 
     @cached_property
     def noise(self) -> Floats:
-        """Ratio (N,) of the actual to the nominal noise of each landmark's rays. If they are few, it is nearly the ratio of
-        the class."""
+        """Ratio (N,) of the actual to the nominal noise of each landmark's rays. With few rays, it is near the ratio of the
+        class."""
         middle = np.nan_to_num(grouped_median(self.deviation, self.owner, self.count)) / RAYLEIGH_MEDIAN
         own, number = np.minimum(middle, NOISE_FACTORS[1]), self.ray_count
         pooled = number * own + POOLED_WITH_CLASS * self.class_noise[self.label]

@@ -1,4 +1,4 @@
-"""Decide whether two landmarks are one object, by which explanation of their rays, common frames and misses is cheaper."""
+"""Decide whether two landmarks are one object: compare the cost of both explanations of their rays, frames and misses."""
 
 from dataclasses import dataclass
 
@@ -15,23 +15,23 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
 _OBJECT_COST = 10.0
-"""The cost of one more object in squared deviations. BIC's cost is added: ln of the number of rays for each coordinate."""
+"""The cost of one more object in squared deviations. BIC's cost is added: for each coordinate, ln of the number of rays."""
 _SHARED_SPACE = (0.35, 0.5)
-"""Two objects fill one space within a distance of the first share of the smaller size, or the second of the larger size."""
+"""Two objects fill one space within this share of the smaller size, or within the second share of the larger size."""
 _MOST_APART = 0.1
-"""The largest share of frames in which one object may look like two. The frames are those of the rarer landmark, or those
-that should show both landmarks."""
-_MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is taken to be at least this.
+"""The largest share of frames in which one object may look like two. The frames show the rarer landmark, or should show both
+landmarks."""
+_MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is assumed to be at least this.
 _DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
-_REACH_GATES = 2.0  # Landmarks within this many gates are compared, because little parallax gives one object two distances.
+_REACH_GATES = 2.0  # Landmarks within this many gates are compared. With little parallax, one object has two distances.
 
 
 @dataclass(frozen=True)
 class _Pairs:
     """P pairs of landmarks a < b, and the rays of all pairs in one flat list of Q rays. a, b: (P,) the landmarks. ray, pair:
-    (Q,) the indices of each ray and of its pair. For each pair, the rays of a come before the rays of b. So a ray is listed
-    once for each pair of its landmark."""
+    (Q,) the index of each ray, and of its pair. For each pair, the rays of a come before the rays of b. A ray is listed once
+    for each pair of its landmark."""
 
     a: Ints
     b: Ints
@@ -40,7 +40,7 @@ class _Pairs:
 
 
 def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
-    """Return the landmark (N,) into which each one merges: itself, or the one with more rays if a pair is one object.
+    """Return the landmark (N,) into which each one merges: itself, or the landmark with more rays if a pair is one object.
 
     across_labels: compare pairs of different labels instead of pairs with one label.
     """
@@ -73,8 +73,8 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
 
 
 def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
-    """Return the pairs of landmarks a < b (P,) that may be one object. They are near, compared with the noise of
-    their rays or with their sizes, or they lie on one line of sight."""
+    """Return the pairs of landmarks a < b (P,) that may be one object. They are near compared with the noise of their rays
+    or with their sizes, or they lie on one line of sight."""
     from scipy.spatial import cKDTree
 
     count, position = state.count, state.landmarks.position
@@ -89,8 +89,8 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 
 def _on_one_line(state: State, gate: float) -> Ints:
-    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second landmark. The reason is
-    little parallax or a phantom."""
+    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second landmark. This happens with
+    little parallax, or if one of them is a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -110,7 +110,7 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 
 def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
-    """Return by how much one object instead of two lowers -2 ln likelihood (P,), in fit, boxes, misses and object number."""
+    """Return the decrease (P,) of -2 ln likelihood by one object instead of two, from fit, boxes, misses and number."""
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]

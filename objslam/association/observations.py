@@ -17,11 +17,11 @@ MIN_DEPTH = 0.05
 
 @dataclass(frozen=True)
 class Observations:
-    """R boxes as lines in the map, sorted by frame, then by the values of the box. So the input order has no effect. frame:
-    (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in map. sigma: (R,)
-    rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if unknown.
-    range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px. track: (R,)
-    id of the track, -1 if unknown."""
+    """R boxes as lines in the map. They are sorted by frame, then by the values of the box, so the input order has no
+    effect. frame: (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in
+    map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if
+    unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px.
+    track: (R,) id of the track, -1 if unknown."""
 
     frame: Ints
     label: Ints
@@ -82,7 +82,8 @@ def observe(
 ) -> tuple[Observations, Ints, Ints]:
     """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
-    Frames are sorted by time and camera, boxes in a frame by label and coordinates. So the input order has no effect.
+    Frames are sorted by time and camera. Boxes in a frame are sorted by label and coordinates. So the input order has no
+    effect.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]
@@ -103,7 +104,7 @@ def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]
     focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
     pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
     depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
-    # A box that is read in another order than it was written may have a negative side.
+    # If a box is read in another order than it was written, a side may be negative.
     return np.asarray(np.maximum(rays.box[:, 2:] - rays.box[:, :2], 0.0) / focal * depth[:, None])
 
 
@@ -117,8 +118,8 @@ def extents(
 ) -> Floats:
     """Return the width and height (N, 2) m of each object at its position (N, 3) m, as medians over its rays.
 
-    They are NaN if an object has no ray or no position, or if at least half of its rays are from cameras that observe no
-    sizes. map_T_camera: (K, 4, 4) of the keyframes.
+    The size is NaN for an object without a ray or a position, and if at least half of its rays are from cameras that observe
+    no sizes. map_T_camera: (K, 4, 4) of the keyframes.
     """
     held = np.flatnonzero(association.object >= 0)
     index = association.object[held]

@@ -1,7 +1,7 @@
 """Place recognition: find one constellation of landmarks in another by the landmarks' relative positions.
 
-Several landmarks that fit under one shift and turn within the drift are evidence for the place. The evidence is the Bayes
-factor of "the landmarks here are those there" over "all landmarks here are new".
+If several landmarks fit under one shift and turn within the drift, this is evidence for the place. The evidence is the Bayes
+factor of "the landmarks here are the landmarks there" over "all landmarks here are new".
 """
 
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ MIN_LANDMARKS = 2
 """The fewest common landmarks for recognising a place."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
-_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood, constant (m) and per distance from the robot (m/m).
+_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the robot.
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
-_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Any two pairs form a hypothesis.
+_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Each two of these pairs form a hypothesis.
 _HYPOTHESES = 2000  # The most hypotheses from two pairs, with the longest bases. A larger number costs time.
 _VERIFIED = 20  # The hypotheses with the best quick scores that get a best assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
@@ -39,7 +39,7 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Make a constellation of all these landmarks, with larger covariances.
+    """Make a constellation of landmarks with larger covariances.
 
     The added standard deviation grows with the horizontal distance from the pivot (2,) m, because a neighbourhood may be
     deformed.
@@ -59,7 +59,7 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: how much the evidence exceeds that of the best other place.
+    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the best other place.
     """
 
     correction: Floats
@@ -118,9 +118,9 @@ class _Problem:
     """The matching problem of `recognise_place`, with N landmarks `here` and M landmarks `there`.
 
     offset: (N, 3) m, the landmarks `here` relative to the pivot. target: (M, 3) m, the landmarks `there` relative to the
-    pivot. Each pair has a landmark of both. information: (N, M, 3, 3) m^-2, the inverse covariance of the position
-    difference of a pair. spread: (N, M) m, the horizontal standard deviation of this difference. peak: (N, M) the gain of a
-    pair without a difference. weight: (3, 3) inverse of the prior. prior, possible: as in `recognise_place`.
+    pivot. A pair is a landmark here and a landmark there. information: (N, M, 3, 3) m^-2, the inverse covariance of the
+    position difference of a pair. spread: (N, M) m, the horizontal standard deviation of this difference. peak: (N, M) the
+    gain of a pair without a difference. weight: (3, 3) inverse of the prior. prior, possible: as in `recognise_place`.
     """
 
     offset: Floats
@@ -146,8 +146,8 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift. If there are too many pairs, those
-    remain whose landmark here has the fewest partners. They are the most distinctive."""
+    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift. If there are too many, the most
+    distinctive pairs remain: the landmark here has the fewest partners."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -159,7 +159,7 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2) of two candidates each: every candidate with itself, and every two that fit each other."""
+    """Return hypotheses (H, 2, 2) of two candidates each: every candidate paired with itself, and every two that fit."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])

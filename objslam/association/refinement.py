@@ -7,13 +7,13 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HALF_RAY, grouped_quantiles
 
 RANGE_GAIN = 6.0
-"""The amount by which a perfect range reduces the cost of a match, because another object would rarely have this range."""
+"""A perfect range lowers the cost of a match by this. Another object would rarely have this range."""
 RANGE_LOSS = 4.0
-"""The most that a wrong range adds to the cost of a match, because about one correct box in ten has a wrong range."""
+"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range."""
 BEHIND = 1e6
 """The finite number of standard deviations that stands for a point behind the camera."""
-_HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. A larger one lets wrong ranges pull harder.
-_DAMPING = 1e-6  # The share of the information added in all directions, so that unobserved directions stay unchanged.
+_HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
+_DAMPING = 1e-6  # The share of the information added in all directions. Unobserved directions then stay unchanged.
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 
 
@@ -90,7 +90,7 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
         total = grouped_sums(each.reshape(-1, 9), index, count).reshape(-1, 3, 3)
         total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
         step = np.linalg.solve(total, grouped_sums(pull, index, count)[:, :, None])[:, :, 0]
-        # Little parallax makes full steps unreliable, so no step is longer than the mean distance of the point.
+        # With little parallax, full steps are unreliable. So no step is longer than the mean distance of the point.
         length, reach = np.linalg.norm(step, axis=1), np.bincount(index, distance, count) / number
         position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     return position
@@ -150,7 +150,7 @@ def velocity_gain(
 def _across(to: Floats) -> tuple[Floats, Floats]:
     """Return the lengths (P,) m of offsets (P, 3) m from cameras, and projections (P, 3, 3) perpendicular to them.
 
-    Angles do not change along the line of sight. So a point that moves along with the camera explains nothing.
+    Residuals are angles, which do not change along the line of sight. So a point gains nothing by moving with its camera.
     """
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
     toward = to / distance[:, None]

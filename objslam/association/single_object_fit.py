@@ -1,6 +1,6 @@
 """Triangulate one object of a live session by RANSAC, as `triangulation` does for all objects of a log.
 
-Both use a consensus of ray pairs. This module uses numpy, because a call of torch takes too long for a frame.
+Both find a consensus by pairs of rays. This module uses numpy, because a call of torch takes too long for a frame.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ class PointFit:
 
 
 def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -> PointFit | None:
-    """Fit the point on which most rays agree. None if no two agree. slack: m, standard deviation added to the origins."""
+    """Fit the point on which most rays agree. None if no two rays agree. slack: m, standard deviation added to the
+    origins."""
     start = _consensus(obs, rng, slack)
     if start is None:
         return None

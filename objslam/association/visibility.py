@@ -12,18 +12,18 @@ from objslam.core.camera import Camera, depths, in_view
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
-_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances; outside them a miss tells nothing.
-_CORE_SHARE = 0.8  # The share of a class's boxes, of its strongest objects, that sets its distances. Others may be phantoms.
-_FRONT_SHARE = 0.95  # The least share of an object's boxes from one half space for the object to have a front.
-_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it, in m and as a share of its distance.
+_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
+_CORE_SHARE = 0.8  # The strongest objects, with this share of a class's boxes, set its distances. Others may be phantoms.
+_FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
+_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it: in m, and as a share of its distance.
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
 
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera: (F, 4,
-    4). A usable box is at least `margin` px and the share `margin_share` of its size away from the image edge. A negative
-    margin allows any box."""
+    """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
+    (F, 4, 4). The distance of a usable box from the image edge is at least `margin` px, and at least `margin_share` of its
+    size. A negative margin allows any box."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -68,9 +68,9 @@ def detection_history(
 ) -> DetectionHistory:
     """Return where the objects are or should be detected.
 
-    An object should be detected if its box lies in the image, at a usual distance of its class or of itself, is not occluded
-    by a closer box, and shows the object's front if it has one. matched: (R,) the object of each observation, -1 for none.
-    position, label: (N, 3) m and (N,), of the objects.
+    An object should be detected under four conditions. Its box lies in the image. Its distance is usual for its class or for
+    itself. No closer box hides it. The camera sees its front, if it has one. matched: (R,) the object of each observation,
+    -1 for none. position, label: (N, 3) m and (N,), of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
@@ -97,6 +97,29 @@ def detection_history(
     there = index * total + obs.frame[held]
     key = np.union1d(obj[clear] * total + frame[clear], there)
     return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
+
+
+def count_looks(
+    position: Floats, extent: Floats, seen_from: Floats, view: CameraFrames, obs: Observations, distance: Floats
+) -> Ints:
+    """Return in how many frames (N,) each object of a map should be detected if it is where the map says.
+
+    Its box lies in the image, its distance is one from which it was detected before, and no closer box covers it.
+    extent: (N, 2) m, NaN where unknown. seen_from: (N, 2) m, the least and the greatest distance. obs: the boxes of the
+    frames. distance: (R,) m, how far their objects are, NaN where unknown.
+    """
+    found = np.zeros(len(position), dtype=np.int64)
+    for number, camera in enumerate(view.cameras):
+        frames = np.flatnonzero(view.camera == number)
+        step = max(1, _PAIRS_AT_ONCE // max(len(position), 1))
+        for begin in range(0, len(frames), step):
+            some = frames[begin : begin + step]
+            obj, frame, away, pixel = _in_image(position, np.nan_to_num(extent), seen_from[:, 1], camera, some, view)
+            usual = away >= seen_from[obj, 0]
+            obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
+            clear = ~_hidden(frame, away, pixel, obs, distance)
+            found += np.bincount(obj[clear], minlength=len(position))
+    return found
 
 
 def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:

@@ -15,12 +15,14 @@ from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
 from objslam.cli.info import info
-from objslam.cli.live import live
+from objslam.cli.journal import journal_app
+from objslam.cli.live_command.command import live
+from objslam.cli.merge import diff_results, merge_results
 from objslam.cli.register import register_results
 from objslam.cli.report import report_result
 from objslam.cli.run import run
 from objslam.cli.view import view
-from objslam.errors import ObjslamError, one_line
+from objslam.errors import ObjslamError, is_out_of_memory, one_line
 
 app = typer.Typer(
     name="objslam",
@@ -35,6 +37,8 @@ app.command()(calibrate)
 app.command(name="eval")(evaluate_result)
 app.command(name="report")(report_result)
 app.command(name="register")(register_results)
+app.command(name="merge")(merge_results)
+app.command(name="diff")(diff_results)
 app.command()(view)
 app.command()(demo)
 app.command()(convert)
@@ -45,6 +49,7 @@ app.command()(export)
 config_app = typer.Typer(no_args_is_help=True, help="Print the settings.")
 config_app.command("dump")(config_dump)
 app.add_typer(config_app, name="config")
+app.add_typer(journal_app, name="journal")
 
 
 def _version(asked: bool) -> None:
@@ -79,12 +84,15 @@ def main() -> NoReturn:
     except KeyboardInterrupt:
         say("objslam: interrupted", stderr=True)
         sys.exit(130)
-    except MemoryError:
-        say("objslam: out of memory", stderr=True)
-        sys.exit(1)
     except Exception as error:  # Hides the traceback of an internal error from the user.
         if debug:
             raise
+        if is_out_of_memory(error):
+            say("objslam: out of memory", stderr=True)
+            sys.exit(1)
+        if isinstance(error, OSError) and error.filename is not None:  # Such as a folder that may not be entered.
+            say(f"objslam: {one_line(error.filename)}: {error.strerror}", stderr=True)
+            sys.exit(1)
         said = f"{type(error).__name__}: {one_line(error)}"
         say(f"objslam: internal error, {said} (please report it with the traceback from objslam --debug)", stderr=True)
         sys.exit(1)

@@ -46,6 +46,15 @@ Mode = Annotated[
         "localisation, else joint.",
     ),
 ]
+PriorMapPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="MAP",
+        help="The map of another day: an objects.json, or a result folder. If the drive is found in it, the result is in "
+        "its frame.",
+    ),
+]
 Align = Annotated[
     Literal["auto", "none", "se2", "sim2", "se3", "sim3"],
     typer.Option(

@@ -17,7 +17,7 @@ def register_results(
     """Find the transform from map A to map B by the relative positions of their objects. Exit code 1: it is not certain."""
     import numpy as np
 
-    from objslam.api.registration import register
+    from objslam.association.registration.object_maps import reason, register
     from objslam.results.object_map import ObjectMap
 
     one, other = ObjectMap.load(a), ObjectMap.load(b)
@@ -30,8 +30,7 @@ def register_results(
         say("sigma: x {:.3f} y {:.3f} z {:.3f} m, yaw {:.2f} deg".format(*sigma))
     for i, k in found.matches.tolist():
         say(f"  {one[i].label} #{one[i].id} is #{other[k].id}")
-    say(
-        f"{len(found.matches)} matches, log odds against chance {found.log_odds:.1f}, lead {found.lead:.1f}: {found.verdict}"
-    )
+    why = reason(found, one, other, (str(a), str(b)))
+    say(f"registered: {why}" if found.accepted else f"not registered: {why}")
     if not found.accepted:
         raise typer.Exit(1)

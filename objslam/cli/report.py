@@ -13,9 +13,9 @@ def report_result(
     log: Annotated[
         Path | None, typer.Option("--log", help="The log with the images. Default: the log that the run read.")
     ] = None,
-    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Number of image crops shown for each object.")] = 4,
+    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of the best boxes of each object.")] = 4,
 ) -> None:
-    """Write report.html with the map, objects, residuals, evaluation and settings of a result. The page works offline."""
+    """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline."""
     from objslam.output.report import write_report
 
     with progress_bar() as show:

@@ -16,6 +16,7 @@ from objslam.cli.options import (
     Json,
     Mode,
     Out,
+    PriorMapPath,
     Quiet,
     Set,
     settings_of,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
     from objslam.core.types import Log
+    from objslam.mapping.localization import PriorMap
 
 _COLUMNS: Final[dict[str, Callable[[MapObject], str]]] = {
     "id": lambda o: str(o.id),
@@ -53,6 +55,8 @@ _SPARE = (
     "sigma m",
     "status",
 )  # Columns that a narrow terminal leaves out, in this order.
+NOT_LOCALISED = 3
+"""The exit code of a run that wrote its result, but was not found in the map that --map names."""
 _WIDE = 10_000  # The width at which a table is measured, columns. It is larger than any table.
 
 
@@ -67,10 +71,15 @@ def run(
     options: SourceOptions,
     detector: DetectorModel = None,
     calibration: CalibrationFile = None,
+    map_: PriorMapPath = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Map the objects of a log and write a result folder."""
+    """Map the objects of a log and write a result folder.
+
+    With --map, the exit code is 3 if the drive is not found in that map.
+    """
+    from objslam.api.mapping import prior_map
     from objslam.core.diagnostics import Ledger
     from objslam.output.result_folder import output_folder
 
@@ -78,7 +87,10 @@ def run(
     ledger = Ledger()
     with output_folder(out):
         tell = _say_nothing if quiet else _say_json if json else say_result
-        run_log(read(log, ledger, options), settings, ledger, out, detector, tell)
+        known = None if map_ is None else prior_map(map_)
+        result = run_log(read(log, ledger, options), settings, ledger, out, detector, tell, known)
+    if known is not None and not result.summary["localisation"]["localised"]:
+        raise typer.Exit(NOT_LOCALISED)
 
 
 def run_log(
@@ -88,10 +100,11 @@ def run_log(
     out: Path,
     detector: Path | None = None,
     tell: Callable[[RunResult, str, Path, tuple[str, ...]], None] | None = None,
-) -> None:
+    known: PriorMap | None = None,
+) -> RunResult:
     """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log.
 
-    tell: prints the summary; `say_result` by default.
+    tell: prints the summary; `say_result` by default. known: the map of another day in which the drive is to be found.
     """
     import time
 
@@ -99,7 +112,7 @@ def run_log(
     from objslam.output.result_folder import write_result
 
     with progress_bar() as show:
-        result, log = map_log(log, settings, ledger, detector, show)
+        result, log = map_log(log, settings, ledger, detector, show, known)
         show("writing", 0, 0)
         begin = time.perf_counter()
         removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
@@ -107,6 +120,7 @@ def run_log(
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
     (tell or say_result)(result, f", {result.settings.mode} mode; {times}", out, removed)
+    return result
 
 
 def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
@@ -138,6 +152,8 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
         f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}"
     )
+    if told := result.summary.get("localisation"):
+        say(told["line"])
     judged = result.summary["assessment"]
     say(" ".join([f"verdict: {judged['level']}.", *judged["reasons"]]))
     if removed:
@@ -173,10 +189,11 @@ def calibration_table(calibration: dict[str, Any]) -> Table:
     table = Table(
         title="errors that all measurements share", caption=f"this log cannot tell apart: {pairs}" if pairs else None
     )
-    for name in ("error", "found", "sigma", "prior sigma", "unit", ""):
-        table.add_column(name, justify="left" if name in ("error", "unit", "") else "right")
+    for name in ("error", "found", "sigma", "prior sigma", "unit", "told by"):
+        words = name in ("error", "unit", "told by")
+        table.add_column(name, justify="left" if words else "right", no_wrap=True)
     for name, of in calibration["parameters"].items():
         numbers = (f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))
-        remark = "" if of["observable"] else "not observable from this log"
-        table.add_row(name, *numbers, of["unit"], remark, style="" if of["observable"] else "dim")
+        source = "the log" if of["observable"] else "the prior"
+        table.add_row(name, *numbers, of["unit"], source, style="" if of["observable"] else "dim")
     return table

@@ -10,9 +10,9 @@ class CalibrationSettings(Section):
     or at the value of `file`."""
 
     use: Literal["auto"] | bool = "auto"
-    """auto: estimate the errors in joint mode if the log has odometry, and in fixed mode those of the cameras against the
+    """auto: estimate all errors in joint mode if the log has odometry, and the errors of cameras in fixed mode if it has a
     localisation. A camera whose base_T_camera is the identity then has no rotation to estimate, because its poses are the
-    camera's own. true estimates in any case, false never."""
+    camera's own. true: always estimate. false: never estimate."""
     file: str | None = None
     """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it. An error in it that is
     not estimated has the value of the file."""

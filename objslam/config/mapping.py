@@ -65,9 +65,9 @@ class Odometry(Section):
     yaw_per_rad: NotNegative = 0.05
     """Standard deviation of the heading in rad after 1 rad of turning."""
     floor_xy: Positive = 1e-3
-    """Standard deviation of the position in m that each keyframe step has even if the robot is at rest."""
+    """Standard deviation of the position in m that each keyframe step has even if the robot stands still."""
     floor_yaw: Positive = 1e-3
-    """Standard deviation of the heading in rad that each keyframe step has even if the robot is at rest."""
+    """Standard deviation of the heading in rad that each keyframe step has even if the robot stands still."""
 
 
 class Planar(Section):
@@ -161,7 +161,7 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames at rest are keyframes too."""
+    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames without motion are keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
     """Camera rotation in degrees from the last keyframe to a new keyframe. A frame also becomes a keyframe if it shows a
     label that no keyframe at the current place shows."""
@@ -185,6 +185,11 @@ class Live(Section):
     larger value drops true objects too."""
     ghost_frames: Count = 40
     """Number of frames that should show an object before it can be dropped. A larger value keeps false objects longer."""
+    journal_segment_mb: Annotated[float, Field(ge=0.001)] = 64.0
+    """Size in MB at which a segment of the journal is closed and compressed, and the next one begins."""
+    journal_free_mb: NotNegative = 200.0
+    """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
+    of less than 50 times this size, it is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200

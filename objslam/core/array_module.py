@@ -1,4 +1,4 @@
-"""One code for numpy arrays and torch tensors: what differs between the two, and which of them works.
+"""The same code for numpy arrays and torch tensors: functions for their differences, and the choice between the two.
 
 Code for both calls functions of `module_of(array)`, which is numpy or torch. Both take `axis=` and positional arguments.
 This module imports torch only to make tensors of it.

@@ -35,7 +35,7 @@ def kind(name: str) -> str:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The estimate of the shared errors: measurements with these values taken out agree best.
+    """The estimate of the shared errors. Measurements that are corrected by these values agree best.
 
     names: P names, as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P).
     prior: (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None for 0.
@@ -126,7 +126,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
 
 
 class CalibratedMeasurements(Protocol):
-    """The measurements of a log, as a function of the shared errors that are taken out of them."""
+    """The measurements of a log, corrected by shared errors, as a function of these errors."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -178,14 +178,14 @@ class CalibratedMeasurements(Protocol):
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
         """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
-        turning, and not at all.
+        turning, and without odometry noise.
 
-        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the errors
-        taken out.
+        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the corrected
+        errors.
         """
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
-        """Return the measurements with the errors (P,) taken out, and the settings of their noise.
+        """Return the measurements corrected by the errors (P,), and the settings of their noise.
 
         drift: whether the keyframes' drift is needed; without it the call is quicker and `Keyframes.drift` is not current.
         """

@@ -27,7 +27,7 @@ _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """The noise of the depths of one sensor. Its fields mean what they mean in the settings `depth`.
+    """The noise of the depths of one sensor. Its fields have the meaning of the settings `depth`.
 
     sigma: m, the constant part. sigma_per_m: the part that grows with the distance, m per m. bias: m, the part that all
     ranges of one object share.
@@ -44,7 +44,7 @@ class Camera:
 
     matrix: (3, 3) px. distortion: (D,) coefficients. base_T_camera: (4, 4) the pose of the optical frame in base.
     depth_scale: the units of a depth image per metre. sees_size: whether the boxes show how large the objects are. A box
-    that only marks a bearing does not. depth_noise: the noise of its depths, None if only the settings tell it.
+    that only marks a bearing does not. depth_noise: the noise of its depths, None if only the settings give it.
     """
 
     name: str

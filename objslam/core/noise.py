@@ -29,7 +29,7 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the noise of the odometry multiplied. `rays_with_noise` has that of rays and ranges."""
+        """Return the settings with the noise of the odometry multiplied. `rays_with_noise` does this for rays and ranges."""
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -43,7 +43,7 @@ class NoiseFactors:
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with their noise, and that of their ranges, multiplied."""
+        """Return rays with the noise of their directions and of their ranges multiplied."""
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,
@@ -52,7 +52,7 @@ class NoiseFactors:
         )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
-        """Return whether all factors agree with those of another within a relative tolerance."""
+        """Return whether all factors agree with the factors of `other` within a relative tolerance."""
         mine, its = (np.array(list(one.to_dict(None).values())) for one in (self, other))
         return bool((np.abs(np.log(np.maximum(mine[:-1], 1e-9) / np.maximum(its[:-1], 1e-9))) < tolerance).all())
 
@@ -68,8 +68,8 @@ NOMINAL = NoiseFactors()
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
     """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
 
-    camera: (n,) the index of each range's camera. A camera that tells the noise of its depths has that one. The others have
-    the noise of the settings.
+    camera: (n,) the index of each range's camera. If a camera has its own noise of depths, its ranges have this noise. The
+    others have the noise of the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]

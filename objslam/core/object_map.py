@@ -13,10 +13,13 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
+Fate = Literal["new", "confirmed", "moved", "gone"]
+FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
+"""What may become of an object from one session to the next."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
 _SHOWN = 20  # The most objects in the text of a map. A larger number makes it longer.
-_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # The rows and columns of the covariance in a row.
+_UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Entries of the covariance in a table row.
 
 COLUMNS: dict[str, str] = {
     **{"id": "int64", "label": "string", "status": "string"},
@@ -28,13 +31,34 @@ COLUMNS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
+class Life:
+    """What several sessions say of one object.
+
+    state: `new` since the last session, `confirmed` by more than one, `moved` since the last session, or `gone`.
+    probability: that the object is still at its position. sessions_expected, sessions_seen: in how many sessions it was in
+    view, and in how many it was found. looks, detections: in how many frames of them it was in view, and in how many it was
+    detected. updated: the time of the last session, s. moved_from: (3,) m, where it was before it moved, None if it did not.
+    """
+
+    state: Fate
+    probability: float
+    sessions_expected: int
+    sessions_seen: int
+    looks: int
+    detections: int
+    updated: float
+    moved_from: Floats | None = None
+
+
+@dataclass(frozen=True)
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
     the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
     rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
-    existence are None if the run took all boxes of a label as one object.
+    existence are None if the run took all boxes of a label as one object. seen_from: the least and the greatest distance (m)
+    from which it was detected, None if unknown. life: what several sessions say of it, None if there was one.
     """
 
     id: int
@@ -52,6 +76,8 @@ class MapObject:
     ray: tuple[Floats, Floats] | None = None
     labels: dict[str, float] | None = None
     existence: float | None = None
+    seen_from: tuple[float, float] | None = None
+    life: Life | None = None
 
     @property
     def sigma(self) -> float | None:
@@ -87,11 +113,12 @@ class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
     A map is a sequence of its objects. Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to
-    ignore heights.
+    ignore heights. gone: objects of earlier sessions that are no longer there.
     """
 
     objects: tuple[MapObject, ...]
     frame: str = "map"
+    gone: tuple[MapObject, ...] = ()
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -122,7 +149,7 @@ class ObjectMap:
 
     @property
     def positions(self) -> Floats:
-        """(N, 3) m, the positions of all objects. That of an unresolved object is a guess on its ray, or NaN."""
+        """(N, 3) m, the positions of all objects. The position of an unresolved object is a guess on its ray, or NaN."""
         return np.array([o.position for o in self.objects], dtype=np.float64).reshape(-1, 3)
 
     @property

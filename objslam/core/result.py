@@ -23,7 +23,8 @@ class RunResult:
     at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image files of each
     camera. surface: the surroundings, None without depth images. surface_before: the same at the poses before the
     estimation, if the settings ask for it. calibration: the shared errors that were estimated, None if none were.
-    residual_before: (R,) as residual, for the rays with the shared errors left in them. None if none were estimated.
+    residual_before: (R,) rad, the residual of the rays as measured, with the shared errors. None if none were estimated.
+    views: all camera frames on the path, also those without a box, at the solved poses. None if nobody asked for them.
     """
 
     map: ObjectMap
@@ -46,3 +47,4 @@ class RunResult:
     surface_before: Surface | None = None
     calibration: Calibration | None = None
     residual_before: Floats | None = None
+    views: Keyframes | None = None

@@ -40,7 +40,9 @@ class Snapshot:
     rebuilt. lag: the time, s, from the arrival of the newest message until the map contains it. update: the median and the
     99th percentile of the time, s, from the push of a message to the updated map. counters: how many messages of each kind
     were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
-    image. calibration: the shared errors that the session takes out of its measurements, None if it takes out none.
+    image. calibration: the shared errors that the session corrects in its measurements, None if it corrects none.
+    map_T_odom: (4, 4) the pose of the odometry's frame in the map at the newest keyframe (REP 105), for the odometry as
+    received. None if the odometry does not cover this keyframe.
     """
 
     stamp: float
@@ -54,3 +56,4 @@ class Snapshot:
     dropped: dict[str, int] = field(default_factory=dict)
     frames: tuple[CameraFrame, ...] = ()
     calibration: Calibration | None = None
+    map_T_odom: Floats | None = None

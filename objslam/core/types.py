@@ -7,7 +7,7 @@ forward). `a_T_b` is the pose of b in a. It turns coordinates in b into coordina
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from objslam.core.diagnostics import Ledger
 
 MAX_BOXES = 10_000
 """The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""An axis of a map's frame, with its direction, that points up in the world."""
 
 
 def _need(condition: Any, message: str) -> None:
@@ -54,7 +56,7 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if the edge of the image cuts no box off.
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge.
     Then box centres are valid up to the edge. This holds for fiducials, because a detector needs all their corners.
     ValueError if a shape, an index or the order is wrong.
     """
@@ -142,7 +144,7 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
-    reading: what was dropped while the log was read, None if nobody kept account of it.
+    reading: the data dropped while the log was read, None if they were not counted.
     """
 
     name: str
@@ -163,7 +165,7 @@ class Log:
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. If different clock offsets of several cameras were taken out, this holds for each camera
+    stamps: (K,) s, non-decreasing. If different clock offsets of several cameras were corrected, this holds for each camera
     alone. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
     base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
     localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the

@@ -47,7 +47,7 @@ def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
 
 
 def valid_positions(positions: Floats) -> Bools:
-    """Return which positions (..., 3), m, are finite and below `MAX_POSITION` in each coordinate."""
+    """Return which positions (..., 2) or (..., 3), m, are finite and below `MAX_POSITION` in each coordinate."""
     return np.asarray((np.abs(positions) < MAX_POSITION).all(axis=-1))
 
 

@@ -3,6 +3,7 @@ matches."""
 
 import ast
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from objslam import config
 from objslam.core.coco import COCO_NAMES
 from objslam.errors import ConfigError, DetectorError
 
-_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # Those of COCO's 91 class numbers that have no class.
+_GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers among COCO's 91 that have no class.
 _BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
 _MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
 
@@ -67,7 +68,9 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
     if not text:
         return None
     try:
-        data = ast.literal_eval(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python warns of some texts that it cannot parse either.
+            data = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         try:
             data = json.loads(text)
@@ -92,14 +95,17 @@ def _as_names(data: Any) -> tuple[str, ...] | None:
     if isinstance(data, dict):
         try:
             numbered = {int(number): name for number, name in data.items()}
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             return None
         if not numbered or min(numbered) < 0 or max(numbered) >= _MOST:
             return None
         data = [numbered.get(number, f"class_{number}") for number in range(max(numbered) + 1)]
     if not isinstance(data, list | tuple) or not data or not all(isinstance(name, str | int) for name in data):
         return None
-    return tuple(str(name).strip() for name in data)
+    try:
+        return tuple(str(name).strip() for name in data)
+    except ValueError:  # A number of more than 4300 digits.
+        return None
 
 
 def _checked(names: tuple[str, ...], where: str) -> tuple[str, ...]:

@@ -1,5 +1,5 @@
-"""Inference of a model's recipe. The settings override the model's own description, which overrides what is usual for the
-layout."""
+"""Inference of a model's recipe. The settings override the model's own description. This description overrides the usual
+recipe of the layout."""
 
 import json
 import re

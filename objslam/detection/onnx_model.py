@@ -101,14 +101,17 @@ def open_network(path: Path, settings: config.Detector) -> Network:
         raise DetectorError(message, where=str(path)) from error
     if settings.device == "cuda" and _CUDA not in session.get_providers():
         raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="check its CUDA libraries")
-    inputs, outputs = ([_tensor(node) for node in nodes] for nodes in (session.get_inputs(), session.get_outputs()))
+    try:
+        inputs, outputs = ([_tensor(node) for node in nodes] for nodes in (session.get_inputs(), session.get_outputs()))
+        metadata = session.get_modelmeta().custom_metadata_map
+    except UnicodeDecodeError as error:
+        raise DetectorError("a name or the metadata of the model is not UTF-8", where=str(path)) from error
     images = [image for image in map(_as_image, inputs) if image is not None]
     extras = tuple(t for t in inputs if _FED.get(t.name) == len(t.shape) and t.kind in _KINDS)
     if len(images) != 1 or len(extras) + 1 != len(inputs):
         saw = "; ".join(map(str, inputs)) or "none"
         hint = f"export the model with one image input of 3 channels, and at most {_MASK} and {_SIZES} besides"
         raise DetectorError(f"the model has inputs that an image does not feed: {saw}", where=str(path), hint=hint)
-    metadata = session.get_modelmeta().custom_metadata_map
     return Network(path, session, digest, metadata, images[0], extras, tuple(outputs))
 
 

@@ -42,8 +42,8 @@ HABITS: dict[Layout, Habits] = {
 
 @dataclass(frozen=True)
 class InputSize:
-    """The size of the network input, px. For a free side, it is the largest length. The input then shrinks along this side
-    to the resized image, rounded up to a multiple of `stride`."""
+    """The size of the network input, px. For a free side, this is the largest length. The actual side is as long as the
+    resized image, rounded up to a multiple of `stride`."""
 
     width: int
     height: int

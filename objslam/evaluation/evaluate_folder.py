@@ -26,6 +26,10 @@ def choose_alignment(out: Path) -> tuple[Alignment, str]:
     summary = load_summary(out)
     if summary.get("map_frame") == "localization":
         return "none", "a localisation fixed the frame of the map"
+    if summary.get("map_frame") == "map":
+        return "none", "the drive was found in an older map, whose frame it has"
+    if summary.get("map_frame") == "site":
+        return "se2", "the map has the frame of its first session"
     if summary.get("map_frame") == "odometry":
         planar = summary.get("planar") is not False
         return ("se2", "the map has the frame of the odometry") if planar else ("se3", _IN_SPACE)
@@ -41,7 +45,8 @@ def evaluate_folder(
     be read, ConfigError if the radius is not positive.
     """
     check_radius(radius)
-    map_, path, known = load_map(out), load_trajectory(out), load_truth(truth or out)
+    map_, known = load_map(out), load_truth(truth or out)
+    path = None if load_summary(out).get("map_frame") == "site" else load_trajectory(out)  # A site has no path.
     if known is None:
         if truth is None:
             raise LogError("the log of this result has no ground truth", where=str(out), hint="give --truth FILE")

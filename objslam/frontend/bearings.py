@@ -20,8 +20,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
-    rays.border is negative or the detections are `whole`. In each frame, at most `MAX_OF_LABEL` boxes of one label are used,
-    those with the highest scores.
+    rays.border is negative or the detections are `whole`. In each frame, at most `MAX_OF_LABEL` boxes of one label are used.
+    The boxes with the highest scores are taken.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}

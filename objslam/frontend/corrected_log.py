@@ -1,4 +1,4 @@
-"""Take known shared errors out of a log, or out of one part of it: odometry, cameras, directions, or stamps of frames."""
+"""Correct known shared errors in a log, or in one part of it: odometry, cameras, directions, or stamps of frames."""
 
 import math
 from collections.abc import Mapping
@@ -16,13 +16,13 @@ ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 AXES = ("roll", "tilt", "yaw")
 """The rotations of a camera on the base, about x, y and z."""
 _SQUEEZED = 1e-3
-"""The time (s) at each end of the path that holds the frames which a clock offset moves beyond that end. A larger value
+"""A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
 us."""
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
-    """Return the log with errors taken out of odometry, cameras, and stamps and depths of frames.
+    """Return the log corrected by known errors: odometry, cameras, and stamps and depths of frames.
 
     error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it (see
     `later`). Otherwise a clock offset may move them beyond its ends.
@@ -40,7 +40,7 @@ def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Traj
 
 
 class CorrectablePath:
-    """Odometry that is corrected for many values of its errors. What no error changes is computed once."""
+    """Odometry that is corrected for many values of its errors. The parts that no error changes are computed once."""
 
     def __init__(self, odometry: Trajectory) -> None:
         """Measure the steps of the odometry."""
@@ -52,13 +52,13 @@ class CorrectablePath:
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
 
     def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Return the poses (n, 4, 4) with some of these numbers, or all, as `corrected_odometry` does."""
+        """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as by `corrected_odometry`."""
         scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
         poses = self.odometry.poses if which is None else self.odometry.poses[which]
         if scale == turn_scale == turn_bias == 0:
             return poses
         more = turn_scale * self._turned + turn_bias * self._seconds
-        middle = (more[1:] + more[:-1]) / 2  # a scaled arc begins and ends at other headings, its chord lies between them
+        middle = (more[1:] + more[:-1]) / 2  # A chord has the mean of the two headings of its arc.
         cos, sin = np.cos(middle), np.sin(middle)
         x, y, z = self._ways
         places = np.empty((3, len(more)))
@@ -106,7 +106,7 @@ class OdometryCorrection:
         turn = rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2]
         more = float(self._turn_scale * turn + self._turn_bias * (stamp - self._stamp))
         way = (1 + self._scale) * (pose[:3, 3] - self._before[:3, 3])
-        self._place = self._place + _about_z(self._turned + more / 2) @ way  # a chord lies between its two headings
+        self._place = self._place + _about_z(self._turned + more / 2) @ way  # A chord has the mean of its headings.
         self._turned += more
         self._stamp, self._before = stamp, pose
         return make_pose(_about_z(self._turned) @ pose[:3, :3], self._place)
@@ -120,7 +120,7 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 
 def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
-    """Return unit directions (R, 3). Those that `mine` (R,) marks are for a focal length that is longer by the share
+    """Return unit directions (R, 3). Directions in the mask `mine` (R,) are for a longer focal length, by the share
     `focal`."""
     if focal == 0:
         return directions
@@ -150,7 +150,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data with errors taken out. path: the path on which its stamps stay (see `later`), or None."""
+    """Return a camera and its data without errors. path: the path on which its stamps stay (see `later`), or None."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

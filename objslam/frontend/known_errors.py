@@ -1,5 +1,5 @@
-"""The shared errors that a log can have, and those in a calibration file. The latter are taken out if they are not
-estimated."""
+"""The shared errors that a log can have, and the errors in a calibration file. If the errors in the file are not estimated,
+they are corrected."""
 
 from pathlib import Path
 
@@ -24,9 +24,9 @@ def error_names(log: Log) -> tuple[str, ...]:
 
 
 def prior_sigma(name: str, settings: Settings) -> float:
-    """Return the prior standard deviation of an error in the settings, 0 if they hold the error.
+    """Return the prior standard deviation of an error in the settings, 0 if the error is fixed.
 
-    In fixed mode, the errors are estimated from bearings and given poses. So the errors of odometry and of ranges are held.
+    In fixed mode, the errors are estimated from bearings and given poses. So the errors of odometry and of ranges are fixed.
     """
     what = kind(name)
     if settings.mode == "fixed" and (name in ODOMETRY or what == "range_scale"):
@@ -47,10 +47,10 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
 
 
 def possible(log: Log, settings: Settings) -> list[str]:
-    """Return the names of the errors of a log that the settings do not hold.
+    """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    place are no errors, unless settings.calibration.use is true.
+    position have no errors, unless settings.calibration.use is true.
     """
     asked = settings.calibration.use is True
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
@@ -74,10 +74,11 @@ def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Led
 
 
 def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
-    """Return the log without those errors of calibration.file that the run does not estimate.
+    """Return the log corrected by the errors of calibration.file that the run does not estimate.
 
-    These are all errors in the file if the run estimates none, else only those that the settings hold. The ledger warns of
-    errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits nothing in the log.
+    If the run estimates no errors, all errors in the file are corrected. Otherwise, only errors that the settings fix are.
+    The ledger warns of errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits
+    nothing in the log.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:

@@ -7,7 +7,7 @@ Value = TypeVar("Value")
 
 
 class RecentValues(Generic[Value]):
-    """The last values of a function by the numbers that they depend on."""
+    """The last values of a function, by its arguments."""
 
     def __init__(self, most: int) -> None:
         """Keep `most` values. A larger number takes more memory."""

@@ -1,6 +1,6 @@
-"""The measurements of a log with its shared errors taken out: the odometry's scale, clocks, and the cameras' rotations.
+"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations.
 
-The parameters change the measurements, never the kind of factors that a graph makes of them.
+The parameters change the measurements. They do not change the kinds of factors in the graph.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
 noisy and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01
-"""The step of every other parameter, in its unit; the measurements are close to linear over it."""
+"""The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
 """The largest absolute value of a parameter without a bound of its own, in standard deviations of its prior. A larger value
 lets a parameter move farther from its prior."""
@@ -52,11 +52,11 @@ class SharedErrors:
     mean: Floats
     prior: Floats
     noise: NoiseFactors = NOMINAL
-    _path: list[CorrectablePath] = field(default_factory=list, repr=False, compare=False)  # copies share what it holds
+    _path: list[CorrectablePath] = field(default_factory=list, repr=False, compare=False)  # Copies share this list.
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: those that the settings leave open, if there are such measurements."""
+        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements."""
         of, default = self.settings, Settings()
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()
@@ -113,7 +113,7 @@ class SharedErrors:
         return np.where(kinds == "clock", clocks, widest)
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
-        """Return keyframes, rays and settings with the errors (P,) taken out.
+        """Return keyframes, rays and settings corrected by the errors (P,).
 
         The noise of distances and ranges follows their scale. Otherwise a smaller map would fit better. Keyframes stay on
         their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
@@ -144,7 +144,7 @@ class SharedErrors:
         return moved, ranged, settings
 
     def corrected_log(self, values: Floats) -> Log:
-        """Return the log with the errors (P,) taken out of odometry, cameras and the stamps of frames."""
+        """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""
         return take_out(self.log, dict(zip(self.names, values.tolist(), strict=True)), stay=True)
 
     def drift_at_stamps(self, keyframes: Keyframes, values: Floats) -> Keyframes:
@@ -169,10 +169,10 @@ class SharedErrors:
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
         """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
-        turning, and not at all.
+        turning, and without odometry noise.
 
-        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the errors
-        taken out.
+        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the corrected
+        errors.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         path = self._drift(error)
@@ -202,7 +202,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # the stamps of the poses, which end with the path
+        known = stamps.copy()  # The stamps of the poses, which end with the path.
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)
@@ -277,7 +277,7 @@ class _Poses:
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
     """Return the errors that are estimated from a log by the settings, None if there are none.
 
-    keyframes, rays: those that are solved. An error is a parameter if its prior is not 0 and something was measured with it.
+    keyframes, rays: the solved ones. An error is a parameter if its prior is not 0 and it affects some measurement.
     """
     names: tuple[str, ...] = ()
     if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):

@@ -24,9 +24,9 @@ from objslam.graph.multiframes import Multiframes
 class Measurements:
     """The measurements of a log, as P multiframes.
 
-    images: the keyframes before they were joined. keyframes: (P,) the first keyframe of each multiframe, of which the graph
-    has the poses. rays: in the frames of these keyframes. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions by
-    odometry, None without odometry.
+    images: the keyframes before they were joined. keyframes: (P,) the first keyframe of each multiframe. The graph has the
+    poses of these. rays: in the frames of these keyframes. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions
+    by odometry, None without odometry.
     """
 
     multiframes: Multiframes
@@ -39,7 +39,7 @@ class Measurements:
 
     @classmethod
     def of(cls, images: Keyframes, rays: Rays, settings: Settings, multiframes: Multiframes | None = None) -> Self:
-        """Collect the measurements of keyframes and their rays. Without multiframes, each keyframe has a pose of its own."""
+        """Collect the measurements of keyframes and rays. Without multiframes, each keyframe has its own pose."""
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
         moved = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
@@ -65,7 +65,7 @@ class Measurements:
         begin: int = 0,
         end: int | None = None,
     ) -> list[gtsam.NonlinearFactor]:
-        """Return the factors that come into a graph with new keyframes, rays and landmarks.
+        """Return the factors that new keyframes, rays and landmarks add to a graph.
 
         Args:
             owner: (R,) the landmark of each ray, or -1.
@@ -73,7 +73,7 @@ class Measurements:
             landmarks: (m,) the added landmarks.
             positions: (N, 3) m, all landmarks in map.
             loss: the loss of the bearings.
-            begin, end: the added keyframes are `begin` to `end` - 1. If `end` is None, they are all from `begin` on.
+            begin, end: the added keyframes are `begin` to `end` - 1. If `end` is None, all keyframes from `begin` on.
         """
         keyframes, settings = self.keyframes, self.settings
         end = len(keyframes) if end is None else end

@@ -27,10 +27,11 @@ from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
-"""The relative decreases of the cost below which a joint solve ends: the last one, and one before the shared errors and the
-noise are estimated, which moves everything again. Larger values end it sooner."""
+"""A joint solve ends if the cost decreases by less than this share. The first value is for the last solve. The second is for
+the solve before the shared errors and the noise are estimated, because they move everything again. Larger values end it
+sooner."""
 _ROUNDS_BEFORE = 2
-"""The most rounds of solve and test before the shared errors are estimated, which settles the inliers again after each of
+"""The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
 its steps. A larger number is slower, and leads to the same inliers."""
 
 
@@ -107,15 +108,15 @@ def solve_joint(
     If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
     solution counts. Images of one stamp share one pose. SolveError if the linear system is indeterminate, or if the cost is
     not finite.
-    start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors,
-    which are then estimated from theta (P,) on, or from their mean. Their covariance enters the covariance of the objects.
-    hold: whether the shared errors and the noise stay as they are.
+    start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors.
+    These are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance of objects.
+    hold: whether the shared errors and the noise are kept fixed.
     """
 
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, _share_bias(rays, association, settings), settings, multiframes)
+        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes)
 
     if errors is None:
         measured = measure(keyframes, rays, settings)
@@ -151,7 +152,7 @@ def solve_joint(
     if errors is not None and theta is not None and hold:
         calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     elif errors is not None and theta is not None:
-        from objslam.graph.calibration.self_calibration import calibrate  # scipy.sparse, which no other solve needs
+        from objslam.graph.calibration.self_calibration import calibrate  # It imports scipy.sparse. No other solve needs it.
 
         try:
             calibrated = calibrate(errors, measure, association, found, theta, trace)
@@ -201,7 +202,7 @@ def solve_joint(
 
 
 def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:
-    """Return what the bias that all ranges of an object share adds to its covariance (N, 3, 3).
+    """Return the covariance (N, 3, 3) that the bias of ranges adds, if all ranges of an object share their bias.
 
     directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times one sigma of the bias.
     """
@@ -211,9 +212,10 @@ def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, lan
     return shift[:, :, None] * shift[:, None, :]
 
 
-def _share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
+def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
-    # The mean of n ranges with noise s and bias b, and of n independent ranges of variance s^2 + n b^2: b^2 + s^2 / n.
+    # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. n independent ranges with the
+    # variance s^2 + n b^2 have the same.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()

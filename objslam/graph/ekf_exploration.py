@@ -1,10 +1,10 @@
 """Explore a log without names by an extended Kalman filter: poses, landmarks, and the landmark of each ray.
 
-The filter keeps how all errors are correlated, also with the errors that all motions share, such as a clock that lags. So it
-knows at each frame where each landmark may appear. The rays of a frame are assigned together, because one error of the pose
-shifts all of them. A ray with a range that fits no landmark gives a new one.
-After a long way, new landmarks may be old ones. They are tied together if the errors of the way explain them all at once,
-much better than chance. A frame takes the same time at the start and at the end of a log.
+The filter keeps all correlations between errors. It includes the errors that all motions share, such as a lagging clock. So
+it knows in each frame where each landmark may appear. The rays of a frame are assigned together, because one error of the
+pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
+After a long way, new landmarks may be old ones. They are tied to the old ones if one drift explains all these pairs much
+better than chance. A frame takes the same time at the start and at the end of a log.
 """
 
 from collections.abc import Callable
@@ -26,27 +26,29 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
-"""The number of frames after which a landmark with too few rays is dropped. A larger number keeps false ones longer."""
+"""A landmark with too few rays is dropped after this number of frames. A larger number keeps false landmarks longer."""
 _RECENT = 300
-"""The number of frames after its birth during which a landmark may turn out to be an old one. A larger number is slower."""
+"""The number of frames after its first ray in which a landmark can be tied to an old one. A larger number is slower."""
 _SURE = 4.0
-"""The least log odds of a match over the best explanation without it. Larger odds leave more rays to the solve."""
+"""The least log odds of a match over the best explanation without this match. Larger odds leave more rays to the solve."""
 _NEW = 0.2
 """The expected share of rays that belong to no known landmark. A larger share accepts fewer matches."""
 _PAIRS = 40
-"""The most pairs that are assigned together, the likeliest ones. A larger number is slower and finds rarer assignments."""
+"""The most pairs that are assigned together. The likeliest pairs are taken. A larger number is slower and finds rarer
+assignments."""
 _BENT = 0.07
 """The standard deviation (m) between two estimates of one landmark beyond what the filter expects. A larger value ties more
 landmarks, and confuses neighbours more often."""
 _TIED = 0.02
-"""The standard deviation (m) to which tied landmarks are brought together. A larger value ties them less."""
+"""The standard deviation (m) of the distance between tied landmarks. A larger value ties them less closely."""
 _EXPLAINED = 0.8
-"""The least share of rays with a sure landmark in an exploration that can be trusted. With ranges, it is 0.86 to 1 in
-simulated rooms and among the posts of Lost in the Woods, and 0.4 to 0.65 on the MRCLAM robots, whose landmarks stand 0.18 m
-apart. A larger share trusts fewer explorations."""
+"""An exploration is reliable if at least this share of the rays has a sure landmark. With ranges, it is 0.86 to 1 in
+simulated rooms and among the posts of Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM robots, whose landmarks stand
+0.18 m apart. With a larger share, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""The share by which one correction changes the factors on the motion's variances, the largest factor, and the largest
-ratio of a correction to its expected square that counts. Larger values follow rough odometry sooner, and outliers, too."""
+"""How the factors on the motion's variances change: the share of one correction, the largest factor, and the largest ratio
+of a squared correction to its expectation that counts. Larger values adapt sooner to rough odometry, and also to
+outliers."""
 
 
 def explore(
@@ -58,8 +60,8 @@ def explore(
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. Rays that are not sure have no landmark.
 
-    errors: the same keyframes and rays as a function of shared errors, which the filter estimates from their mean on.
-    progress(done, total) is called with numbers of keyframes.
+    errors: the same keyframes and rays as a function of shared errors. The filter estimates these errors, starting from
+    their mean. progress(done, total) is called with numbers of keyframes.
     """
     if errors is not None:
         keyframes, rays, settings = errors.at(errors.mean)
@@ -67,17 +69,17 @@ def explore(
 
 
 def is_sure(start: InitialEstimate) -> bool:
-    """Return whether an exploration explains enough rays to begin with.
+    """Return whether an exploration explains enough rays to start from.
 
-    Else neighbours of one label stand too close together for the odometry, so that single frames do not tell them apart.
+    Otherwise, neighbours of one label stand too close together for the odometry, and single frames cannot tell them apart.
     """
     return bool((start.association.object >= 0).mean() >= _EXPLAINED)
 
 
 class _Exploration:
-    """The filter at the present frame. label, first, last, hits: (N,) of its landmarks, with their first and last frame and
-    the number of their rays. owner: (R,) the landmark of each ray. doubtful: (R,) rays that may belong to a known landmark.
-    path: (P, 4, 4) the base at each frame."""
+    """The filter at the present frame. label, first, last, hits: (N,) of its landmarks: label, first and last frame, and
+    number of rays. owner: (R,) the landmark of each ray. doubtful: (R,) rays that may belong to a known landmark. path:
+    (P, 4, 4) the base at each frame."""
 
     def __init__(
         self,
@@ -99,12 +101,12 @@ class _Exploration:
         self.by_shared, prior = motions_by_shared_errors(errors, first, self.motion)
         self.heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[first][:, :3, :3])[:, -1])  # rad^2
         self.filter = ekf.Filter.start(keyframes.map_T_base[0], prior)
-        self.roughness = np.ones(ekf.POSE)  # the factors on the variances of the motion's yaw, x and y
+        self.roughness = np.ones(ekf.POSE)  # The factors on the variances of the motion's yaw, x and y.
         self.path = np.tile(np.eye(4), (len(first), 1, 1))
         self.owner, self.doubtful = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays), dtype=bool)
         self.label, self.first, self.last, self.hits = np.zeros((4, 0), dtype=np.int64)
         self.rarity = -np.log(_NEW) + _log_spread(self.sight)
-        self.birth = -_STRETCH  # the last frame with a new landmark
+        self.birth = -_STRETCH  # The last frame with a new landmark.
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
         """Explore all frames."""
@@ -151,7 +153,7 @@ class _Exploration:
         found = assign_jointly(Pairings(row, column, expected.residual, total, rarity, SAME_POINT_WIDE))
         sure = found.margin >= _SURE
         chosen = found.chosen[sure]
-        # A ray is doubtful if two landmarks compete for it, or if it misses a free landmark that it could have been sure of.
+        # A ray is doubtful if two landmarks compete for it, or if a free landmark could have had it as a sure match.
         could = rarity - 0.5 * np.linalg.slogdet(2 * np.pi * alone[near])[1] >= _SURE
         could &= ~np.isin(column, column[chosen]) & ~np.isin(row, row[chosen])
         self.doubtful[rays[np.concatenate([row[found.chosen[~sure & found.rival]], row[could]])]] = True
@@ -160,14 +162,14 @@ class _Exploration:
             self._learn(*ekf.update(f, expected.take(chosen)))
 
     def _learn(self, step: Floats, expected: Floats) -> None:
-        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y, given its expected covariance (3, 3)."""
+        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with an expected covariance (3, 3)."""
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first frame since which the drift is small."""
+        """Return the first frame after which the drift up to now is small."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
@@ -178,12 +180,12 @@ class _Exploration:
         self.birth = now
 
     def _forget(self, now: int) -> None:
-        """Drop landmarks that were seen too rarely, and not for a while."""
+        """Drop landmarks that have too few rays and were not seen recently."""
         kept = (self.hits >= self.settings.association.min_rays) | (self.last >= self._stretch(now))
         self._keep(kept, np.arange(len(kept)))
 
     def _keep(self, kept: Bools, into: Ints) -> None:
-        """Keep landmarks. into: (N,) the landmark that gets the rays of each one."""
+        """Keep some landmarks. into: (N,) the landmark that gets the rays of each landmark."""
         if not kept.all():
             number = np.append(np.where(kept, np.cumsum(kept) - 1, -1)[into], -1)
             self.owner = number[self.owner]
@@ -191,7 +193,7 @@ class _Exploration:
             self.label, self.first, self.last, self.hits = (a[kept] for a in (self.label, self.first, self.last, self.hits))
 
     def _close(self, now: int) -> None:
-        """Tie recent landmarks to the older landmarks that they are, if that is sure."""
+        """Tie recent landmarks to older ones if they are certainly the same."""
         if now - self.birth > _STRETCH:
             return
         f, recent = self.filter, self.first >= now - _RECENT
@@ -217,7 +219,7 @@ class _Exploration:
         self.path[begin : now + 1] = f.map_T_base @ inverse(before) @ self.path[begin : now + 1]
         into = np.arange(len(f))
         into[one] = two
-        while (into[into] != into).any():  # a landmark may be tied to one that is tied to another
+        while (into[into] != into).any():  # A landmark may be tied to a landmark that is itself tied to another.
             into = into[into]
         np.add.at(self.hits, into[one], self.hits[one])
         np.maximum.at(self.last, into[one], self.last[one])
@@ -226,13 +228,14 @@ class _Exploration:
 
 
 def _likeliest(squared: Floats) -> Ints:
-    """Return the pairs (p,) within the gate, in their order, by squared deviations (P,). They are `_PAIRS` at most."""
+    """Return at most `_PAIRS` pairs (p,) within the gate, in their order. The least squared deviations (P,) are chosen."""
     near = np.flatnonzero(squared <= SAME_POINT_WIDE)
     return np.sort(near[np.argsort(squared[near], kind="stable")[:_PAIRS]])
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the extent, in rad^2 or rad^2 m, over which rays of new things are spread, by all rays."""
+    """Return the log (R,) of the area or volume over which rays of new things spread, estimated from all rays. The unit is
+    rad^2, or rad^2 m with a range."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

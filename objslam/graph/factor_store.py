@@ -24,8 +24,8 @@ class Stored(NamedTuple):
 class FactorStore:
     """The factors by kind, then by number. A graph gets the kinds in the order of `kinds`.
 
-    The number of a `motion` is that of the keyframe at its end. The number of an `absolute` pose is that of its keyframe.
-    The number of a `landmark` prior is that of the landmark. A `ray` has its own number. The caller numbers other kinds.
+    The number of a `motion` is the number of the keyframe at its end. An `absolute` pose has the number of its keyframe, and
+    a `landmark` prior has the number of its landmark. A `ray` has its own number. The caller numbers other kinds.
     """
 
     kinds: dict[str, dict[int, Stored]] = field(
@@ -33,7 +33,7 @@ class FactorStore:
     )
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
-        """Store one group of factors for each number. It replaces the factors of this kind that have the number already."""
+        """Store one group of factors for each number. It replaces the factors of this kind that already have the number."""
         stored = self.kinds.setdefault(kind, {})
         for number, group in zip(numbers, groups, strict=True):
             stored[number] = Stored(frozenset(key for factor in group for key in factor.keys()), group)  # noqa: SIM118 (no dict)

@@ -11,7 +11,7 @@ from objslam.triangulation.triangulate import Triangulation, triangulate
 def triangulate_at(
     map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
 ) -> Triangulation:
-    """Triangulate every object by Eq. 1 at camera poses (K, 4, 4). The noise of a localisation adds to that of the rays."""
+    """Triangulate every object by Eq. 1 at camera poses (K, 4, 4). The noise of a localisation adds to the noise of rays."""
     sigma, place = pose_noise(rays, keyframes, settings)
     return _triangulate(map_T_camera, rays, association, settings, sigma, place)
 
@@ -35,7 +35,7 @@ def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Fl
     """Return the standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins.
 
     Both contain the noise of the localisation. Keyframes that share one measured pose share its error, so its variance is
-    multiplied by their number. Without a localisation, the noise of the rays alone is left.
+    multiplied by their number. Without a localisation, only the noise of the rays remains.
     """
     share = keyframes.localized_every
     of = settings.localization

@@ -26,11 +26,11 @@ class GrowingGraph(ABC):
         self._settings = settings
         self._store = FactorStore()
         self._at = Variables()
-        self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # not in the estimate yet
+        self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # Not in the estimate yet.
         self._rebuild: IncrementalRebuild | None = None
         self._newest, self._updates = -1, 0
-        self._touched: dict[int, int] = {}  # by landmark, the last update that involved it
-        self._outgrown = False  # a variable has a letter that iSAM2 was not made for
+        self._touched: dict[int, int] = {}  # By landmark: the last update that involved it.
+        self._outgrown = False  # Whether a variable has a letter that the present iSAM2 does not know.
 
     @abstractmethod
     def refresh(self) -> None:

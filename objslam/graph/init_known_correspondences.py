@@ -19,25 +19,25 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The number of iterations of each solve during growth. A larger number is slower. Few are enough, because each solve starts
-close to its optimum, and the next solve continues from its result."""
+"""The number of iterations of each solve during growth. Few are enough, because each solve starts close to its optimum, and
+the next solve continues from its result. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
-doubles. Above the second, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3 to 5
-and 15 degrees converge to the same map. iSAM2 in place of these solves lost robot 1 or 5."""
+doubles. Above the second limit, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3
+to 5 and 15 degrees converge to the same map. With iSAM2 instead of these solves, robot 1 or 5 failed."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
-median angle of the step. Larger values let more false boxes in. Both are well above the odometry's drift in one step."""
+median angle of the step. Larger values accept more false boxes. Both are well above the odometry's drift in one step."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter
 later. With fewer, false boxes agree by chance too often."""
 _SHORTEST = 4
-"""The divisor of joint.grow_step that gives the shortest step. A larger divisor allows shorter steps and slower growth."""
+"""The shortest step is joint.grow_step divided by this. A larger number allows shorter steps and slower growth."""
 _AGAIN = 1.05
-"""The growth of the number of a landmark's rays since its last triangulation at which it is triangulated again. A larger
-factor is faster, and landmarks enter later. With a factor of 1 the time would grow with the square of the rays."""
+"""A landmark is triangulated again when its number of rays has grown by this factor. A larger factor is faster, but
+landmarks enter later. With a factor of 1, the time would grow with the square of the number of rays."""
 _RECORDED = 1.02
-"""The growth of the graph from one step in the trace to the next. A larger factor records fewer steps. With a factor of 1,
+"""The trace records a step when the graph has grown by this factor. A larger factor records fewer steps. With a factor of 1,
 the trace of a long drive would take gigabytes, because each step records the whole path."""
 
 
@@ -52,7 +52,7 @@ def initialize_known(
     window = SlidingWindow(measured, owner, association.count, _ITERATIONS)
     map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)  # rays without a landmark; how many had each
+    waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)  # Rays without a landmark; how many each had.
     begin, step, recorded = 1, settings.joint.grow_step, 0
     shortest = max(2, step // _SHORTEST)
     while begin < len(keyframes):
@@ -60,7 +60,7 @@ def initialize_known(
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
-        known = np.append(np.isfinite(window.positions[:, 0]), False)  # object -1 is the last
+        known = np.append(np.isfinite(window.positions[:, 0]), False)  # The last entry is for object -1.
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
         fresh, unknown = new[known[owner[new]]], new[(owner[new] >= 0) & ~known[owner[new]]]
         off = _off(rays, association, map_T_camera, window.positions, fresh)
@@ -102,10 +102,8 @@ def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: 
 def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
 ) -> tuple[Ints, Floats, Floats, Ints]:
-    """Return the landmarks (n,) that the rays `waiting` determine now, and the rays (m,) that agree with them.
-
-    Between the two are the positions (n, 3) of these landmarks, and their covariances (n, 3, 3) at the present poses.
-    """
+    """Return the landmarks (n,) that the rays `waiting` now determine, their positions (n, 3), their covariances (n, 3, 3)
+    at the present poses, and the rays (m,) that agree with them."""
     waiting = waiting[_may_have_parallax(rays.take(waiting), association.object[waiting], map_T_camera, settings)]
     if len(waiting) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), waiting
@@ -118,9 +116,9 @@ def _new_landmarks(
 
 
 def _may_have_parallax(rays: Rays, owner: Ints, map_T_camera: Floats, settings: Settings) -> Bools:
-    """Return which rays (R,) have a landmark whose rays can have enough parallax, or one of whose rays has a range.
+    """Return a mask (R,) of the rays whose landmark can have enough parallax, or has a ray with a range.
 
-    A triangulation takes much longer than this test. Two rays differ by at most twice the largest angle from their mean.
+    This quick test avoids slow triangulations. Two rays differ by at most twice the largest angle from their mean.
     """
     _, directions = rays.in_map(map_T_camera)
     mean = np.zeros((owner.max(initial=-1) + 1, 3))

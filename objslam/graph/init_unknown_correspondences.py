@@ -2,8 +2,8 @@
 
 As in `init_known_correspondences`, keyframes enter a few at a time, at poses that continue the solved path by odometry. Each
 ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's drift.
-Unassigned rays of the most recent keyframes, between which the drift is small, give new landmarks. The result is the start
-of a global association.
+Unassigned rays of recent keyframes give new landmarks, because the drift between these keyframes is small. The result is the
+start of a global association.
 """
 
 from collections.abc import Callable
@@ -41,11 +41,11 @@ _MORE_RAYS = 2
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
 With fewer rays, more wrong landmarks enter, and each of them disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-"""The numbers of iterations of the solve after a step and of the solve after a loop closure. More are slower. The latter
-needs more, because it starts farther from its optimum."""
+"""The numbers of iterations of the solve after a step and of the solve after a loop closure. The solve after a loop closure
+starts farther from its optimum, so it needs more. Larger numbers are slower."""
 _STRAIN = 200.0
-"""The amount, for each joined landmark, by which a loop closure may raise the cost (a sum of squared deviations). A larger
-amount closes more wrong loops. On MRCLAM, correct loops took up to 110 for each landmark, and wrong ones 240 or more."""
+"""A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
+closes more wrong loops. On MRCLAM, correct loops took up to 110 for each landmark, and wrong ones 240 or more."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def initialize_unknown(
                     refused.add(pairs)
                 else:
                     graph, known, owner, map_T_camera[:end] = closed
-                    refused.clear()  # the numbers of the landmarks have changed
+                    refused.clear()  # The numbers of the landmarks have changed.
         progress(end, len(keyframes))
     return InitialEstimate(map_T_camera, Association(owner, known.label), known.position)
 

@@ -1,7 +1,7 @@
 """Estimate a growing graph by iSAM2: updates, rebuilds, and access to the estimate.
 
 If an update raises an exception, Levenberg-Marquardt solves the stored factors from the last good estimate. iSAM2 is then
-rebuilt at this solution. Levenberg-Marquardt can solve it, because its damping holds variables that no measurement holds.
+rebuilt at this solution. Levenberg-Marquardt succeeds, because its damping determines the variables without measurements.
 """
 
 import gtsam
@@ -56,9 +56,9 @@ class IncrementalGraph(GrowingGraph):
         if relinearise or sunk or self._new.size():
             self._work_in(relinearise, self._layout(coming))
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
-            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # the others may be deep now
+            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # The others may be deep now.
         if self._newest in self._at.poses:
-            self.pose(self._newest)  # makes iSAM2 solve now
+            self.pose(self._newest)  # This makes iSAM2 solve now.
 
     def pose(self, k: int) -> Floats:
         """Return the current map_T_camera (4, 4) of X(k)."""
@@ -103,7 +103,7 @@ class IncrementalGraph(GrowingGraph):
         """
         try:
             joint = self._isam.jointMarginalCovariance([X0 + k, L0 + j])
-        except (RuntimeError, IndexError):  # indeterminate, or not in the graph yet
+        except (RuntimeError, IndexError):  # The system is indeterminate, or a variable is not in the graph yet.
             return np.full((3, 3), np.nan)
         return in_camera(joint, k, j, self.pose(k), self.points(np.array([j]))[0])
 
@@ -123,7 +123,7 @@ class IncrementalGraph(GrowingGraph):
         """Optimise all variables by Levenberg-Marquardt from the current estimate, and rebuild iSAM2 there.
 
         It stops after `iterations`, or when the cost falls by a smaller share than `tolerance`. SolveError if the cost is
-        not finite, or if no factor holds some variable. After a SolveError the graph is unchanged.
+        not finite, or if no factor determines some variable. After a SolveError the graph is unchanged.
         """
         self.refresh()
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
@@ -140,8 +140,8 @@ class IncrementalGraph(GrowingGraph):
     def rebuild_in_slices(self, order: Ints) -> None:
         """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end the old graph stays in use.
 
-        A second call before the end rebuilds at once, because frequent changes must not postpone the end for ever.
-        order: (K,) all keyframes. The keyframe at the start of a motion comes before the one at its end.
+        If the method is called again before the end, it rebuilds at once. Otherwise, frequent changes could postpone the end
+        for ever. order: (K,) all keyframes. The keyframe at the start of a motion comes before the one at its end.
         """
         if self._unfinished or len(order) <= _AT_ONCE:
             self.rebuild()
@@ -166,10 +166,10 @@ class IncrementalGraph(GrowingGraph):
                 return
             self.refresh()
             self._rebuild.finish(self._at)
-        except RuntimeError:  # a full rebuild can handle this
+        except RuntimeError:  # A full rebuild can handle this.
             self.rebuild()
             return
-        self._clear()  # the new iSAM2 has these factors and variables too
+        self._clear()  # The new iSAM2 contains these factors and variables too.
         self._isam, self._stale = self._rebuild.isam, True
         self._rebuild, self._unfinished = None, False
 
@@ -180,7 +180,7 @@ class IncrementalGraph(GrowingGraph):
                 self._fill(self._store.graph())
             else:
                 self._update(relinearise, layout or {})
-        except (RuntimeError, ValueError):  # indeterminate, or an impossible layout
+        except (RuntimeError, ValueError):  # The system is indeterminate, or the layout is impossible.
             self._rescue()
 
     def _layout(self, coming: Ints) -> dict[int, int]:
@@ -220,7 +220,7 @@ class IncrementalGraph(GrowingGraph):
     def _fill(self, graph: gtsam.NonlinearFactorGraph) -> None:
         isam = new_isam(self._at.others)
         isam.update(graph, self._at.values())
-        isam.calculateEstimate()  # throws here if the graph is indeterminate
+        isam.calculateEstimate()  # It raises here if the graph is indeterminate.
         self._isam, self._stale = isam, True
         self._rebuild, self._unfinished, self._outgrown = None, False, False
         self._clear()

@@ -13,8 +13,8 @@ _RELINEARISE = (0.02, 0.05)
 """The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact. A
 change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
-"""The number of updates between two automatic relinearisations. It is so large that only the caller asks for one, when it
-has time. A smaller number would relinearise without a request."""
+"""The number of updates between two automatic relinearisations. It is so large that none happens. The caller asks for a
+relinearisation when it has time. A smaller number would relinearise without a request."""
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
@@ -45,9 +45,9 @@ class IncrementalRebuild:
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:
         self.isam = new_isam(variables.others)
         self._variables, self._order = variables, order
-        self._at: list[list[Stored]] = [[] for _ in order]  # factors by their last keyframe in the order
-        self._alone: dict[int, list[Stored]] = {}  # factors on a single variable that is no keyframe
-        self._last: list[Stored] = []  # factors on several variables without a keyframe
+        self._at: list[list[Stored]] = [[] for _ in order]  # Factors by their last keyframe in the order.
+        self._alone: dict[int, list[Stored]] = {}  # Factors on a single variable that is not a keyframe.
+        self._last: list[Stored] = []  # Factors on several variables without a keyframe.
         place = {X0 + k: i for i, k in enumerate(order)}
         for stored in store.kinds.values():
             for one in stored.values():
@@ -88,7 +88,7 @@ class IncrementalRebuild:
         variables.insert(self.new, values)
         graph.push_back(self.later)
         self.isam.update(graph, values)
-        self.isam.calculateEstimate()  # throws here if the graph is indeterminate
+        self.isam.calculateEstimate()  # It raises here if the graph is indeterminate.
 
     def _push(self, one: Stored, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         for key in one.keys:

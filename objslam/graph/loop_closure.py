@@ -14,14 +14,14 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The number of past epochs, latest first, in which a loop is searched. An epoch is `_EPOCH` successive keyframes. A larger
-number is slower and closes longer loops."""
+"""The number of past epochs in which a loop is searched, the latest first. An epoch is `_EPOCH` successive keyframes. A
+larger number is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
 """The factors that multiply the standard deviations of the drift in the search for a loop, because wheels slip more than a
 Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The number of keyframes in an epoch. The drift since an epoch is computed for one of its keyframes. So a larger number is
-faster and less exact."""
+"""The number of keyframes in an epoch. The drift since an epoch is computed for only one of its keyframes. So a larger
+number is faster and less exact."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
     correction: (4, 4) the motion in map that corrects the current poses. now: (P,) the recent landmarks. before: (P,) the
-    old landmark that each one is. evidence: log odds of the loop.
+    old landmark for each recent one. evidence: log odds of the loop.
     """
 
     correction: Floats
@@ -71,8 +71,8 @@ def find_closure(
 ) -> Closure | None:
     """Return the loop with the most evidence, or None if no loop is certain.
 
-    The search has two cases. After a long drift, landmarks with recent observations (`active`, (N,)) match the others. After
-    a slip or a push, the landmarks that were found since then match all others.
+    The search has two cases. After a long drift, recently observed landmarks (`active`, (N,)) are matched with the others.
+    After a slip or a push, the landmarks found since then are matched with all others.
     """
     together = seen_together(rays.keyframe, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
@@ -87,7 +87,7 @@ def find_closure(
             continue
         try:
             marginals = marginals or gtsam.Marginals(graph, values)
-        except RuntimeError:  # indeterminate: no loop can be tested
+        except RuntimeError:  # The system is indeterminate, so no loop can be tested.
             return None
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
@@ -134,8 +134,8 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
 def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
     """Return a path (K, 4, 4) with a correction (4, 4) spread over the keyframes from `begin` to `end`.
 
-    drift: (K,) accumulated along the path. The share of the correction that a keyframe gets is the share of the drift
-    between `begin` and `end` that has gathered there. Earlier keyframes get nothing. Later ones get all of it.
+    drift: (K,) accumulated along the path. A keyframe gets a share of the correction that is proportional to the drift since
+    `begin`. Earlier keyframes get nothing. Later ones get all of it.
     """
     gathered = drift - drift[begin]
     share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)

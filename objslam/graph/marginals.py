@@ -11,8 +11,8 @@ from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
-"""The standard deviation (m) of the prior that each landmark gets if the linear system is indeterminate. A landmark counts
-as undetermined if, with this prior, its largest standard deviation is still above half of this value. A larger value holds
+"""The standard deviation (m) of the prior that each landmark gets if the linear system is indeterminate. If the standard
+deviation of a landmark is still above half of this value, no measurement determines the landmark. A larger value constrains
 the landmarks less. With too large a value, the system stays indeterminate."""
 
 
@@ -45,9 +45,9 @@ def seen_covariances(
 ) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of landmarks (n,). Each is relative to one keyframe, its witness (n,).
 
-    A covariance is in the camera frame of the witness, without the uncertainty of this camera's pose. Far from the start of
-    a map by odometry, nearly all uncertainty of a landmark in map is that of the pose. If the linear system is
-    indeterminate, the ledger gets a warning, and the remaining covariances are NaN.
+    A covariance is in the camera frame of the witness, without the uncertainty of this camera's pose. In a map by odometry,
+    far from its start, nearly all uncertainty of a landmark comes from the pose. If the linear system is indeterminate, the
+    ledger gets a warning, and the remaining covariances are NaN.
     """
     covariance = np.full((len(landmarks), 3, 3), np.nan)
     if len(landmarks) == 0:

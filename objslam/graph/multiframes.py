@@ -1,7 +1,7 @@
 """Join the images of one stamp into one multiframe: one pose in the graph, with rays from several camera centres.
 
-Together the cameras are one generalised camera (Pless 2003, Using many cameras as one), whose frame is that of the first
-image. So a rig adds one pose and one motion for each stamp, however many cameras it has.
+Together the cameras are one generalised camera (Pless 2003, Using many cameras as one), with the frame of the first image's
+camera. So a rig adds one pose and one motion for each stamp, however many cameras it has.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +14,14 @@ from objslam.core.geometry import inverse
 from objslam.core.types import Keyframes, Rays
 
 TOGETHER = 0.01
-"""The longest time (s) between the logged stamps of the first and of any other image of a multiframe. Within it, the motion
-by odometry is taken as exact: at 1 m/s it errs by less than a millimetre. A longer time joins more images and errs more. It
-is well above the jitter of cameras with a common trigger."""
+"""The longest time (s) between the logged stamps of the first image and any other image of a multiframe. Within this time,
+the odometry is assumed exact: at 1 m/s it errs by less than a millimetre. A longer time joins more images and has larger
+errors. This time is well above the jitter of cameras with a common trigger."""
 
 
 @dataclass(frozen=True)
 class Multiframes:
-    """Which keyframes, which are images, share a pose.
+    """The keyframes (images) that share a pose.
 
     number: (K,) the multiframe of each keyframe, non-decreasing from 0. first: (P,) the first keyframe of each multiframe.
     """
@@ -50,23 +50,23 @@ class Multiframes:
 
     @classmethod
     def single(cls, count: int) -> Self:
-        """Give each of `count` keyframes a pose of its own."""
+        """Give each of `count` keyframes its own pose."""
         return cls(np.arange(count), np.arange(count))
 
     def keyframes(self, images: Keyframes) -> Keyframes:
-        """Return the first keyframe (P,) of each multiframe. The images (K,) may have clocks of their own."""
+        """Return the first keyframe (P,) of each multiframe. The images (K,) may have different clocks."""
         if len(self.first) == len(images):
             return images
         shared = images.localized_every * len(self.first) / len(images)
         return replace(images.take(self.first), localized_every=max(shared, 1.0) if images.localized_every else 0.0)
 
     def rays(self, images: Keyframes, rays: Rays) -> Rays:
-        """Return the rays of images as the rays of the multiframes: each in the frame of the first camera."""
+        """Return the rays of images as the rays of the multiframes, in the frame of the first camera."""
         if len(self.first) == len(images):
             return rays
         first_T_camera = inverse(images.base_T_camera[self.first])[self.number] @ self._motion(images) @ images.base_T_camera
         own = self.first[self.number] == np.arange(len(images))
-        first_T_camera[own] = np.eye(4)  # without rounding, as their factors need no offset then
+        first_T_camera[own] = np.eye(4)  # Without rounding errors, their factors need no offset.
         offset, direction = rays.in_map(first_T_camera)
         return replace(rays, keyframe=self.number[rays.keyframe], direction=direction, offset=offset)
 
@@ -78,6 +78,6 @@ class Multiframes:
         return map_T_base[self.number] @ self._motion(images)
 
     def _motion(self, images: Keyframes) -> Floats:
-        """(K, 4, 4) the motion of base from the first image of the multiframe to each image."""
+        """Return the motions (K, 4, 4) of base from the first image of the multiframe to each image."""
         path = images.map_T_base if images.odom_T_base is None else images.odom_T_base
         return inverse(path[self.first])[self.number] @ path

@@ -77,7 +77,7 @@ def levenberg_marquardt(
 
     def hook(number: Any, _: Any, after: Any) -> None:
         nonlocal last
-        if int(number) > last and on_iteration is not None:  # GTSAM calls once more with the last number if a step fails.
+        if int(number) > last and on_iteration is not None:  # If a step fails, GTSAM repeats the last number.
             on_iteration(float(after), optimizer.values())
         last = int(number)
 
@@ -108,7 +108,7 @@ def gauss_newton(
         optimizer = gtsam.GaussNewtonOptimizer(graph, start, parameters)
         before = optimizer.error()
         values = optimizer.optimize()
-    except RuntimeError:  # damping may make the system determinate, and if it does not, its error says so
+    except RuntimeError:  # Damping may make the system determinate. If not, the other solver raises.
         return levenberg_marquardt(graph, start, max_iterations, relative_tolerance)
     if not optimizer.error() <= before:
         return levenberg_marquardt(graph, start, max_iterations, relative_tolerance)

@@ -16,13 +16,13 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is
-rejected too. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore none."""
+"""A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is also
+rejected. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore no ray."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _COARSE = 1e-4
-"""The relative decrease of the cost below which a solve ends whose inliers are tested next. A larger value ends it sooner.
-Robust weights converge slowly, and the last digits of a solution hardly change an inlier."""
+"""If the inliers are tested next, a solve ends when the cost decreases by less than this share. A larger value ends it
+sooner. Robust weights converge slowly, and the last digits of a solution hardly change an inlier."""
 _SURE = 0.95
 """The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
 corrects more objects at wrong positions."""
@@ -67,7 +67,7 @@ def reject_outliers(
         if optimum is None:
             agreeing = agreeing | back
         elif (agreeing == used).all():
-            break  # the positions stay those of the last solve
+            break  # The positions stay as in the last solve.
         positions, used = moved, agreeing
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         graph = build_graph(measured.factors(association.object, which, landmarks, positions, loss))
@@ -88,7 +88,7 @@ def reject_outliers(
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too, as if poses were wrong."""
+    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too. Poses may be wrong."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)
@@ -127,7 +127,7 @@ def second_opinion(
         return positions, agreeing
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
-    if used.any():  # solved poses do not have the noise of the localisation
+    if used.any():  # Solved poses do not have the noise of the localisation.
         keyframes = replace(keyframes, localized_every=0.0)
     placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, measured.settings)
     other = positions.copy()

@@ -1,4 +1,4 @@
-"""The planar part of the motions that odometry measures: their noise, and how errors that they share change them."""
+"""The planar part of the motions that odometry measures: its noise, and its derivatives by shared errors."""
 
 import numpy as np
 
@@ -17,9 +17,9 @@ def planar_noise(drift: Floats, odom_T_base: Floats, settings: Settings) -> Floa
 
 
 def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints, motion: Floats) -> tuple[Floats, Floats]:
-    """Return how shared errors change the yaw, x and y of the motions (P-1, 3, S), and their prior sigmas (S,).
+    """Return the derivatives (P-1, 3, S) of the motions' yaw, x and y by shared errors, and the prior sigmas (S,) of these.
 
-    They are the errors of the odometry, and one clock for all cameras.
+    The shared errors are the errors of the odometry, and one clock for all cameras.
     """
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(errors.names if errors is not None else ()):

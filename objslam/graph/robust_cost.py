@@ -1,4 +1,4 @@
-"""Compute the cost of a solution, for a comparison with solutions that have other inliers, and the information of rays."""
+"""Compute the information of rays, and the cost of a solution, to compare solutions with different inliers."""
 
 import numpy as np
 
@@ -18,7 +18,8 @@ def truncated_cost(
     """Return the sum of the squared deviations of the rays and of the odometry. A ray counts `STRAY_RAY` at most.
 
     owner: (R,) index into positions (N, 3), or -1 for a ray that does not count. map_T_camera: (K, 4, 4) the first K
-    keyframes. Later rays and motions do not count. motion, covariance: (M, 4, 4), (M, 6, 6) camera motions by odometry.
+    keyframes. Rays and motions of later keyframes do not count. motion, covariance: (M, 4, 4), (M, 6, 6) camera motions by
+    odometry.
     """
     held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
     some = rays.take(held)

@@ -1,7 +1,7 @@
-"""Solve a graph that grows along the path, over a window of its last keyframes. The rest is held by its marginals.
+"""Solve a graph that grows along the path, over a window of its last keyframes. Priors replace the rest of the graph.
 
-If each step solved the whole graph, the time would grow with the square of the path. Here, a step solves only the window.
-The whole graph is solved each time that it has doubled. All these solves together take twice the time of the last one.
+If each step solved the whole graph, the time would grow with the square of the path. So a step solves only the window. The
+whole graph is solved each time that its size has doubled. All these solves together take twice the time of the last one.
 """
 
 import gtsam
@@ -13,15 +13,15 @@ from objslam.graph.optimizers import Optimum, build_graph, levenberg_marquardt
 from objslam.graph.variables import L0, LETTER, X0, keyframes_in, landmarks_in
 
 _WINDOW = 60
-"""The number of keyframes before a step that are solved again with it. A larger number is slower and corrects older poses.
-On the MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps."""
+"""The number of earlier keyframes that a step solves again. A larger number is slower and corrects older poses. On the
+MRCLAM robots, windows of 30, 60 and 120 keyframes lead to the same maps."""
 _GROWTH = 2.0
-"""The growth of the graph since its last whole solve at which it is solved as a whole again. A larger factor is faster. A
-smaller one corrects earlier what windows neglect: errors of what they hold are correlated, and a loop bends old poses."""
+"""The whole graph is solved when it has grown by this factor since its last whole solve. A larger factor is faster. A
+smaller factor corrects sooner what a window ignores: the errors of its priors are correlated, and a loop bends old poses."""
 _AT_CAMERA = 1e-3
-"""The distance (m) from a camera below which a landmark is at the camera, which no object is. The information of a bearing
-grows with the inverse square of the distance, so that nearer landmarks make the linear system singular. A larger distance
-also takes real landmarks out. The solver put landmarks there on real drives whose clocks were 0.2 s apart."""
+"""A landmark within this distance (m) of a camera is at the camera. No object is there. The information of a bearing grows
+with the inverse square of the distance, so such landmarks make the linear system singular. A larger distance also removes
+real landmarks. On real drives whose clocks were 0.2 s apart, the solver put landmarks there."""
 
 
 class SlidingWindow:
@@ -31,26 +31,26 @@ class SlidingWindow:
     """
 
     def __init__(self, measured: Measurements, owner: Ints, landmarks: int, iterations: int) -> None:
-        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: those of a solve."""
+        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: of each solve."""
         self.map_T_camera = measured.keyframes.map_T_camera.copy()
         self.positions = np.full((landmarks, 3), np.nan)
         self._measured, self._owner, self._iterations = measured, owner, iterations
-        self._factors: list[list[gtsam.NonlinearFactor]] = [[] for _ in self.map_T_camera]  # by their last keyframe
-        self._weak: dict[int, gtsam.NonlinearFactor] = {}  # the weak prior of each landmark, by its key
-        self._held: dict[int, gtsam.NonlinearFactor] = {}  # the prior of each variable by what left the window
+        self._factors: list[list[gtsam.NonlinearFactor]] = [[] for _ in self.map_T_camera]  # By their last keyframe.
+        self._weak: dict[int, gtsam.NonlinearFactor] = {}  # The weak prior of each landmark, by its key.
+        self._held: dict[int, gtsam.NonlinearFactor] = {}  # By key: the prior in place of factors outside the window.
         self._values = gtsam.Values()
-        self._begin, self.end, self._solved = 0, 0, 0  # the window, and the keyframes of the last whole solve
+        self._begin, self.end, self._solved = 0, 0, 0  # The window, and the keyframes of the last whole solve.
         nothing = np.zeros(0, dtype=np.int64)
         self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
 
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
         """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
 
-        covariance: (m, 3, 3) of the landmarks by their rays. It stands for the rays of keyframes that have left the window.
+        covariance: (m, 3, 3) of the landmarks by their rays. It replaces the rays of keyframes that have left the window.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
-            last = max(factor.keys())  # the keys of keyframes are above those of landmarks
+            last = max(factor.keys())  # The keys of keyframes are above the keys of landmarks.
             if _is_landmark(last):
                 self._weak[last] = factor
             else:
@@ -67,7 +67,7 @@ class SlidingWindow:
     def solve(self) -> Optimum:
         """Solve the window, or the whole graph if it has grown enough or is complete. Then move the window on.
 
-        A landmark that ends at a camera leaves the graph. Its position is NaN then, and new rays may find it again.
+        A landmark that ends up at a camera leaves the graph. Its position becomes NaN, and new rays may find it again.
         SolveError if the linear system is indeterminate, or if the cost is not finite.
         """
         if self.end >= _GROWTH * self._solved or self.end == len(self.map_T_camera):
@@ -83,7 +83,7 @@ class SlidingWindow:
         return optimum
 
     def _take_out(self, landmarks: Ints) -> None:
-        """Take landmarks (n,) and their factors out of the graph."""
+        """Remove landmarks (n,) and their factors from the graph."""
         if not len(landmarks):
             return
         out = set((L0 + landmarks).tolist())
@@ -103,10 +103,10 @@ class SlidingWindow:
         return graph
 
     def _move(self, begin: int) -> None:
-        """Let the window begin at another keyframe. The marginals of what leaves become the priors of what stays.
+        """Let the window begin at another keyframe. The marginals of the removed part become priors of the window.
 
-        Landmarks that leave keep their marginal until they are seen again. If what leaves does not tell its marginals, the
-        window stays, and becomes longer. A later solve raises SolveError if the whole graph does not tell them either.
+        A landmark that leaves the window keeps its marginal until it is seen again. If the marginals are indeterminate, the
+        window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve raises SolveError.
         """
         if begin == self._begin:
             return
@@ -117,7 +117,7 @@ class SlidingWindow:
         try:
             marginals = gtsam.Marginals(leaving, self._values.extract(keys))
             self._held |= {key: _prior(key, self._values, marginals.marginalCovariance(key)) for key in kept}
-        except RuntimeError:  # GTSAM's only sign of an indeterminate system
+        except RuntimeError:  # GTSAM has no other sign of an indeterminate system.
             return
         self._begin = begin
 

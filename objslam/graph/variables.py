@@ -1,6 +1,6 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
-The camera is that of keyframe k, or the first one of multiframe k where images share a pose.
+X(k) belongs to the camera of keyframe k. If images share a pose, it belongs to the first camera of multiframe k.
 
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """

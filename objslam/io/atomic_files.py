@@ -4,10 +4,11 @@ import errno
 import fcntl
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from objslam.errors import OutputError
 from objslam.io.folders import remove_leftovers, temporary_name
@@ -32,10 +33,15 @@ class FileSet:
 
 
 def try_folder(folder: Path, files: FileSet) -> None:
-    """Create a folder and test writing to it. Raises OutputError if `replace_files` would fail."""
+    """Create a folder and test writing to it. Temporary files of the set that killed processes left are deleted.
+
+    Raises OutputError if `replace_files` would fail.
+    """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with _staged(folder, files) as staging:
+            for name in files.names(folder):
+                remove_leftovers(folder / name)
             _write(staging / "probe", b"objslam")
 
 
@@ -70,11 +76,28 @@ def write_file(file: Path, data: bytes) -> None:
 
     Raises OutputError with the final file name for a disk error.
     """
+    with _replaced(file) as stream:
+        stream.write(data)
+
+
+def write_lines(file: Path, lines: Iterable[str]) -> None:
+    """Write a text file of lines as `write_file` does, line by line. Raises the errors of `write_file` and of `lines`."""
+    with _replaced(file) as stream:
+        for line in lines:
+            stream.write(encode(f"{line}\n"))
+
+
+@contextmanager
+def _replaced(file: Path) -> Iterator[BinaryIO]:
+    """Yield a stream to a temporary file, and rename that to `file` at the end. After an error, it is deleted."""
     temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
         remove_leftovers(file)
         try:
-            _write(temporary, data)
+            with temporary.open("wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
             temporary.replace(file)
             _sync(file.parent)
         finally:

@@ -4,9 +4,10 @@ The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a 
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import yaml
@@ -115,7 +116,7 @@ def _read(
     return Calibration(camera, placed)
 
 
-def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
+def parse_camera(text: bytes, place: str, ledger: Ledger, name: str | None) -> Camera:
     """Parse a camera from a text in the format of a camera file. Raises LogError, which names `place` as the file."""
     path = Path(place)
     return _read(path, _load(path, text, "the camera"), ledger, name, True).camera
@@ -123,21 +124,42 @@ def parse_camera(text: bytes, place: str, ledger: Ledger, name: str) -> Camera:
 
 def write_camera(camera: Camera, path: Path) -> None:
     """Write a camera file. Every number except the quaternion of the rotation is read back as the same float."""
-    xyzw = quaternion(camera.base_T_camera[None])[0]
-    data = {
+    path.write_text(dump_camera(camera), encoding="utf-8")
+
+
+def dump_camera(camera: Camera) -> str:
+    """Return the text of a camera file, as `write_camera` writes it."""
+    return _dumped(camera_keys(camera))
+
+
+def camera_keys(camera: Camera) -> dict[str, Any]:
+    """Return the content of a camera file."""
+    return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
         "image_height": int(camera.height),
         "camera_matrix": {"rows": 3, "cols": 3, "data": camera.matrix.ravel().tolist()},
         "distortion_model": camera.distortion_model,
         "distortion_coefficients": {"rows": 1, "cols": len(camera.distortion), "data": camera.distortion.tolist()},
-        "base_T_camera": {"translation": camera.base_T_camera[:3, 3].tolist(), "rotation_xyzw": xyzw.tolist()},
+        "base_T_camera": _written(camera.base_T_camera),
         "depth_scale": float(camera.depth_scale),
         **({} if camera.sees_size else {"sees_size": False}),
         **({} if camera.depth_noise is None else {"depth_noise": asdict(camera.depth_noise)}),
     }
-    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
-    path.write_text(text, encoding="utf-8")
+
+
+def write_mounts(mounts: Mapping[str, Floats], path: Path) -> None:
+    """Write base_T_camera (4, 4) of cameras by name, as `read_mounts` reads them."""
+    cameras = {name: {"base_T_camera": _written(pose)} for name, pose in mounts.items()}
+    path.write_text(_dumped({_CAMERAS: cameras}), encoding="utf-8")
+
+
+def _written(pose: Floats) -> dict[str, list[float]]:
+    return {"translation": pose[:3, 3].tolist(), "rotation_xyzw": quaternion(pose[None])[0].tolist()}
+
+
+def _dumped(data: Mapping[str, Any]) -> str:
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, allow_unicode=True, width=125)
 
 
 def _error(path: Path, node: yaml.Node, message: str, hint: str | None = None) -> LogError:

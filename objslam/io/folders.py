@@ -1,4 +1,4 @@
-"""Remove what failed or killed work leaves on the disk: empty folders, temporary files and temporary folders."""
+"""Remove the remains of failed or killed work from the disk: empty folders, temporary files and temporary folders."""
 
 import os
 import platform
@@ -10,12 +10,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 OLD = "old"
-"""The entry of a temporary folder that holds the folder that is just being replaced."""
+"""The name, in a temporary folder, of the folder that is being replaced."""
 
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """After an error in the block, delete those of `path` and its parents that the block created and left empty."""
+    """If the block raises an error, delete the folders of `path` and its parents that the block created and left empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield
@@ -36,7 +36,7 @@ def temporary_name(path: Path) -> str:
 def remove_leftovers(path: Path) -> None:
     """Delete the temporary files and folders beside `path` that dead processes of this machine left (`temporary_name`).
 
-    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Those
+    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Entries
     of other machines stay, because a process on the same disk may be alive there. Raises OSError if the disk refuses.
     """
     ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)

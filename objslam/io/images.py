@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from objslam.io.image_size import stated_size
 
 MAX_PIXELS = 1 << 26
-"""The most pixels of an image. A larger number takes more memory and time: at this one, a PNG takes 3 s. No robot's camera
-has more."""
+"""The most pixels of an image. With this number, a PNG takes 3 s. A larger number takes more memory and time. No robot's
+camera has more."""
 _MAX_SCANNED = 1 << 29
-"""The most pixels times scans of a JPEG. A larger number takes more time: 16 million pixels in 100 scans, three times as
-much, took 4 s. A progressive JPEG has about ten scans."""
+"""The most pixels of a JPEG, multiplied by its scans. A larger number takes more time: 16 million pixels in 100 scans are
+three times as much, and took 4 s. A progressive JPEG has about ten scans."""
 _JPEG, _SCAN = b"\xff\xd8\xff", b"\xff\xda"  # The first bytes of a JPEG, and the marker before each scan.
 
 

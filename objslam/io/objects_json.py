@@ -10,12 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import FATES, Life, MapObject, ObjectMap
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
 
-FORMAT = "objslam.objects/1"  # The value of the key "format", which is the file type and its version.
+FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
+_READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
 _UNIT = 1e-3  # The largest difference of the length of a direction from 1. A larger value accepts worse directions.
 _T = TypeVar("_T")
 
@@ -26,12 +27,12 @@ class _Malformed(OutputError):
 
 def dump_objects(objects: ObjectMap) -> str:
     """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. NaN becomes null."""
-    return _dump([_entry(o) for o in objects.objects], objects.frame)
+    return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone])
 
 
 def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
     """Return the text of a ground truth file. `read_truth_objects` restores the same objects."""
-    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map")
+    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map", [])
 
 
 def read_objects(file: Path) -> ObjectMap:
@@ -44,9 +45,16 @@ def read_objects(file: Path) -> ObjectMap:
 
 def parse_objects(data: dict[str, Any]) -> ObjectMap:
     """Return the map in the decoded JSON data of an objects.json. Raises OutputError if the data are malformed."""
-    if data.get("format") != FORMAT:
+    if data.get("format") not in _READ:
         raise _Malformed(f"format is {data.get('format')!r}, not {FORMAT!r}")
-    return ObjectMap(_each(data, _map_object), _text(data.get("frame", "map"), "frame"))
+    gone = data.get("gone", [])
+    if not isinstance(gone, list):
+        raise _Malformed("gone must be a list of objects")
+    return ObjectMap(
+        _each(data["objects"], _map_object, "objects"),
+        _text(data.get("frame", "map"), "frame"),
+        _each(gone, _map_object, "gone"),
+    )
 
 
 def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tuple[TruthObject, ...]:
@@ -56,18 +64,22 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
     """
     try:
         data = _load(file)
-        if data.get("format", FORMAT) != FORMAT:
+        if data.get("format", FORMAT) not in _READ:
             raise _Malformed(f"format is {data['format']!r}, not {FORMAT!r}")
-        return tuple(o for o in _each(data, _truth_object) if o is not None)
+        return tuple(o for o in _each(data["objects"], _truth_object, "objects") if o is not None)
     except _Malformed as malformed:
         raise error(str(malformed), where=str(file)) from malformed
 
 
-def _dump(entries: list[dict[str, Any]], frame: str) -> str:
+def _dump(entries: list[dict[str, Any]], frame: str, gone: list[dict[str, Any]]) -> str:
     """Return the text of the file. Each object is on its own line, so that two files can be compared line by line."""
-    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": ['
+    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": '
+    return head + _lines(entries) + (f', "gone": {_lines(gone)}' if gone else "") + "}\n"
+
+
+def _lines(entries: list[dict[str, Any]]) -> str:
     lines = [json.dumps(entry, ensure_ascii=False, allow_nan=False) for entry in entries]
-    return head + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]}\n"
+    return "[" + ("\n  " + ",\n  ".join(lines) + "\n" if lines else "") + "]"
 
 
 def _entry(o: MapObject) -> dict[str, Any]:
@@ -89,6 +101,11 @@ def _entry(o: MapObject) -> dict[str, Any]:
         entry["labels"] = {name: float(share) for name, share in o.labels.items()}
     if o.existence is not None:
         entry["existence"] = float(o.existence)
+    if o.seen_from is not None:
+        entry["seen_from"] = [float(x) for x in o.seen_from]
+    if o.life is not None:
+        moved = o.life.moved_from
+        entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
     return entry
@@ -114,10 +131,10 @@ def _load(file: Path) -> dict[str, Any]:
     return data
 
 
-def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[_T, ...]:
+def _each(entries: list[Any], parse: Callable[[dict[str, Any]], _T], name: str) -> tuple[_T, ...]:
     parsed: list[_T] = []
     seen: set[int] = set()
-    for i, entry in enumerate(data["objects"]):
+    for i, entry in enumerate(entries):
         try:
             if not isinstance(entry, dict):
                 raise _Malformed("not a mapping")
@@ -127,7 +144,7 @@ def _each(data: dict[str, Any], parse: Callable[[dict[str, Any]], _T]) -> tuple[
             seen.add(number)
             parsed.append(parse(entry))
         except _Malformed as malformed:
-            raise _Malformed(f"objects[{i}]: {malformed}") from malformed
+            raise _Malformed(f"{name}[{i}]: {malformed}") from malformed
     return tuple(parsed)
 
 
@@ -190,7 +207,34 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         ray=ray,
         labels=labels,
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
+        seen_from=None if entry.get("seen_from") is None else _distances(entry["seen_from"]),
+        life=None if entry.get("life") is None else _life(entry["life"]),
     )
+
+
+def _distances(value: Any) -> tuple[float, float]:
+    near, far = _vector(value, "seen_from", 2).tolist()
+    if not 0 <= near <= far < MAX_POSITION:
+        raise _Malformed("seen_from must be the least and the greatest distance in metres")
+    return near, far
+
+
+def _life(value: Any) -> Life:
+    if not isinstance(value, dict):
+        raise _Malformed("life must be a mapping")
+    moved, state = value.get("moved_from"), next((fate for fate in FATES if fate == value.get("state")), None)
+    if state is None:
+        raise _Malformed(f"life.state must be one of {', '.join(FATES)}, got {_short(value.get('state'))}")
+    probability = _number(value.get("probability"), "life.probability")
+    if not 0 <= probability <= 1:
+        raise _Malformed("life.probability must be from 0 to 1")
+    counts = {name: _integer(value, name) for name in ("sessions_expected", "sessions_seen", "looks", "detections")}
+    if min(counts.values()) < 0:
+        raise _Malformed("the counts of life must not be below 0")
+    place = None if moved is None else _vector(moved, "life.moved_from")
+    if place is not None and not valid_positions(place):
+        raise _Malformed(f"life.moved_from is not below {MAX_POSITION:g} m")
+    return Life(state, probability, **counts, updated=_stamp(value, "updated"), moved_from=place)
 
 
 def _integer(entry: dict[str, Any], name: str) -> int:

@@ -47,7 +47,7 @@ def solve(
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if not frames.localized_every:
-            cause = " and tell no calibration" if settings.calibration.use is True else ""
+            cause = " and allow no calibration" if settings.calibration.use is True else ""
             ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
         if errors is None:
             progress("association", 0, 0)

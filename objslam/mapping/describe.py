@@ -17,6 +17,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
+from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
 from objslam.mapping.solution import Solution
@@ -104,9 +105,16 @@ def describe(
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
+                seen_from=_distances(estimate.positions[j], origins[kept]) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
+
+
+def _distances(position: Floats, origins: Floats) -> tuple[float, float]:
+    """Return the least and the greatest distance (m) of a position (3,) from the origins (n, 3) of its rays."""
+    distance = np.linalg.norm(origins - position, axis=1)
+    return round(float(distance.min()), 3), round(float(distance.max()), 3)
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
@@ -129,7 +137,8 @@ def summarise(
     """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
     Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
-    measurement. Its entry `planar` says whether the measured path has one height, roll and pitch.
+    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
+    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
@@ -141,6 +150,7 @@ def summarise(
         "mode": settings.mode,
         "map_frame": "localization" if solution.keyframes.localized_every else "odometry",
         "planar": is_planar(solution.keyframes.map_T_base),
+        "up": up_axis(solution.keyframes),
         "counts": {
             **counts,
             "keyframes": len(solution.keyframes),

@@ -45,12 +45,12 @@ Guess = tuple[Association, Floats]
 
 @dataclass(frozen=True)
 class JointState:
-    """What the rounds of a joint solve have found so far.
+    """The present state of the rounds of a joint solve.
 
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
-    ray, and their rays, without the shared errors found so far. errors: the shared errors, which belong to `keyframes`
-    and `rays`. theta: (P,) their last values, None before the first solve. hold: whether they are known well enough to move
-    only in the last solve. settled: whether no ray changed its object in the last round.
+    ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
+    (P,) their last values, None before the first solve. hold: whether they are known well enough to stay fixed until the
+    last solve. settled: whether no ray changed its object in the last round.
     """
 
     frames: Keyframes
@@ -123,10 +123,10 @@ class JointState:
         return state
 
     def alternated(self, map_T_base: Floats, guess: Guess | None, *, drifting: bool = False) -> Self:
-        """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the poses to begin with.
+        """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        drifting: whether the association allows for the drift of keyframes without an assigned ray. The rounds also end when
-        an earlier association comes back, because a few rays between two objects could change for ever.
+        drifting: whether the association allows for the drift of keyframes without an assigned ray. The rounds also end if
+        an earlier association returns, because a few rays between two objects could change for ever.
         """
         state, earlier = self, set[bytes]()
         for number in range(self.settings.joint.max_rounds):
@@ -145,8 +145,8 @@ class JointState:
     def drift_followed(self) -> Self:
         """Return the state after rounds that allow for the drift of keyframes without an assigned ray, if they explain more.
 
-        Their poses follow the odometry alone. Where it has drifted by more than the noise of a ray, no association at these
-        poses finds their objects. Wider gates can also lose objects, so that the rays decide.
+        These keyframes follow the odometry alone. If it has drifted by more than the noise of a ray, no association at their
+        poses finds their objects. Wider gates can also lose objects, so the number of agreeing rays decides.
         """
         assert self.association is not None
         assert self.estimate is not None
@@ -171,7 +171,7 @@ class JointState:
 
     @property
     def explained(self) -> int:
-        """The number of rays that agree with their object, beyond those that any object needs."""
+        """Return the number of rays that agree with their object, above the minimum number of each object."""
         assert self.association is not None
         assert self.estimate is not None
         agree = (self.estimate.weight > 0) & (self.association.object >= 0)
@@ -245,9 +245,9 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
 
 
 def _by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether the rays agree with that.
+    """Return the state with one object per label, and whether the rays agree with it.
 
-    If few labels are wrong, the state still has better shared errors and noise than the nominal ones.
+    If only a few labels are wrong, the shared errors and the noise of this state are still better than the nominal ones.
     """
     association, errors = associate_by_label(state.rays), state.errors
     solved = state.solve("labels", association)
@@ -304,8 +304,8 @@ def _with_loose_odometry(state: JointState) -> JointState | None:
 def _turned_since(keyframes: Keyframes, assigned: Ints) -> Floats:
     """Return the standard deviations (K,), rad, of the heading's drift between a keyframe and the nearest assigned one.
 
-    assigned: indices of keyframes with an assigned ray. 0 where no odometry leads from one to the keyframe, or with a
-    localisation.
+    assigned: indices of keyframes with an assigned ray. The result is 0 with a localisation, and if no odometry connects the
+    keyframe with an assigned one.
     """
     since = np.full(len(keyframes.stamps), np.inf)
     if keyframes.drift is None or keyframes.localized_every or len(assigned) == 0:

@@ -28,6 +28,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
@@ -35,9 +36,16 @@ from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 
 
-def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> RunResult:
+def run(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Progress = lambda stage, done, total: None,
+    known: PriorMap | None = None,
+) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
+    known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
     LogError if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
     or does not fit the log.
     """
@@ -81,7 +89,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
             say(diagnosis, ledger)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
-    objects, residual = describe(solution, cameras, settings, trusted=not diagnosis.spoilt)
+    trusted = not diagnosis.spoilt
+    objects, residual = describe(solution, cameras, settings, trusted=trusted)
     if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
         calibrated = estimate.calibration is not None
         missing = check_residuals(
@@ -90,6 +99,15 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
+    where = None
+    if known is not None:
+        with _stage("localize", seconds, progress):
+            where = localize(solution, objects, known, errors, settings, ledger)
+            if where.solution is not None and where.map_T_drive is not None:
+                solution, log = where.solution, moved_log(log, where.map_T_drive)
+                keyframes, estimate = solution.keyframes, solution.estimate
+                described, residual = describe(solution, cameras, settings, trusted=trusted)
+                objects = with_map(described, where, known)
     path = log.robot_path
     assert path is not None  # Otherwise build_keyframes has raised LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
@@ -114,6 +132,8 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
+            **({} if where is None else {"localisation": where.told}),
+            **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
         },
         settings=settings,
         cameras=cameras,
@@ -123,7 +143,15 @@ def run(log: Log, settings: Settings, ledger: Ledger, progress: Progress = lambd
         surface=surface,
         surface_before=before,
         residual_before=residual_before,
+        views=_views(log, settings, path_after),
     )
+
+
+def _views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
+    """Return all camera frames of a log without errors, at the poses of the solved path."""
+    frames = build_keyframes(log, settings, Ledger())
+    at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
+    return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from objslam.io.odometry_parquet import dump_motions
 from objslam.io.ply import write_cloud, write_mesh
 from objslam.io.rays_parquet import RaysTable, dump_rays
 from objslam.io.tum_trajectory import write_trajectory
+from objslam.io.views_parquet import Views, dump_views
 from objslam.mapping.measured_motions import motions_of
 from objslam.output.export.formats import FORMATS
 from objslam.results import files
@@ -30,8 +32,10 @@ from objslam.results.files import dump_json
 from objslam.results.read import load_map
 from objslam.sources.log_folder import resembles_log
 
-_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
+RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
 """The files that a new result replaces or deletes. They include the exports of the older result."""
+_ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
+"""The files of an older result that a live session deletes."""
 
 
 def prepare_output(out: Path) -> None:
@@ -48,13 +52,13 @@ def prepare_output(out: Path) -> None:
             hint = "name another folder with -o"
             raise OutputError("this is a log, and a result needs a folder of its own", where=str(out), hint=hint)
         names = _existing_files(out)
-        if names and not is_cut_short(out, _FILES) and not _is_result(out, names):
+        if names and not is_cut_short(out, RESULT_FILES) and not _is_result(out, names):
             what = f"these files are in the way of a result and were not written by a run: {', '.join(names)}"
             raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
-        for name in _FILES.names(out):
+        for name in RESULT_FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
                 raise OutputError("a folder stands where a file of the result goes: move it", where=str(out / name))
-    try_folder(out, _FILES)
+    try_folder(out, RESULT_FILES)
 
 
 @contextmanager
@@ -83,27 +87,23 @@ def write_result(
         OutputError: the folder cannot be written, or another run writes there.
     """
     prepare_output(out)
-    return replace_files(out, _FILES, _writers(result, truth, detected))
+    return replace_files(out, RESULT_FILES, _writers(result, truth, detected))
 
 
 def copy_result(folder: Path, out: Path) -> tuple[str, ...]:
     """Copy the files of a result into the folder `out`. Replace, return and raise as `write_result` does."""
     prepare_output(out)
-    found = [name for name in _FILES.names(folder) if (folder / name).is_file()]
-    return replace_files(out, _FILES, {name: partial(shutil.copyfile, folder / name) for name in found})
+    found = [name for name in RESULT_FILES.names(folder) if (folder / name).is_file()]
+    return replace_files(out, RESULT_FILES, {name: partial(shutil.copyfile, folder / name) for name in found})
 
 
 def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
-    A remaining file would look like a file of the session. objects.json stays, because the session replaces it. summary.json
-    marks the folder as a result, so it is deleted last.
+    A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
+    process is killed in between, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
     """
-    names = tuple(name for name in reversed(_existing_files(out)) if name != files.OBJECTS)
-    with disk_errors(out):
-        for name in names:
-            (out / name).unlink(missing_ok=True)
-    return names
+    return replace_files(out, _ALL_BUT_OBJECTS, {})
 
 
 def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, ...]) -> dict[str, Callable[[Path], object]]:
@@ -120,6 +120,9 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
     motions = motions_of(result)
     if motions is not None:
         writers[files.MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))
+    if result.views is not None:
+        views = Views.of(result.views, result.cameras, result.settings.rays.border, result.settings.rays.border_share)
+        writers[files.VIEWS] = lambda file: file.write_bytes(dump_views(views))
     if truth is not None and truth.objects:
         objects = truth.objects
         writers[files.TRUTH_OBJECTS] = lambda file: file.write_bytes(encode(dump_truth_objects(objects)))
@@ -175,7 +178,7 @@ def rays_table(result: RunResult) -> RaysTable:
 
 
 def _existing_files(out: Path) -> list[str]:
-    return [name for name in _FILES.names(out) if (out / name).is_file()]
+    return [name for name in RESULT_FILES.names(out) if (out / name).is_file()]
 
 
 def _is_result(out: Path, names: list[str]) -> bool:

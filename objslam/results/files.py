@@ -12,6 +12,7 @@ TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
 PATH = "path.txt"  # The pose map_T_base at each pose of the recorded path.
 RAYS = "rays.parquet"  # Each ray with its object.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
+VIEWS = "views.parquet"  # The pose of each camera frame, which says what could have been seen.
 CONFIG = "config.yaml"  # All settings of the run.
 SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
 DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
@@ -28,7 +29,7 @@ GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, PATH, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
-    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, EVALUATION, REPORT),
+    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, VIEWS, EVALUATION, REPORT),
 )
 """The files of a result, including the files of later commands. SUMMARY and exported files are not included."""
 

@@ -15,6 +15,7 @@ from objslam.io.objects_json import read_objects, read_truth_objects
 from objslam.io.odometry_parquet import Motions, read_motions
 from objslam.io.rays_parquet import RaysTable, read_rays
 from objslam.io.tum_trajectory import read_trajectory
+from objslam.io.views_parquet import Views, read_views
 from objslam.results import files
 from objslam.results.shapes import EvaluationFile, Summary, fault_of
 
@@ -84,6 +85,13 @@ def load_motions(out: Path) -> Motions | None:
 def load_rays(out: Path) -> RaysTable:
     """Read the rays of the result folder `out`. OutputError if the file is missing, damaged or of an older version."""
     return read_rays(out / files.RAYS)
+
+
+def load_views(out: Path) -> Views | None:
+    """Read the camera frames of the folder `out`; None if an older version wrote it. OutputError if the file is damaged."""
+    _existing(out, files.OBJECTS)
+    file = out / files.VIEWS
+    return read_views(file) if file.is_file() else None
 
 
 def load_truth(path: Path) -> Truth | None:

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from objslam.core.types import Up
+
 _Integer = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 _Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
 
@@ -34,6 +36,11 @@ class _Assessment(_Shape):
     reasons: list[str] = []
 
 
+class _Localisation(_Shape):
+    localised: bool
+    line: str
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
@@ -41,6 +48,7 @@ class Summary(_Shape):
     log_path: str | None = None
     map_frame: str = ""
     planar: bool = True
+    up: Up = "z"
     counts: dict[str, _Integer] = {}
     calibration: _Calibration | None = None
     unexplained_share: dict[str, _Number] = {}
@@ -53,6 +61,7 @@ class Summary(_Shape):
     versions: dict[str, str] = {}
     warnings: list[str] = []
     assessment: _Assessment | None = None
+    localisation: _Localisation | None = None
 
 
 class _Match(_Shape):

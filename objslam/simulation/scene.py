@@ -75,7 +75,7 @@ def furnish(settings: DriveSettings, path: Path, frame_stamps: Floats, rng: np.r
 
 
 def roam(settings: DriveSettings, scene: Scene, rng: np.random.Generator) -> Roamers:
-    """Draw objects that move through the whole room at about 0.3 m/s. Their classes are those of the scene."""
+    """Draw objects that move through the whole room at about 0.3 m/s. They have the classes of the scene."""
     moving = settings.moving
     label = rng.integers(max(len(scene.classes), 1), size=moving)
     low, high = _bounds(settings)

@@ -82,18 +82,18 @@ class DriveSettings(CourseSettings):
     cameras: tuple[InstanceOf[Camera], ...] = (make_camera(),)
     max_range: Positive = 6.0  # The largest distance at which a camera sees an object, m.
     cut_off: bool = False
-    """Whether boxes are cut off at the image's edge, as those of real detectors. If not, objects at the edge get no box."""
+    """Whether boxes are cut off at the image's edge, like boxes of real detectors. If not, objects at the edge get no
+    box."""
     objects: Annotated[int, Field(ge=0)] = 15
     """The number of objects at random positions."""
     classes: Annotated[int, Field(ge=1)] | None = None
-    """The number of classes of the objects, assigned in turn. None gives each object a class of its own."""
+    """The number of classes of the objects, assigned in turn. None gives each object its own class."""
     placed: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     """The label and the x, y, z (m, in map) of additional objects. They have the first ids."""
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """The least number of views of a random object by all cameras together, as a share of the number of one camera's
-    images."""
+    """All cameras together see a random object at least in this many images, as a share of the images of one camera."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""

@@ -1,4 +1,4 @@
-"""Put errors that all measurements share into a log: what a robot with a wrong calibration would have recorded."""
+"""Put errors that all measurements share into a log, as if a robot with a wrong calibration had recorded it."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Put one mistake into a log: what a user would have recorded or converted with wrong units, axes, stamps or calibration."""
+"""Put one mistake into a log, as if a user had recorded or converted it with wrong units, axes, stamps or calibration."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -172,7 +172,7 @@ def _camera_moved(log: Log) -> Log:
 def join(first: Log, second: Log, *, interleaved: bool) -> Log:
     """Return a log with the boxes of two recordings: frame by frame in turns, or one half of each.
 
-    Poses and calibration are those of the first.
+    Poses and calibration are from the first recording.
     """
 
     def boxes_of(a: Detections, b: Detections) -> Detections:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from objslam.errors import ConfigError, LogError
 from objslam.sources.mrclam import MrclamOptions
+from objslam.sources.no_camera import NoCamera
 from objslam.sources.options import AnyOptions, names, unused
 from objslam.sources.ros_bag.options import BagOptions
 from objslam.sources.tum_rgbd import TumOptions
@@ -84,8 +85,8 @@ SOURCES = (
     Source(
         "journal",
         "journal.objslam, the journal of a live session",
-        "sources.journal.file:is_journal",
-        "sources.journal.file:read_journal",
+        "sources.journal.segments:is_journal",
+        "sources.journal.log:read_journal",
     ),
     Source(
         "ros",
@@ -116,7 +117,8 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
     """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
     Images inside a bag are extracted into a temporary folder beside the log folder. They are then linked into the log
-    folder, so that their bytes are written only once. Raises the errors of `read` and `log_folder.write_log_folder`.
+    folder, so that their bytes are written only once. Of a recording that has no camera, the path and the mounts that tf
+    knows are written, with a warning. Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder
 
@@ -125,7 +127,11 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
     with ExitStack() as stack:
         if "extract" in names(kind.options) and options.extract is None:
             options = replace(options, extract=stack.enter_context(log_folder.beside(log)))
-        log_folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
+        try:
+            log_folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
+        except NoCamera as found:
+            written = log_folder.write_path(found, log, overwrite=overwrite)
+            ledger.warn(f"{found.where}: {found.message}; {', '.join(written)} need a camera.yaml and a detections.jsonl")
 
 
 def choose(path: Path, name: str | None = None) -> Source:

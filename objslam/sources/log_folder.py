@@ -13,16 +13,18 @@ from typing import TypeVar
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import CameraLog, Images, Log, Trajectory, Truth
 from objslam.errors import LogError, OutputError
-from objslam.io.camera_yaml import read_camera, write_camera
+from objslam.io.camera_yaml import read_camera, write_camera, write_mounts
 from objslam.io.detections_jsonl import read_detections, write_detections
 from objslam.io.folders import OLD, no_empty_folders, remove_leftovers, temporary_name
 from objslam.io.image_list import read_images, write_images
 from objslam.io.objects_json import FORMAT, read_truth_objects
 from objslam.io.text import reading
 from objslam.io.tum_trajectory import read_trajectory, write_trajectory
+from objslam.sources.no_camera import NoCamera
 
 CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
+MOUNTS = "mounts.yaml"  # The poses of cameras on the robot, of a recording that has no camera.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
@@ -77,11 +79,34 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     files = all(name and not name.startswith(".") and "/" not in name and name.isprintable() for name in names)
     if len(set(names)) < len(names) or (len(names) > 1 and not files):
         raise OutputError(f"the cameras' names must differ and be usable as folder names, got {names}", where=log.name)
+    _write_whole(path, overwrite, lambda fresh: _write_content(log, fresh, path))
+
+
+def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple[str, ...]:
+    """Write the path and the mounts of a recording without a camera, and return the names of the files.
+
+    A camera.yaml and a detections.jsonl beside them make it a log. Raises OutputError as `write_log_folder` does.
+    """
+    paths = {ODOMETRY: found.odometry, LOCALIZATION: found.localization}
+    known = {name: trajectory for name, trajectory in paths.items() if trajectory is not None}
+
+    def write(folder: Path) -> None:
+        for name, trajectory in known.items():
+            write_trajectory(trajectory, folder / name)
+        if found.mounts:
+            write_mounts(found.mounts, folder / MOUNTS)
+
+    _write_whole(Path(os.path.realpath(path)), overwrite, write)
+    return (*known, *([MOUNTS] if found.mounts else []))
+
+
+def _write_whole(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
+    """Make the folder at `path`, with what `write` writes into it, whole or not at all."""
     check_target(path, overwrite)
     with beside(path) as work, _writing(path):
         fresh = work / "new"
         fresh.mkdir()
-        _write_content(log, fresh, path)
+        write(fresh)
         try:
             if path.exists():
                 path.rename(work / OLD)
@@ -108,7 +133,7 @@ def beside(path: Path) -> Iterator[Path]:
 def check_target(path: Path, overwrite: bool) -> None:
     """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced.
 
-    What killed processes left beside it is removed first. A log that one of them was replacing is put back.
+    The remains of killed processes beside it are removed first. If one of them was replacing a log, the log is put back.
     """
     with _writing(path):
         remove_leftovers(Path(os.path.realpath(path)))

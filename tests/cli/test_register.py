@@ -1,5 +1,6 @@
-"""The command `register`: a map is found again in a turned copy, and an empty map is refused with exit code 1."""
+"""The commands that lay maps on each other: `register`, and `run --map`. Their exit codes say whether it worked."""
 
+import json
 import sys
 from dataclasses import replace
 
@@ -9,6 +10,9 @@ import pytest
 from objslam import MapObject, ObjectMap
 from objslam.cli import main
 from objslam.core.geometry import lift_se2
+from objslam.mapping.localization import moved_log
+from objslam.simulation import preset, simulate
+from objslam.sources.log_folder import write_log_folder
 
 
 def some_map(rng, count=10):
@@ -31,3 +35,46 @@ def test_a_turned_copy_is_found_and_an_empty_map_refused(tmp_path, monkeypatch, 
             main()
         assert ended.value.code == code
         assert words in capsys.readouterr().out
+
+
+def test_an_empty_folder_is_one_line_and_code_1(tmp_path, monkeypatch, capsys):
+    (tmp_path / "nothing").mkdir()
+    monkeypatch.setattr(sys, "argv", ["objslam", "register", str(tmp_path / "nothing"), str(tmp_path / "nothing")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "no result here: objects.json is missing" in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, monkeypatch, capsys):
+    first = simulate(preset("demo", frames=200), 2)
+    objects = tuple((o.label, tuple(o.position)) for o in first.truth.objects)
+    second = simulate(preset("demo", frames=200, objects=0, placed=objects, path=(3, 2)), 102)
+    write_log_folder(replace(first, truth=None), tmp_path / "first")
+    write_log_folder(moved_log(second, lift_se2(np.array([3.0, -2.0, 1.0]))), tmp_path / "second")
+    (tmp_path / "empty.json").write_text('{"format": "objslam.objects/1", "frame": "map", "objects": []}')
+    quick = ["--set", "output.recording=false", "--set", "output.picture=false"]
+
+    def objslam(*arguments):
+        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().out
+
+    assert objslam("run", tmp_path / "first", "-o", tmp_path / "map", *quick)[0] == 0
+    before = (tmp_path / "map" / "objects.json").read_bytes()
+    for known, code, words in ((tmp_path / "map", 0, "localised in"), (tmp_path / "empty.json", 3, "not localised in")):
+        out = tmp_path / f"out{code}"
+        ended, said = objslam("run", tmp_path / "second", "-o", out, "--map", known, *quick)
+        assert ended == code
+        told = json.loads((out / "summary.json").read_text())["localisation"]
+        assert told["localised"] == (code == 0)
+        assert told["line"].startswith(words)
+        assert told["line"] in said
+        assert objslam("report", out)[0] == 0
+        assert words in (out / "report.html").read_text().lower()
+    assert (tmp_path / "map" / "objects.json").read_bytes() == before
+    assert ObjectMap.load(tmp_path / "out0").by_id(0).label == ObjectMap.load(tmp_path / "map").by_id(0).label

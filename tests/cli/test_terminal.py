@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from objslam.cli import console as terminal
-from objslam.cli.live_status import status_line
+from objslam.cli.live_command.status import status_line
 from objslam.cli.run import objects_table
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import MapObject, ObjectMap
@@ -65,7 +65,7 @@ def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
             show(snapshot, Ledger())
     finally:
         terminal.console.cache_clear()
-    assert "0 objects, 0 unresolved | odometry " in screen.getvalue()
+    assert "0 objects, 0 unresolved | dropped 2 (frame too late) | " in screen.getvalue()
     lines = [""]
     for part in re.split(r"(\x1b\[[0-9?]*[A-Za-z]|\r|\n)", screen.getvalue()):
         if part == "\n":
@@ -82,7 +82,7 @@ def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
 
 def test_the_status_line_says_why_most_was_dropped(monkeypatch):
     """Also what the adapter dropped, and apart from it what the settings leave unused."""
-    monkeypatch.setattr("objslam.cli.live_status._LINES", 0.0)
+    monkeypatch.setattr("objslam.cli.live_command.status._LINES", 0.0)
     seen = io.StringIO()
     monkeypatch.setattr(sys, "stderr", seen)
     terminal.console.cache_clear()

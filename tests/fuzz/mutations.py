@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import os
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,10 @@ ROUNDS = int(os.environ.get("OBJSLAM_FUZZ_ROUNDS", "1"))
 """How many times the inputs of the suite a target gets. tools/fuzz.sh sets a larger number."""
 SEED = int(os.environ.get("OBJSLAM_FUZZ_SEED", "0"))
 """The first seed of the byte mutations. tools/fuzz.sh counts it up, so that each of its rounds has other inputs."""
+CORPUS = Path(__file__).parent / "corpus"
+"""The inputs that once broke a target, in a folder for each. Every run gives them to the target again."""
+COUNTED = {"inputs": 0}
+"""How many inputs the targets got so far."""
 NUMBERS = [b"nan", b"inf", b"-1", b"1e300", b"1e400", b"99999999999999999999", b"0", b"null", b"true", b"[]", b"{}", b'""']
 ODD = [
     None,
@@ -99,13 +105,30 @@ def as_json(data: Any) -> bytes:
     return json.dumps(data).encode("utf-8", "surrogatepass")
 
 
-def survives(parse: Callable[[], Any]) -> bool:
-    """Whether a parser takes its input. What it takes must be valid, and what it refuses must end in our own error."""
+def known(target: str) -> Iterator[bytes]:
+    """Yield the inputs in the folder `corpus` that once broke a target."""
+    folder = CORPUS / target
+    for file in sorted(folder.iterdir()) if folder.is_dir() else ():
+        yield file.read_bytes()
+
+
+def survives(parse: Callable[[], Any], target: str = "", data: bytes = b"") -> bool:
+    """Whether a parser takes its input. What it takes must be valid, and what it refuses must end in our own error.
+
+    target, data: an input that breaks the parser is written into the folder `corpus` under the name of the target.
+    """
+    COUNTED["inputs"] += 1
     try:
         found = parse()
+        check(found)
     except ObjslamError:
         return False
-    check(found)
+    except BaseException:
+        if target:
+            file = CORPUS / target / hashlib.sha256(data).hexdigest()[:16]
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(data)
+        raise
     return True
 
 

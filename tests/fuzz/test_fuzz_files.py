@@ -23,7 +23,9 @@ from objslam.io.images import decode_colour, decode_depth
 from objslam.io.objects_json import read_objects, read_truth_objects
 from objslam.io.tum_trajectory import read_trajectory
 from objslam.simulation import make_camera
-from objslam.sources.journal.file import Journal, messages, read_journal
+from objslam.sources.journal.journal import Journal
+from objslam.sources.journal.log import read_journal
+from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import (
     CalibrationMessage,
     CameraMessage,

@@ -19,12 +19,12 @@ from objslam.live.session.session import Session
 from objslam.live.session.snapshots import Describer
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
-from objslam.sources.journal import file as journals
+from objslam.sources.journal import journal as journals
 from objslam.sources.log_folder import write_log_folder
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
 QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
-live_command = importlib.import_module("objslam.cli.live")  # the name in objslam.cli is the function
+live_command = importlib.import_module("objslam.cli.live_command.command")
 PATIENCE = 60  # s until a wait counts as one for ever
 
 

@@ -17,7 +17,7 @@ from objslam.config import load_settings
 from objslam.core.camera import Camera, RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.live.session.session import Session
-from objslam.sources.journal.file import messages
+from objslam.sources.journal.reader import messages
 
 SETTINGS = load_settings(None, ("mode=joint",))
 MATRIX = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])

@@ -10,8 +10,8 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.session import session as sessions
 from objslam.live.session.session import Session
 from objslam.simulation import make_camera
-from objslam.sources.journal import file as journals
-from objslam.sources.journal.file import messages
+from objslam.sources.journal import journal as journals
+from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import MountMessage
 
 SETTINGS = load_settings(None, ("mode=joint",))
@@ -111,16 +111,18 @@ def test_a_record_that_could_not_be_taken_back_ends_the_journal(tmp_path, monkey
 
     monkeypatch.setattr(journals.os, "write", half)
     monkeypatch.setattr(journals.os, "ftruncate", no_cut)
-    assert not session.push_odometry(1.0, np.eye(4))
+    assert session.push_odometry(1.0, np.eye(4))
     monkeypatch.setattr(journals.os, "write", write)
     monkeypatch.setattr(journals.os, "ftruncate", cut)
-    assert not session.push_odometry(2.0, np.eye(4))
+    assert session.push_odometry(2.0, np.eye(4))
     session.abort()
+    (warning,) = session.counters.ledger.warnings
+    assert "the journal stops, and the session goes on without it: No space left on device" in warning
     assert [m.stamp for m in journalled(tmp_path / "journal.objslam")] == [0.0]
 
 
 def test_a_message_too_long_to_be_read_back_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(journals, "_LONGEST", 1000)
+    monkeypatch.setattr(journals, "LONGEST", 1000)
     session = Session(SETTINGS, tmp_path / "journal.objslam")
     assert session.push_camera(make_camera("front"))
     assert not session.push_detections(1.0, "front", [[1, 1, 9, 9]], ["cup" * 1000], [1.0])

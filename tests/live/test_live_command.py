@@ -19,7 +19,7 @@ from objslam.live.session.session import Session
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources import read
-from objslam.sources.journal.file import messages
+from objslam.sources.journal.reader import messages
 from objslam.sources.log_folder import write_log_folder
 
 QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
@@ -159,7 +159,7 @@ def test_a_start_killed_before_its_first_message_costs_no_journal(log, tmp_path,
     kept = journal_in(out)
     file = out / "journal.objslam"
     with subprocess.Popen(command("stdin", out), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
-        wait_for(lambda: (out / "journal.1.objslam").exists() and file.exists() and file.stat().st_size == 8)
+        wait_for(lambda: (out / "journal.1.objslam").exists() and file.exists() and file.stat().st_size == 24)
         process.kill()
     done = subprocess.run(command("stdin", out, *more), input="", capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 1

@@ -16,7 +16,7 @@ pytest.importorskip("cyclonedds")
 from objslam.cli import app
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
-from objslam.sources.journal.file import messages
+from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import FrameMessage, PoseMessage
 
 

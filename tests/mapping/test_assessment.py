@@ -33,13 +33,14 @@ def test_a_usual_result_is_good() -> None:
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
         ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
+        ({"fixed": True, "odometry_frame": True}, "check", "The poses are the odometry's as they are, so its drift is in"),
         ({"rays": 20, "unexplained": 0}, "check", "Only 20 boxes were used, which is too few to notice wrong input."),
     ],
 )
 def test_each_cause_has_its_reason(changes: dict[str, object], level: str, reason: str) -> None:
     found = assess(replace(GOOD, **changes))  # type: ignore[arg-type]
     assert found.level == level
-    assert len(found.reasons) == 1
+    assert len([reason for reason in found.reasons if not reason.startswith("The map lies")]) == 1
     assert found.reasons[0].startswith(reason)
 
 
@@ -69,6 +70,14 @@ def test_a_run_knows_how_far_its_rays_miss(sigma: float, level: str) -> None:
 def test_a_run_from_odometry_says_that_the_map_has_its_frame() -> None:
     joint = objslam.run(small_log(), QUIET, mode="joint", poses={"use": "odometry"})
     assert "frame of the odometry" in str(joint.assessment)
+
+
+def test_fixed_poses_are_good_where_they_are_absolute_and_not_where_they_drift() -> None:
+    drifting = objslam.run(small_log(), QUIET, mode="fixed", poses={"use": "odometry"})
+    assert drifting.assessment.level == "check"
+    assert "drift is in the map" in drifting.assessment.reasons[0]
+    absolute = objslam.run(small_log(), QUIET, mode="fixed", poses={"use": "localization"})
+    assert "drift is in the map" not in str(absolute.assessment)
 
 
 def test_boxes_at_the_edge_are_told() -> None:

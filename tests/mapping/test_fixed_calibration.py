@@ -125,7 +125,7 @@ def test_plain_odometry_calibrates_nothing_and_says_so():
     log = simulate(preset("demo", localization=None, odometry=Odometry(), frames=150), 1)
     ledger = Ledger()
     assert run(log, "calibration.use=true", ledger=ledger).calibration is None
-    assert any("plain odometry and tell no calibration" in warning for warning in ledger.warnings)
+    assert any("plain odometry and allow no calibration" in warning for warning in ledger.warnings)
 
 
 def test_each_of_two_cameras_has_its_own_errors():

@@ -8,11 +8,13 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Keyframes, Trajectory
+from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping.joint_alternation import JointState, _turned_since
+from objslam.mapping.pipeline import run
 from objslam.mapping.solution import seen_something
-from objslam.simulation import preset, simulate
+from objslam.simulation import DepthNoise, preset, simulate
 
 
 def keyframes_with_drift(heading):
@@ -64,3 +66,16 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     assert followed.association.count == 8
     assert followed.explained == len(rays) - 8 * settings.association.min_rays  # every ray
     assert plain.explained < 0.9 * followed.explained
+
+
+def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():
+    """The first exploration gates by the noise of the settings, and finds some objects twice."""
+    default = Odometry()
+    noisy = {name: 4 * getattr(default, name) for name in type(default).model_fields if not name.startswith("floor")}
+    changes = {"objects": 8, "classes": 2, "frames": 150, "frame_rate": 2.0, "pixel_sigma": 3.0, "missed": 0.0, "false": 0.0}
+    changes |= {"odometry": default.model_copy(update=noisy), "depth": DepthNoise(), "localization": None}
+    log = simulate(preset("demo", **changes), 7)
+    result = run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
+    score = evaluate(result.map, log.truth, result.path_after, align="se2", radius=1.0).to_dict()
+    assert (score["matched"], score["false"]) == (8, 0)
+    assert score["ate"] < 0.15

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from faults import contents, in_child, killed_at
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from killed import contents, in_child, killed_at
 from small_log import small_log
 from synthetic_result import clusters, synthetic_result
 
@@ -169,7 +169,7 @@ def test_malformed_objects_are_named(tmp_path: Path, change: dict[str, object], 
         (b'{"objects": {}}', "not an objects file"),
         (b'{"format": "objslam.objects/1", "objects": [3]}', "objects[0]: not a mapping"),
         (b'{"objects": []}', "format is None"),
-        (b'{"format": "objslam.objects/2", "objects": []}', "format is 'objslam.objects/2'"),
+        (b'{"format": "objslam.objects/3", "objects": []}', "format is 'objslam.objects/3'"),
         (b"[" * 100_000, "not JSON that can be read"),
         (b'{"format": "objslam.objects/1", "objects": [{"id": ' + b"9" * 10_000 + b"}]}", "not JSON that can be read"),
     ],
@@ -347,7 +347,7 @@ def test_killed_at_any_moment_no_half_file_and_no_mix(tmp_path: Path) -> None:
         assert {p.name for p in out.iterdir()} == PLAIN_FILES
         if code == 0:
             break
-        assert code == 9
+        assert code == -9
     assert code == 0
     assert step > 15
     assert seen == {"old", "none", "new"}
@@ -419,7 +419,7 @@ def test_a_file_that_no_run_wrote_stays(tmp_path: Path, name: str) -> None:
 
 
 def test_what_a_killed_run_left_beside_is_still_not_taken_for_a_result(tmp_path: Path) -> None:
-    assert in_child(killed_at(4, lambda: write_result(small(), tmp_path))) == 9
+    assert in_child(killed_at(4, lambda: write_result(small(), tmp_path))) == -9
     assert (tmp_path / ".objslam-staging").is_dir()
     (tmp_path / "config.yaml").write_text("mode: joint")
     with pytest.raises(OutputError, match=r"config\.yaml"):

@@ -8,7 +8,9 @@ import pytest
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate, lift_se2
 from objslam.evaluation.alignment import match_points
+from objslam.mapping.localization import PriorMap, moved_log
 from objslam.mapping.pipeline import run
 from objslam.sources import read
 
@@ -73,7 +75,38 @@ def test_no_object_is_there_twice(whole):
     assert (apart[same & ~np.eye(len(labels), dtype=bool)] >= 0.05).all()
 
 
-def test_half_of_the_log_gives_the_same_objects_as_the_other(log):
-    (first, here), (second, there) = (objects(half(log, late)) for late in (False, True))
+@pytest.fixture(scope="module")
+def halves(log):
+    """The first half as a map, and the second half in a frame that nobody knows, found in this map."""
+    unknown = lift_se2(np.array([3.0, -7.0, 2.0]))
+    first = run(half(log, False), Settings(), Ledger())
+    known = PriorMap("first", first.map)
+    return first, run(moved_log(half(log, True), unknown), Settings(), Ledger(), known=known)
+
+
+def test_the_second_half_is_found_in_the_map_of_the_first(log, halves, whole):
+    first, second = halves
+    told = second.summary["localisation"]
+    assert told["localised"]
+    true, there = interpolate(log.localization.stamps, log.localization.poses, second.keyframes.stamps, 1.0)
+    assert there.all()
+    assert np.sqrt((np.linalg.norm((second.map_T_base - true)[:, :3, 3], axis=1) ** 2).mean()) <= 0.05
+    labels, positions = np.array(whole[0]), whole[1]
+
+    def of_one_run(o):
+        """The object of a run over both halves that is nearest."""
+        same = np.flatnonzero(labels == o.label)
+        return same[np.linalg.norm(positions[same] - o.position, axis=1).argmin()]
+
+    by_id = {o.id: o for o in second.map}
+    as_one = [of_one_run(first.map.by_id(m["id"])) == of_one_run(by_id[m["id"]]) for m in told["matches"]]
+    assert len(as_one) >= 15
+    assert np.mean(as_one) >= 0.95
+
+
+def test_half_of_the_log_gives_the_same_objects_as_the_other(halves):
+    (first, here), (second, there) = (
+        ([o.label for o in r.map.resolved()], np.array([o.position for o in r.map.resolved()])) for r in halves
+    )
     matched, _ = match_points(here, there, np.array(first)[:, None] == np.array(second), 0.1)
     assert len(matched) >= 15

@@ -106,7 +106,7 @@ def test_a_robot_is_read(dataset):
         "measurement of an unknown barcode": 1,
         "measurement of another robot": 2,
         "measurement with a bearing outside the virtual camera's view": 1,
-        "range that is not above zero (taken as unknown)": 1,
+        "range that is not above zero or too large (taken as unknown)": 1,
         "landmark line with a subject that is no landmark": 1,
     }
     assert ledger.examples["measurement of another robot"] == [f"{measurement}:4", f"{measurement}:5"]

@@ -1,4 +1,4 @@
-"""Registers two maps whose frames are unknown to each other.
+"""Registers two maps if the transform between their frames is unknown.
 
-Proposals come from pairs of objects. Fits make them precise, and the number of false alarms judges them.
+Pairs of objects propose transforms. Fits make them precise, and the number of false alarms judges them.
 """

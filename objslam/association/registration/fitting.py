@@ -1,4 +1,4 @@
-"""Two maps to be registered, and the robust fit of transforms to the objects that match under them."""
+"""Two maps to be registered, and the robust fit of transforms to the objects that match."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -9,15 +9,16 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import HUBER_K, SAME_POINT
 
 _FLOOR = 0.01
-"""The least standard deviation (m) of a position. It lets maps without noise be registered."""
+"""The least standard deviation (m) of a position. It also allows maps without noise to be registered."""
 _DENSITY_NEIGHBOURS = 8
 """The number of neighbours that measure the local density of objects. A larger number smooths the density more."""
 
 
 class Problem:
-    """Both maps about their middles, with what is computed once of them.
+    """Both maps relative to their centres, with values that are computed only once.
 
-    spread_a, spread_b: (N,) and (M,) horizontal variance of a position, m^2. apart: m, more than any two objects are apart.
+    spread_a, spread_b: (N,) and (M,) horizontal variance of a position, m^2. apart: m, more than the distance of any two
+    objects.
     """
 
     def __init__(self, a: Constellation, b: Constellation) -> None:
@@ -30,7 +31,7 @@ class Problem:
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
     def nearest(self, moved: Floats, index: Ints) -> Ints:
-        """Return for points (H, P, 3) of the objects `index` (H, P) of a the nearest object of b with an equal label."""
+        """Return the nearest object of b with an equal label, for points (H, P, 3) of the objects `index` (H, P) of a."""
         at = np.concatenate([moved, self.a.label[index][..., None] * self.apart], axis=-1)
         return np.asarray(self._labelled.query(at.reshape(-1, 4))[1]).reshape(index.shape)
 
@@ -73,7 +74,7 @@ def jacobian_of(x: Floats, moved: Floats) -> Floats:
 
 
 def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Return for objects of a (H, P) their nearest objects of b, the misses, covariances, Jacobians, and which match.
+    """Return for objects of a (H, P) their nearest objects of b, the offsets, covariances, Jacobians, and which match.
 
     hessian: (H, 4, 4) the information of the transforms, NaN before the first fit. Its inverse widens the gates.
     """
@@ -87,14 +88,14 @@ def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Int
     doubt[known] = np.linalg.inv(hessian[known])
     total = covariance + jacobian @ doubt[:, None] @ np.swapaxes(jacobian, -1, -2)
     squared = (miss * np.linalg.solve(total, miss[..., None])[..., 0]).sum(axis=-1)
-    limit = np.where(known, SAME_POINT, 2 * SAME_POINT)[:, None]  # The heading of a pair alone is coarse.
+    limit = np.where(known, SAME_POINT, 2 * SAME_POINT)[:, None]  # The heading by a single pair is not precise.
     return partner, miss, covariance, jacobian, squared <= limit
 
 
 def fit(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Floats, Floats]:
     """Return transforms (H, 4) after one robust Gauss-Newton step on the matches of objects (H, P), and their information.
 
-    A transform with fewer than two matches stays, and its information is NaN.
+    A transform with fewer than two matches stays unchanged, and its information is NaN.
     """
     _, miss, covariance, jacobian, good = gate(problem, index, x, hessian)
     return robust_step(x, miss, covariance, jacobian, good)
@@ -116,7 +117,7 @@ def robust_step(x: Floats, miss: Floats, covariance: Floats, jacobian: Floats, g
 
 
 def one_each(partner: Ints, good: Bools) -> Bools:
-    """Return which matches (H, P) remain if an object of b counts once in each row."""
+    """Return which matches (H, P) remain if an object of b may be matched only once in each row."""
     marked = np.where(good, partner, -1 - np.arange(partner.shape[1]))
     order = np.argsort(marked, axis=1, kind="stable")
     ordered = np.take_along_axis(marked, order, axis=1)

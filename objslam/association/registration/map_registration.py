@@ -1,8 +1,8 @@
-"""Register two maps whose frames are unknown to each other, by how their objects lie to each other.
+"""Register two maps whose frames are unknown to each other, by the relative positions of their objects.
 
-Pairs of objects with equal labels and equal distances propose transforms. The best proposals grow from the neighbourhood of
-their pair to the whole map. The evidence is a number of false alarms (a-contrario; Desolneux, Moisan & Morel 2000): how many
-proposals as good as this one two maps of unrelated places would give.
+Pairs of objects with equal labels and equal distances propose transforms. The fit of the best proposals grows from the
+neighbourhood of their pair to the whole map. The evidence is a number of false alarms (a-contrario; Desolneux, Moisan &
+Morel 2000): the expected number of equally good proposals from two maps of unrelated places.
 """
 
 from dataclasses import dataclass
@@ -32,25 +32,25 @@ from objslam.core.statistics import SAME_POINT
 
 Verdict = Literal["accepted", "ambiguous", "too little evidence"]
 MIN_LOG_ODDS = 9.2
-"""The least log odds against chance of an accepted registration, and its least lead over another place. A larger value
-refuses more. 9.2 allows one false alarm in 10,000 pairs of maps."""
+"""The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
+refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""For each stage of growth, how many objects around its pair a proposal is fitted to, and how many proposals enter. Larger
-numbers find smaller overlaps and take longer."""
+"""For each stage of growth, the number of objects around its pair to which a proposal is fitted, and the number of proposals
+that enter. Larger numbers find smaller overlaps and take longer."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms nearer than this (m at the middle of the map, rad) are one place. Larger values hide a near repetition."""
+"""Two transforms nearer than this (m at the centre of the map, rad) are one place. Larger values hide a near repetition."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """How one map lies in the frame of another.
+    """The transform between the frames of two maps.
 
-    b_T_a: (4, 4) takes points of the map a to the frame of b; it turns about z only. NaN if no transform fits at all.
+    b_T_a: (4, 4) takes points from the frame of map a to the frame of b. It turns about z only. NaN if no transform fits.
     covariance: (4, 4) of the x, y, z (m) and yaw (rad) of b_T_a. matches: (P, 2) indices of one object in a and in b.
-    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: the same of
-    the best other place, None and -inf if there is none.
+    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: the same
+    for the best other place, None and -inf if there is none.
     """
 
     b_T_a: Floats
@@ -62,12 +62,12 @@ class Registration:
 
     @property
     def lead(self) -> float:
-        """How much the log odds exceed those of the best other place, or 0 where that place has none."""
+        """The log odds minus the log odds of the best other place. Negative odds of the other place count as 0."""
         return self.log_odds - max(self.second_log_odds, 0.0)
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the evidence carries the transform, and whether it carries another place as well."""
+        """Whether the evidence is enough for the transform, and whether it is enough for another place too."""
         if self.log_odds < MIN_LOG_ODDS:
             return "too little evidence"
         return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"
@@ -79,12 +79,12 @@ class Registration:
 
 
 def register_maps(a: Constellation, b: Constellation) -> Registration:
-    """Find the transform (yaw and translation) from the frame of a to that of b. Labels are numbers that both maps share.
+    """Find the transform (yaw and translation) from the frame of a to the frame of b. Both maps use the same label numbers.
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)): T proposals were tried, m objects match, and X is Poisson
-    with the mean of the chance matches. The chance that an object of a has a match is the local density of objects in b,
-    times the area of the gate, times the share of the objects of b that have its label and its height. The two objects of
-    the proposing pair do not count.
+    distributed. Its mean is the sum of the chances of all objects of a to have a match. This chance is the local density of
+    objects in b, times the area of the gate, times the share of the objects of b with the same label and height. The two
+    objects of the proposing pair do not count.
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:
@@ -109,7 +109,7 @@ def register_maps(a: Constellation, b: Constellation) -> Registration:
         return transform
 
     b_T_a = whole(fitted)
-    lever = np.eye(4)  # The translation of b_T_a is that of the centre, less the turned centre.
+    lever = np.eye(4)  # The translation of b_T_a is the moved centre of a, minus its turned centre.
     turned = b_T_a[:3, :3] @ centre_a
     lever[0, 3], lever[1, 3] = turned[1], -turned[0]
     return Registration(
@@ -128,7 +128,7 @@ def _nothing() -> Registration:
 
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
-    """Return the best transforms (H, 4), each fitted to the objects around its pair, then farther, then to all."""
+    """Return the best transforms (H, 4). Each is fitted first to the objects around its pair, then to more, then to all."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)
@@ -152,7 +152,7 @@ def _everything(problem: Problem, x: Floats) -> Ints:
 
 
 def _differ(x: Floats, other: Floats) -> Bools:
-    """Return which transforms (H, 4) are another place than one transform (4,)."""
+    """Return which transforms (H, 4) mean another place than one transform (4,)."""
     turn = (x[:, 3] - other[3] + np.pi) % (2 * np.pi) - np.pi
     return np.asarray((np.hypot(*(x[:, :2] - other[:2]).T) > _SAME_SHIFT) | (np.abs(turn) > _SAME_TURN))
 
@@ -160,7 +160,7 @@ def _differ(x: Floats, other: Floats) -> Bools:
 def _log_odds(problem: Problem, index: Ints, x: Floats, tried: int) -> Floats:
     """Return the log odds against chance (H,) of transforms (H, 4), by the formula of `register_maps`.
 
-    The tail of the Poisson distribution is bounded by its first term and a geometric series: with mean u, P(X >= n) is at
+    A bound for the tail of the Poisson distribution is its first term and a geometric series: with mean u, P(X >= n) is at
     most exp(n ln u - u - ln n!) / (1 - u / (n + 1)).
     """
     moved = move(x, problem.a.position[index])

@@ -8,19 +8,19 @@ from objslam.association.registration.fitting import Problem, move
 from objslam.core.arrays import Array, Floats, Ints
 
 _PAIRS = 6000
-"""The most ordered pairs of one map that propose transforms, except that each object has at least `_MIN_PARTNERS`. A larger
+"""The most ordered pairs of one map that propose transforms. But each object has at least `_MIN_PARTNERS` partners. A larger
 number finds smaller overlaps and takes longer. Chosen for time, not by a sweep."""
 _MIN_PARTNERS = 6
-"""The least number of partners of an object in the pairs. A larger number takes longer on large maps."""
+"""Each object has at least this number of partners in the pairs. A larger number takes longer on large maps."""
 _MIN_BASE = 6.0
-"""The least distance of a pair's two objects, in standard deviations of their difference. A larger value gives better
-headings and fewer pairs. At 6, the heading of a pair has a standard deviation below 1/6 rad in each map."""
+"""The least distance between the two objects of a pair, in standard deviations of their difference. A larger value gives
+better headings and fewer pairs. At 6, the heading of a pair has a standard deviation below 1/6 rad in each map."""
 _GATE = 3.0
 """The largest difference of two pairs' lengths, in standard deviations. A larger value proposes more wrong transforms."""
 _MAX_PROPOSALS = 60_000
 """The most proposals that are compared by the neighbours of their pair. A larger number takes longer."""
 _NEIGHBOURS = 12
-"""The number of neighbours that compare a proposal. A larger number ranks better and takes longer."""
+"""The number of neighbours by which a proposal is compared. A larger number ranks better and takes longer."""
 _AT_ONCE = 1 << 20
 """The most differences of neighbours computed together. A larger number needs more memory."""
 
@@ -36,10 +36,10 @@ def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
 
 
 def propose(problem: Problem) -> tuple[Ints, Floats, int]:
-    """Return the proposals: the first object (H,) of its pair in a, the transform (H, 4), and how many were tried in all.
+    """Return the proposals: the first object (H,) of its pair in a, the transform (H, 4), and the number of tried proposals.
 
-    A transform is where the middle of a lies in b: x, y, z (m) and yaw (rad). If there are too many proposals, those of the
-    pairs with the fewest like pairs remain, because they are the most distinctive.
+    A transform is the position of the centre of a in b: x, y, z (m), and yaw (rad). If there are too many proposals, the
+    most distinctive ones remain. Their pairs have the fewest similar pairs.
     """
     a, b = problem.a, problem.b
     (i, j), (k, n) = _pairs(a, problem.spread_a), _pairs(b, problem.spread_b)
@@ -69,14 +69,14 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     x[:, :3] = (ends_b - move(x, ends_a[:, None])[:, 0]) / 2
     support = _support(problem, i[p], k[q], yaw, (var_a[p] + var_b[q]) / long_a[p] ** 2)
     best = np.argsort(-support, kind="stable")
-    # Of the proposals of one place, in cells of a metre and of 0.2 rad, only the best remains.
+    # Proposals in one cell of a metre and 0.2 rad are one place. Only the best of them remains.
     cell = np.round(np.column_stack([x[:, :2], np.mod(yaw, 2 * np.pi) / 0.2]))[best]
     best = best[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
     return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair proposes in both orders.
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
-    """Return how many neighbours (H,) of the object i (H,) of a land on a neighbour of the object k (H,) of b."""
+    """Return the number (H,) of neighbours of object i (H,) of a that fall on a neighbour of object k (H,) of b."""
     (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))
     support = np.zeros(len(i))
     spread = float(np.median(problem.spread_b))

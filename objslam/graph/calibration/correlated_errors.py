@@ -1,7 +1,7 @@
-"""Measure how far errors that hang together in time make the shared errors less certain than white noise would.
+"""Measure by how much the shared errors are less certain because noise is correlated in time.
 
-The gradient by a parameter is a sum over measurements. Its variance is that of the sums over windows of time, which need not
-be white inside (cluster-robust covariance; Liang and Zeger 1986).
+The gradient by a parameter is a sum over measurements. It is split into sums over windows of time, and its variance is the
+variance of these sums. Noise need not be white inside a window (cluster-robust covariance; Liang and Zeger 1986).
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from objslam.graph.calibration.variance_components import TOGETHER
 def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
-    Each is the ratio of the deviation by sums over windows of `TOGETHER` seconds to that of white noise. system: of the
-    graph. SolveError if the linear system is singular.
+    A factor is the standard deviation by sums over windows of `TOGETHER` seconds, divided by the one for white noise.
+    system: of the graph. SolveError if the linear system is singular.
     """
     jacobian = system.jacobian
     factored = factor(jacobian)

@@ -15,16 +15,17 @@ from objslam.core.types import Association
 from objslam.errors import SolveError
 
 _ROUNDS = 12
-"""The most Gauss-Newton steps. More are more exact, and a step is cheap."""
+"""The most Gauss-Newton steps. More steps are more exact, and a step is cheap."""
 _CONVERGED = 0.01
-"""The step, in posterior standard deviations, below which an error has converged; larger ends sooner."""
+"""An error has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _CAUCHY = 3.0
 """The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
 _STRETCHES = 50
-"""The number of stretches of the drive that count as independent. Fewer, longer stretches allow for errors that last
-longer, and tell the size of these errors less exactly."""
+"""The number of stretches of the drive that count as independent. With fewer, longer stretches, errors may last longer, but
+the size of these errors is less exact."""
 _FREE = 1e-6
-"""The information (m^-2) that keeps an object determined that no ray places. A larger value moves other objects."""
+"""The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
+objects."""
 
 Noise = tuple[Floats, float]
 """The standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins."""
@@ -33,7 +34,7 @@ Noise = tuple[Floats, float]
 @dataclass(frozen=True)
 class FixedCalibration:
     """The shared errors at known poses. sensitivity: (N, 3, P) of the objects, m per unit of each error, 0 for an
-    object that was not placed."""
+    object without a position."""
 
     calibration: Calibration
     sensitivity: Floats
@@ -41,12 +42,12 @@ class FixedCalibration:
 
 @dataclass(frozen=True)
 class PointSystem:
-    """The normal equations of the shared errors with the points eliminated. The robust weights are held.
+    """The normal equations of the shared errors with the points eliminated. The robust weights are kept fixed.
 
     matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
-    by what factor (at least 1) they exceed their expectation. curvature: the mean curvature of Cauchy's loss as a share of
-    that of the weighted squares, which is 0 to 1. scores: (n, P) what each ray adds to the vector. back: (N, 3, P) how the
-    points follow the errors. own: (N, 3) m, how they move by themselves.
+    the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
+    over the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
+    derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
     """
 
     matrix: Floats
@@ -62,16 +63,16 @@ class PointSystem:
 def calibrate_at_poses(
     errors: CalibratedMeasurements, association: Association, positions: Floats, theta: Floats, noise: Noise
 ) -> FixedCalibration:
-    """Estimate the shared errors from theta (P,) on. What the rays do not tell stays at its prior.
+    """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
 
-    positions: (N, 3) m, the start, NaN for an object that no ray places. Its rays do not count. noise: with that of the
-    poses. SolveError if the linear system has no single solution.
+    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: with the noise of
+    the poses. SolveError if the linear system has no single solution.
     """
-    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # -1, no object, indexes the last
+    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # The index -1 (no object) takes the last.
     number, owner = np.unique(association.object[held], return_inverse=True)
     points = positions[number]
     if not held.any():
-        raise SolveError("no object is placed, so that nothing is calibrated against the poses")
+        raise SolveError("no object has a position, so nothing can be calibrated against the poses")
     keyframe = errors.rays.keyframe[held]
     prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
     for _ in range(_ROUNDS):
@@ -94,7 +95,7 @@ def calibrate_at_poses(
 
 
 def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:
-    """Return the standard deviations (R,), rad, of ray directions in map that the covariance of shared errors causes."""
+    """Return the standard deviations (R,), rad, that the covariance of shared errors gives to ray directions in map."""
     size, axes = np.linalg.eigh(calibration.covariance)
     variance = np.zeros(len(errors.rays))
     for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
@@ -103,7 +104,7 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the angles (R,), rad, by which ray directions in map turn from some shared errors (P,) to others (P,)."""
+    """Return the angles (R,), rad, by which ray directions in map turn if shared errors (P,) change to others (P,)."""
     ends = []
     for values in (before, after):
         keyframes, rays, _ = errors.at(values, drift=False)
@@ -116,7 +117,7 @@ def linearise_points(
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    owner: (n,) the point of each of the held (R,) rays. noise: with that of the poses.
+    held: (R,) the rays that count. owner: (n,) the point of each of them. noise: with the noise of the poses.
     """
     angle, place = noise
     target = points[owner]
@@ -146,17 +147,17 @@ def linearise_points(
     matrix = np.einsum("n,nkp,nkq->pq", weight, reduced, reduced)
     cost = float((weight[:, None] * left**2).sum())
     variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
-    # For the weight w, the curvature in the direction of a deviation and across it is 2 w^2 - w and w: on average w^2.
+    # For the weight w, the curvature is 2 w^2 - w along a deviation and w across it. The mean is w^2.
     curvature = float((robust * weight).sum() / max(weight.sum(), 1e-300))
     return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, np.asarray(back), np.asarray(own))
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
-    """Return by what factor (at least 1) the vector varies more than it would if all rays erred independently.
+    """Return the factor (at least 1) by which the vector varies more than with independent errors of all rays.
 
-    Rays of one frame share the error of its pose, and those of some seconds that of the localisation, or of a detector. The
-    sum over such a stretch of the drive shows it (cluster-robust covariance; Liang and Zeger 1986). The error where this is
-    worst counts for all. prior: (P, P) information. Errors about which it says more than the rays do not count.
+    Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
+    detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
+    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior says more than the rays.
     """
     told = np.diagonal(system.matrix) > np.diagonal(prior)
     if not told.any():

@@ -1,6 +1,6 @@
 """Estimate the errors that all measurements share, around the joint solve: variable projection (Golub and Pereyra 1973).
 
-An outer Gauss-Newton step moves the parameters; an inner solve moves poses and landmarks to the measurements that result.
+An outer Gauss-Newton step moves the parameters. An inner solve then fits poses and landmarks to the new measurements.
 """
 
 from __future__ import annotations
@@ -27,46 +27,46 @@ from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supp
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _ROUNDS = 8
-"""The most outer steps; more is slower. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6."""
+"""The most outer steps. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6. A larger number is slower."""
 _CONVERGED = 0.2
-"""The step, in posterior standard deviations, below which a parameter has converged; larger ends sooner."""
+"""A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _INNER = 3
-"""The iterations of an inner solve. Few are enough, because each begins at a linear prediction of its optimum."""
+"""The iterations of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
 _TOLERANCE = 1e-4
-"""The relative decrease of the cost in an iteration below which an inner solve ends. A larger value ends it sooner."""
+"""An inner solve ends if an iteration decreases the cost by less than this share. A larger share ends it sooner."""
 _HALVINGS = 3
-"""How often a step that does not lower the cost is halved before the parameters are left as they are."""
+"""The most times that a step is halved if it does not lower the cost. After that, the parameters stay as they are."""
 _LEAST_SIGNAL = 0.05
-"""The least share of signal in the information about a clock. A smaller share lets a noisy clock move farther in a step."""
+"""The least share of signal in the information about a clock. With a smaller share, a noisy clock takes larger steps."""
 _RIDGE = 1e-9
-"""The share of the information about the clocks that is added to its diagonal. It keeps clocks that a log cannot tell apart
-from a division by zero, and a larger share blurs them."""
+"""The share of the information about the clocks that is added to its diagonal. It prevents a division by zero if a log
+cannot tell two clocks apart. A larger share mixes such clocks more."""
 _MEMORY = 3
-"""The steps that Anderson's acceleration looks back on; more extrapolates farther, and less safely."""
+"""The number of earlier steps that Anderson's acceleration uses. A larger number extrapolates farther, and less safely."""
 
 _NOISE_ROUNDS = 3
-"""How often the noise is estimated, each time followed by a solve with it. More rounds are slower and change it less."""
+"""The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
+"""The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
 
 _LEAST_GROWTH = 0.5
-"""The least growth of the map by which a projection is trusted, if all scales grow by 1. It is 1 but for errors of
-linearisation. A larger value trusts it more rarely."""
+"""If all scales grow by 1, the linearised map must grow at least by this, or the projection is not used. An exact map would
+grow by 1. With a larger value, the projection is used more rarely."""
 _FAR = 3.0
-"""The distance from the middle of the map, as a multiple of the median, up to which landmarks tell its size. A larger
-value counts more of those that hardly anything places."""
+"""Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
+determined landmarks count too."""
 _SHRINKINGS = 30
-"""How often the noise in the information is made smaller to keep the curvature positive; more keep less of it."""
+"""The most reductions of the noise in the information until the curvature is positive. More reductions keep less noise."""
 
 Measure = Callable[[Keyframes, Rays, Settings], Measurements]
-"""Collect the measurements of keyframes and rays with the noise of the settings."""
+"""A function that collects the measurements of keyframes and rays with the noise of the settings."""
 
 
 @dataclass(frozen=True)
 class CalibratedSolution:
     """A joint solution at the shared errors and the noise that fit best.
 
-    errors: with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter.
+    errors: the measurements with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter.
     """
 
     calibration: Calibration
@@ -86,7 +86,7 @@ def calibrate(
 ) -> CalibratedSolution:
     """Estimate the shared errors and the noise from a joint solution at `theta` (P,).
 
-    Which rays are used is settled again after each step. What the log does not tell stays at its prior.
+    The inliers are tested again after each step. A parameter that the log does not determine stays at its prior.
 
     Raises:
         SolveError: a linear system has no single solution.
@@ -121,7 +121,7 @@ def calibrate(
 
 @dataclass(frozen=True)
 class _Fit:
-    """What a search for shared errors needs: the measurements as a function of them."""
+    """The input of a search for shared errors: the measurements as a function of the errors."""
 
     errors: CalibratedMeasurements
     measure: Measure
@@ -129,11 +129,11 @@ class _Fit:
 
     @property
     def prior_residuals(self) -> float:
-        """For how many residuals the nominal noise counts."""
+        """The number of residuals for which the nominal noise counts."""
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: _State, theta: Floats) -> tuple[Floats, _State, Floats, int]:
-        """Return the parameters (P,) that fit best, the solution at them, the shares of noise (P, P) and the steps."""
+        """Return the best parameters (P,), the solution at them, the shares of noise (P, P), and the number of steps."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         noisy = np.zeros((len(theta), len(theta)))
@@ -142,7 +142,7 @@ class _Fit:
         sigma = np.sqrt(np.diagonal(errors.prior))
 
         def deviation(values: Floats) -> float:
-            """Half the squared Mahalanobis distance of parameters (P,) from their prior."""
+            """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
         history: list[tuple[Floats, Floats]] = []
@@ -175,11 +175,11 @@ class _Fit:
         return theta, state, noisy, steps
 
     def noise_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
-        """Return what noise adds to the information (P, P), as shares of its diagonal: to clocks and odometry scales.
+        """Return the part of the information (P, P) that comes from noise, as shares of its diagonal.
 
-        The derivative of a motion by a clock is a difference of measured velocities. Their noise enters the Jacobian, and
-        makes its square too large. It does not enter the change of the gradient between two values of the clock. The clocks
-        of several cameras share this noise.
+        Only clocks and odometry scales have such a part. The derivative of a motion by a clock is a difference of measured
+        velocities. Their noise enters the Jacobian, and makes its square too large. But the noise does not affect the change
+        of the gradient between two values of the clock. The clocks of several cameras share this noise.
         """
         noisy = np.diag(1 - np.maximum(system.signal, _LEAST_SIGNAL))
         clocks = np.flatnonzero([kind(name) == "clock" for name in self.errors.names])
@@ -201,12 +201,12 @@ class _Fit:
         return noisy
 
     def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
-        """The gradient by some parameters at the optimum for a step (P,) from the parameters."""
+        """Return the gradient by some parameters at the optimum after a step (P,) of the parameters."""
         side = state.moved(system, step, self.measure(*self.errors.at(theta + step)))
         return linearise(side, self.errors, theta + step, which).reduce().gradient
 
     def remeasured(self, state: _State, theta: Floats) -> _State:
-        """The optimum for the measurements with the noise as it is now."""
+        """Return the optimum for the measurements with the present noise."""
         measured = self.measure(*self.errors.at(theta))
         return _State.of(measured, state.association, state.map_T_camera, state.positions, state.used).solved(
             state.landmarks
@@ -216,9 +216,9 @@ class _Fit:
 def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
-    noisy: (P, P) the noise in the information, as shares of its diagonal. The gradient varies as the whole information says,
-    also by this noise, while the curvature is that of the signal alone. Hence the covariance is a sandwich (Huber 1967). In
-    no direction is it larger than that of the prior. wider: (P,) factors on the deviations of the gradient, for noise that
+    noisy: (P, P) the noise in the information, as shares of its diagonal. The curvature comes from the signal alone, but the
+    variance of the gradient is the whole information. So the covariance is a sandwich (Huber 1967). It never exceeds the
+    covariance of the prior in any direction. wider: (P,) factors on the standard deviations of the gradient, for noise that
     is not white.
     SolveError if the information is not finite.
     """
@@ -243,18 +243,18 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats 
 
 
 def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
-    """Return the system without the force that makes a solution too small, which would pull at the parameters.
+    """Return the system without the force that makes a solution too small, because this force would move the parameters.
 
-    A parameter feels the force as far as the size of the map follows it. If all lengths have an unknown scale, everything
-    can grow in proportion at no cost. So what seems to tell a common scale is this force, and it is projected out (the gauge
-    of a free network; Meissl 1969). Else the force is measured.
+    The force acts on a parameter as far as the size of the map depends on the parameter. If all lengths have an unknown
+    scale, everything can grow in proportion at no cost. Then only this force seems to determine a common scale. So it is
+    projected out (the gauge of a free network; Meissl 1969). Otherwise, the force is computed and subtracted.
     """
     landmarks = state.positions[state.landmarks]
     if not len(landmarks):
         return system
     away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
-    near = away <= _FAR * np.median(away)  # A landmark that hardly anything places is far off, and does not grow along.
-    around = landmarks[near] - landmarks[near].mean(axis=0)  # With the mean, a shift of the whole map is no growth.
+    near = away <= _FAR * np.median(away)  # A poorly determined landmark is far off, and does not grow with the map.
+    around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
     moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
     growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
@@ -267,7 +267,7 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
 def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:
     """Return the next parameters (P,) by Anderson's acceleration (Walker and Ni 2011, eq. 2.2) of the Gauss-Newton steps.
 
-    history: parameters and the step from them, the newest last. scale: (P,) in what unit each parameter is compared.
+    history: earlier parameters and their steps, the newest last. scale: (P,) the unit of each parameter.
     """
     theta, step = history[-1]
     if len(history) < 2:
@@ -293,7 +293,7 @@ class _State(Linearised):
         return cls(graph, values, measured, association, map_T_camera, positions, used, graph.error(values))
 
     def moved(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
-        """The optimum for other measurements, from the linear prediction of it for a step (P,) of the parameters."""
+        """Return the optimum for other measurements, predicted linearly for a step (P,) of the parameters."""
         landmarks = self.landmarks
         change = system.sensitivity @ step + system.newton
         positions = self.positions.copy()
@@ -302,7 +302,7 @@ class _State(Linearised):
         return type(self).of(measured, self.association, map_T_camera, positions, self.used).solved(landmarks)
 
     def solved(self, landmarks: Ints) -> Self:
-        """The same after a few iterations of the inner solve. landmarks: (m,) those in the graph."""
+        """Return the state after a few iterations of the inner solve. landmarks: (m,) the landmarks in the graph."""
         optimum = gauss_newton(self.graph, self.values, _INNER, _TOLERANCE)
         return replace(
             self,
@@ -313,7 +313,7 @@ class _State(Linearised):
         )
 
     def settled(self) -> Self:
-        """The same with the rays that agree with their objects now."""
+        """Return the state with the rays that now agree with their objects."""
         used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
         if np.array_equal(used, self.used):
             return self

@@ -1,6 +1,6 @@
-"""How the joint solution depends on the errors that all measurements share: the linear system of a graph with them in it.
+"""The linear system of a graph whose parameters are the shared errors. It shows how the joint solution depends on them.
 
-The parameters are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
+The shared errors are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
 """
 
 from collections.abc import Sequence
@@ -23,18 +23,18 @@ from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.priors import ANCHOR
 
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
-"""The parameters whose derivatives are the measured motions themselves, with their noise."""
+"""Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
 _ALIKE = 10.0
-"""The largest ratio between the covariance of a motion and its prediction by the neighbours for the prediction to be used.
-The noise of a motion changes its covariance by far less. With 3 or 5, one of twelve clean drives was pulled by 7 sigma,
-because the choice itself then depends on the noise. With 30, a stereo rig that often stands lost its scale."""
+"""The prediction of a motion by its neighbours is used if its covariance and theirs differ at most by this factor. The noise
+of a motion changes its covariance by far less. With 3 or 5, one of twelve clean drives was pulled by 7 sigma, because the
+choice itself then depends on the noise. With 30, a stereo rig that often stands lost its scale."""
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """A graph, as `Measurements.factors` makes it, with its variables at the values of its last solve.
+    """A graph by `Measurements.factors`, with its variables at the values of its last solve.
 
-    map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. used: (R,) the rays in it.
+    map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark outside the graph. used: (R,) the rays in the graph.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -58,13 +58,13 @@ class Linearised:
 
 @dataclass(frozen=True)
 class LinearSystem:
-    """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are held.
+    """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
 
     The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
     jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. sides: (M, P) by the
-    shared errors. residual: (M,). first_range, first_motion: the rows where the ranges and the motions begin.
-    instruments: (M, P) what the residuals must not correlate with at the optimum. They are the sides, but for the scales of
-    the odometry: their sides hold the odometry's own noise, which is in the residuals as well.
+    shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions. instruments:
+    (M, P). At the optimum, the residuals do not correlate with these columns. They equal the sides, except for the scales of
+    the odometry: their sides contain the noise of the odometry, and so do the residuals.
     """
 
     jacobian: sparse.csc_matrix
@@ -90,10 +90,10 @@ class LinearSystem:
 class ReducedSystem:
     """The normal equations of the parameters with poses and landmarks eliminated.
 
-    information: (P, P). gradient: (P,), what must be zero at the optimum: the residuals against the instruments. descent:
-    (P,), the negative gradient of the cost. signal: (P,) the share of the information's diagonal that is no noise.
-    sensitivity: (D, P), the derivatives of all variables at their optimum by the parameters: first the landmarks, three
-    rows each, then the poses, six rows each. newton: (D,), what is left of the variables' own step.
+    information: (P, P). gradient: (P,) the residuals against the instruments, zero at the optimum. descent: (P,) the
+    negative gradient of the cost. signal: (P,) the share of the information's diagonal that is not noise. sensitivity: (D,
+    P) the derivatives of all variables at their optimum by the parameters: first the landmarks, three rows each, then the
+    poses, six rows each. newton: (D,) the remaining Newton step of the variables.
     """
 
     information: Floats
@@ -109,7 +109,7 @@ def linearise(
 ) -> LinearSystem:
     """Return the linear system of a graph at its values, and at the shared errors theta (P,).
 
-    which: the numbers of the parameters that the system shall have. None means all of them.
+    which: the indices of the parameters in the system. None means all parameters.
     """
     which = range(len(theta)) if which is None else which
     names = [errors.names[k] for k in which]
@@ -142,9 +142,9 @@ def factor(jacobian: sparse.csc_matrix) -> SuperLU:
 def _whitened(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: int, columns: int
 ) -> tuple[sparse.csc_matrix, Floats]:
-    """The whitened Jacobian (rows, columns) of a graph, and its whitened residuals (rows,), in the order of the factors."""
+    """Return the whitened Jacobian (rows, columns) of a graph and its whitened residuals (rows,), in the factors' order."""
     linear = graph.linearize(values)
-    row, column, value = linear.sparseJacobian_()  # numbers from 1; the column after the last holds the right-hand side
+    row, column, value = linear.sparseJacobian_()  # The numbers start at 1. The last column is the right-hand side.
     row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
     side = column == columns
     residual = np.zeros(rows)
@@ -155,9 +155,9 @@ def _whitened(
 def _parameter_columns(
     of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int], rows: tuple[int, int, int]
 ) -> Floats:
-    """(M, p) derivatives of the whitened residuals by some of the parameters: central differences, robust weights held.
+    """Return derivatives (M, p) of the whitened residuals by some parameters: central differences with fixed robust weights.
 
-    rows: the number of rows, and where the ranges and the motions begin.
+    rows: the number of rows, and the first rows of the ranges and of the motions.
     """
     measured, map_T_camera = of.measured, of.map_T_camera
     keyframes, rays, landmark = measured.keyframes, measured.rays.take(of.which), of.association.object[of.which]
@@ -209,13 +209,13 @@ def _parameter_columns(
 
 
 def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: slice) -> Floats:
-    """The sides (M, p) of parameters with the motions of the odometry's scales as their neighbours predict them.
+    """Return the sides (M, p) of parameters. In the rows of the odometry's scales, neighbours predict the motions.
 
-    A motion's own noise is in its derivative by the scale and in its residual. Their product would pull the scale away: up
-    if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is another
-    (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more of it.
-    Motions that were measured too short would weigh more. So the neighbours predict the covariance as well, unless they move
-    in another way: a long way between two places where the robot stood, or neighbours that take no time.
+    The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
+    if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
+    (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more noise. So
+    motions that were measured too short would weigh more. Hence the neighbours also predict the covariance, unless they move
+    differently. Examples are a long way between two places where the robot stood, and neighbours of no duration.
     """
     which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
@@ -240,7 +240,7 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
 
 
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
-    """Predict motions (n, D) from the two before and the two after each, at their rate. seconds: (n,) their durations."""
+    """Predict motions (n, D) at the rate of the two motions before and the two after each. seconds: (n,) their durations."""
 
     def near(values: Floats) -> Floats:
         padded = np.pad(values, ((2, 2), (0, 0)))
@@ -251,29 +251,30 @@ def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
 
 
 def _seen(map_T_camera: Floats, positions: Floats) -> Floats:
-    """Positions (n, 3), m, in the frames of poses (n, 4, 4)."""
+    """Return positions (n, 3), m, in the frames of poses (n, 4, 4)."""
     return np.asarray(np.einsum("nji,nj->ni", map_T_camera[:, :3, :3], positions - map_T_camera[:, :3, 3]))
 
 
 def _from(rays: Rays, seen: Floats) -> Floats:
-    """Positions (n, 3), m, from where their rays begin."""
+    """Return positions (n, 3), m, relative to the points where their rays begin."""
     return seen if rays.offset is None else seen - rays.offset
 
 
 def _bearing_roots(rays: Rays, residuals: Floats, metric: bool) -> Floats:
-    """What (n, 1) whitens the residuals (n, 2) of rays, with the weights of Huber's loss."""
+    """Return the factors (n, 1) that whiten the residuals (n, 2) of rays, with the weights of Huber's loss."""
     sigma = np.full(len(rays), EQ1_SIGMA) if metric else rays.sigma
     off = np.linalg.norm(residuals, axis=1) / sigma
     return np.asarray((np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12))) / sigma)[:, None])
 
 
 def whitening(covariance: Floats) -> Floats:
-    """Return upper triangular (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM's noise models do."""
+    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does."""
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
 
 
 def _absolute_roots(measured: Measurements, poses: Floats) -> Floats:
-    """What whitens the residuals of absolute poses (n, 4, 4), with the weights of Huber's loss; the anchor has no loss."""
+    """Return matrices (n, 6, 6) that whiten absolute poses (n, 4, 4), with the weights of Huber's loss. The anchor has no
+    loss."""
     keyframes = measured.keyframes
     if not keyframes.localized_every:
         return np.eye(6)[None] / ANCHOR

@@ -1,7 +1,7 @@
 """Estimate the noise of a log's measurements from its residuals: iterated variance components (Koch 1999, 3.6).
 
-Each kind of noise has the size at which the squares of its residuals sum up to their redundancy. The redundancy is what
-poses, landmarks and shared errors leave of the residuals. It is measured with random probes (Hutchinson 1990).
+Each kind of noise gets the size for which the squares of its residuals sum up to their redundancy. The redundancy is the
+part of the residuals that poses, landmarks and shared errors do not absorb. Random probes measure it (Hutchinson 1990).
 """
 
 from dataclasses import dataclass, replace
@@ -19,34 +19,37 @@ from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
 
 _PROBES = 12
-"""The number of random probes. More are slower, and tell the redundancy of n residuals to sqrt(2 / (n * probes)) of it."""
+"""The number of random probes. With n residuals, the relative error of the redundancy is sqrt(2 / (n * probes)). More probes
+are slower."""
 _ITERATIONS = 20
-"""The most iterations. Each takes one factorisation of the linear system, and MRCLAM takes 12 to 17."""
+"""The most iterations. Each takes one factorisation of the linear system. MRCLAM takes 12 to 17."""
 _CONVERGED = 0.02
-"""The relative change of all factors below which the iteration ends. A larger value ends it sooner."""
+"""The iteration ends if all factors change by less than this share. A larger share ends it sooner."""
 _LIMITS = (0.05, 20.0)
-"""The smallest and the largest factor. Noise beyond them is no noise of a sensor that the settings describe at all."""
+"""The smallest and the largest factor. Outside these limits, the settings do not describe the sensor at all."""
 TOGETHER = 3.0
-"""The time (s) for which errors may hang together: wheels lag behind a command, and a detector's box sits aside for a while.
-A longer time finds slower errors, from fewer independent sums."""
+"""The time (s) over which errors may be correlated: wheels lag behind a command, and a detector's box is off for a while. A
+longer time finds slower errors, from fewer independent sums."""
 _MOST_SHRINKAGE = 0.3
-"""The largest shrinkage that is made up for. A map that is smaller by more has another cause."""
+"""The largest shrinkage that is corrected. A map that is smaller than this has another cause."""
 _LEAST_TOLD = 0.3
-"""The least share of the squared ways that neighbours predict, for the prediction to be used. A larger one uses it less."""
+"""The prediction by neighbours is used if it explains at least this share of the squared motions. A larger share uses it
+more rarely."""
 _PRIOR_OBJECTS = 4
-"""The number of objects that the bias of ranges in the settings counts for. A larger number changes it less."""
+"""The range bias in the settings counts like this number of objects. With a larger number, the bias changes less."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
-"""Scales the mean absolute value of Gaussian numbers to their standard deviation."""
+"""The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """What the rows of a linear system are: n bearings, q ranges and s motions, with their nominal noise.
+    """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
     owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m. parts: (3, s, 6, 6) covariances of the
     motions by the noise along, across and in turning. rest: (s, 6, 6) covariances without this noise. motion_axes: (3, s, 6)
-    these directions in the frame of the motion. motion_window: (s,), ray_window: (n,) which rows may err together.
+    these directions in the frame of the motion. motion_window: (s,), ray_window: (n,) the rows of one window may have
+    correlated errors.
     """
 
     bearing_axes: Floats
@@ -66,8 +69,8 @@ def estimate_noise(
 ) -> NoiseFactors:
     """Return the noise that agrees best with the residuals of a solved graph, as factors on the nominal noise.
 
-    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: the number of
-    residuals that the nominal noise counts for, in each kind. Kinds of noise that are not unknown keep their factor.
+    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: in each kind, the
+    nominal noise counts like this number of residuals. Kinds of noise that are known keep their factor.
     """
     kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
     root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
@@ -116,11 +119,11 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
 
 
 def _left(jacobian: sparse.csc_matrix, sides: Floats, prior: Floats, told: Floats) -> Floats:
-    """What a least-squares solution leaves of `told` (M + P, n).
+    """Return the residuals of `told` (M + P, n) after a least-squares solution.
 
-    jacobian: (M, D) by poses and landmarks. sides: (M, P) by the shared errors, and prior: (P, P) the last P rows by them.
-    The sides have no zeros, so they are eliminated last, by a Schur complement. Among the sparse columns they would
-    slow their factorisation down by a factor of four.
+    jacobian: (M, D) by poses and landmarks. sides: (M, P) by the shared errors. prior: (P, P) the last P rows by the shared
+    errors. The sides are dense, so a Schur complement eliminates them last. As columns of the sparse matrix, they would slow
+    its factorisation down by a factor of four.
     """
     both = np.hstack([sides, told[: len(sides)]])
     both = both - jacobian @ factor(jacobian).solve(jacobian.T @ both)
@@ -130,7 +133,7 @@ def _left(jacobian: sparse.csc_matrix, sides: Floats, prior: Floats, told: Float
 
 
 def _rescaling(system: LinearSystem, rows: _Rows, before: NoiseFactors, after: NoiseFactors, size: int) -> sparse.csr_matrix:
-    """What turns rows (size, ...) that are whitened by one noise into rows that are whitened by another."""
+    """Return the matrix that changes rows (size, ...) whitened by the noise `before` into rows whitened by `after`."""
     scale = np.ones(size)
     scale[: system.first_range] = before.rays / after.rays
     ranges = slice(system.first_range, system.first_range + len(rows.owner))
@@ -155,7 +158,8 @@ def _updated(
     left: Floats,
     prior: float,
 ) -> NoiseFactors:
-    """One step of the iteration. left: (M, probes + 1) what the solution leaves of the probes and of the residuals."""
+    """Return the noise after one step of the iteration. left: (M, probes + 1) the probes and residuals after the
+    solution."""
     found = noise.to_dict(None)
     residual, kept = left[:, -1], left[:, :-1]
     if "rays" in kinds and len(rows.bearing_weight):
@@ -185,9 +189,9 @@ def _updated(
 
 
 def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:
-    """The factor on the noise of rays: that of single rays, or a larger one if rays of one object err together for a while.
+    """Return the factor on the noise of rays. It is larger if rays of one object have correlated errors for a while.
 
-    The mean of absolute values is robust. The larger of azimuth and elevation counts: a sensor may have told one of them.
+    The mean of absolute values is robust. The larger of azimuth and elevation counts, because a sensor may fix one of them.
     """
     axes, count = rows.bearing_axes, len(rows.bearing_weight)
     off = np.einsum("njk,nk->nj", axes, residual[: 2 * count].reshape(-1, 2)) / np.sqrt(rows.bearing_weight)[:, None]
@@ -205,7 +209,7 @@ def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kep
 
 
 def _summed(values: Floats, window: Ints) -> Floats:
-    """The sums (W, D) of the rows of (n, D) in each window (n,)."""
+    """Return the sums (W, D) of the rows of (n, D) in each window (n,)."""
     sums = np.zeros((int(window.max()) + 1, values.shape[1]))
     np.add.at(sums, window, values)
     return sums
@@ -214,7 +218,7 @@ def _summed(values: Floats, window: Ints) -> Floats:
 def _range_noise(
     system: LinearSystem, rows: _Rows, noise: NoiseFactors, residual: Floats, prior: float
 ) -> tuple[float, float]:
-    """The factors on the noise of single ranges, and on the bias that all ranges of an object share."""
+    """Return the factors on the noise of single ranges, and on the bias that all ranges of an object share."""
     count = int(rows.owner.max()) + 1
     number = np.bincount(rows.owner, minlength=count)
     off = residual[system.first_range : system.first_range + len(rows.owner)] * _range_sigma(rows, noise)
@@ -235,10 +239,10 @@ def _range_noise(
 def shrinking_force(of: Linearised) -> tuple[float, float]:
     """Return the force that makes a joint solution too small, and the curvature against it, both per share of the size.
 
-    Noise in the rays makes the path jitter. Its steps get longer than those of the odometry, and a smaller map is the
-    cheapest way out (errors in variables; Neyman and Scott 1948). The force is the difference between what the residuals of
-    the ways do to the size and what they do if the ways are taken as their neighbours predict them, without their noise.
-    The curvature is that of all measured lengths.
+    Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
+    them shorter again, at the least cost (errors in variables; Neyman and Scott 1948). The force is a difference between two
+    effects of the motion residuals on the size: with measured motions, and with motions as their neighbours predict them,
+    without their noise. The curvature is the information of all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     steps = np.flatnonzero(keyframes.measured)
@@ -265,19 +269,19 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """(q,) m: the noise of ranges, with their object's share of the bias as `batch_solver` counts it."""
+    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `batch_solver`."""
     number = np.bincount(rows.owner)[rows.owner] if len(rows.owner) else np.zeros(0)
     return np.sqrt((rows.range_sigma * noise.ranges) ** 2 + number * (rows.bias * noise.range_bias) ** 2)
 
 
 def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """(s, 6, 6) covariances of the motions."""
+    """Return the covariances (s, 6, 6) of the motions."""
     variances = np.array([noise.along, noise.across, noise.turning]) ** 2
     return np.asarray(rows.rest + np.tensordot(variances, rows.parts, 1))
 
 
 def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:
-    """(n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation above the base's plane."""
+    """Return the (n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation in the base frame."""
     basis = tangent_basis(directions)
     up = base_T_camera[:, 2, :3]
     elevation = up - (up * directions).sum(axis=1, keepdims=True) * directions

@@ -9,14 +9,14 @@ from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
 STANDOFF = 1e7
-"""The distance (m) of a virtual camera behind the origin of its ray. A larger value leaves less perspective and rounds more
-coarsely. The relative error by perspective is the range divided by this distance. Rounding (1e-16 of it) is a nanometre."""
+"""The distance (m) of a virtual camera behind the origin of its ray. A larger value leaves less perspective, but is rounded
+more coarsely. The relative error by perspective is the range divided by this distance. The rounding error is 1 nm."""
 L1_RADIANS = 1e-4
-"""The angle (rad) below which the loss `l1` on bearings is quadratic, which gives it a derivative at 0. A larger angle is
-smoother and less like a norm. It was chosen far below the noise of a box (a twentieth of a pixel)."""
+"""The angle (rad) below which the loss `l1` on bearings is quadratic, so that it has a derivative at 0. A larger angle is
+smoother and less like a norm. This angle is far below the noise of a box (a twentieth of a pixel)."""
 EQ1_SIGMA = 0.05
-"""The standard deviation (m) of the point-to-line distance in the joint solve. A larger value trusts the odometry more.
-Eq. 1 has no noise model, so this value weighs its distances against the odometry."""
+"""The standard deviation (m) of the point-to-line distance in the joint solve. Eq. 1 has no noise model, so this value
+weighs its distances against the odometry. A larger value trusts the odometry more."""
 _ORTHOGRAPHIC = gtsam.Cal3DS2(STANDOFF, STANDOFF, 0, 0, 0, 0, 0, 0, 0)
 _EQUIDISTANT = gtsam.Cal3Fisheye(1, 1, 0, 0, 0, 0, 0, 0, 0)
 _CENTRE = np.zeros(2)
@@ -27,9 +27,10 @@ def bearings(
 ) -> list[gtsam.NonlinearFactor]:
     """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
 
-    offset: (R, 3) m, where each ray begins in this frame. None means at the origin. GTSAM has no bearing factor with an
-    offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray: the landmark's
-    distance from the image's centre is the angle. Behind this camera the error is constant, and larger than in front of it.
+    offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
+    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. The
+    distance of the landmark from the image's centre is then the angle. Behind this camera the error is constant, and larger
+    than in front of it.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
@@ -49,8 +50,8 @@ def point_to_line(
 ) -> list[gtsam.NonlinearFactor]:
     """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray.
 
-    The directions (R, 3), and the offsets (R, 3), m, where the rays begin, are in the frame of X(keyframe), which is a
-    variable. None means that all rays begin at the origin.
+    The directions (R, 3) and the ray origins `offset` (R, 3), m, are in the frame of X(keyframe), which is a variable. None
+    means that all rays begin at the origin of the frame.
     """
     origins = np.zeros_like(directions) if offset is None else offset
     make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(origins, directions)
@@ -84,7 +85,7 @@ def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
 def tangent_basis(directions: Floats) -> Floats:
     """Return two unit vectors (R, 3, 2) across unit directions (R, 3), as GTSAM chooses them (`Unit3::basis`).
 
-    The first is the cross product with the axis that the direction has least of.
+    The first one is the cross product with the axis along which the direction has its smallest component.
     """
     first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -92,10 +93,10 @@ def tangent_basis(directions: Floats) -> Floats:
 
 
 def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:
-    """Return the axes (R, 3, 2) of the residuals of the factors of rays, as `ray_residuals` takes them.
+    """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
-    GTSAM's bearing factor has its axes across the way to the landmark. The cameras of the other factors have them across the
-    ray.
+    The axes of GTSAM's bearing factor are perpendicular to the way to the landmark. The axes of the other factors are
+    perpendicular to the ray.
     """
     if metric:
         return tangent_basis(directions)
@@ -104,10 +105,10 @@ def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None
 
 
 def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric: bool) -> Floats:
-    """Return the residuals (R, 2) that the factors of rays have, along axes (R, 3, 2).
+    """Return the residuals (R, 2) of the factors of rays, along axes (R, 3, 2).
 
-    directions: (R, 3) unit. to_landmark: (R, 3) m, from where the ray begins, in the same frame. metric: whether they are
-    distances from the ray (m, Eq. 1), or angles (rad).
+    directions: (R, 3) unit. to_landmark: (R, 3) m, from the origin of the ray, in the same frame. metric: whether residuals
+    are distances from the ray (m, Eq. 1), or angles (rad).
     """
     along = np.einsum("ri,ri->r", directions, to_landmark)
     across = to_landmark - along[:, None] * directions
@@ -118,6 +119,6 @@ def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric:
 
 
 def _poses(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a camera for each ray, at its origin (R, 3), m, which looks along its unit direction (R, 3)."""
+    """Return a camera for each ray. It is at the ray's origin (R, 3), m, and looks along its unit direction (R, 3)."""
     axes = np.concatenate([tangent_basis(directions), directions[:, :, None]], axis=2)
     return [gtsam.Pose3(pose) for pose in make_pose(axes, origins)]

@@ -12,8 +12,8 @@ from objslam.core.statistics import CAUCHY_K, HUBER_K
 
 Noise = Sequence[gtsam.noiseModel.Base]
 L1_METRES = 1e-6
-"""The distance (m) below which the loss `l1` is quadratic, which gives it a derivative at 0. A larger distance is smoother
-and less like a norm. It was chosen far below the resolution of a map."""
+"""The distance (m) below which the loss `l1` is quadratic, so that it has a derivative at 0. A larger distance is smoother
+and less like a norm. This distance is far below the resolution of a map."""
 
 
 def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
@@ -34,7 +34,7 @@ def huber(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
 @lru_cache(maxsize=4096)
 def _model(loss: Loss, sigma: float, dimension: int, l1_kink: float) -> gtsam.noiseModel.Base:
     estimators, wrap = gtsam.noiseModel.mEstimator, gtsam.noiseModel.Robust.Create
-    if loss == "l1":  # a model with sigma s and constant k has slope k / s = 1 / sigma and kink k * s = l1_kink
+    if loss == "l1":  # A model with sigma s and constant k has slope k / s = 1 / sigma and kink k * s = l1_kink.
         whitened = gtsam.noiseModel.Isotropic.Sigma(dimension, np.sqrt(sigma * l1_kink))
         return wrap(estimators.Huber.Create(np.sqrt(l1_kink / sigma)), whitened)
     model = gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)

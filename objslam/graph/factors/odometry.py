@@ -10,8 +10,8 @@ from objslam.core.types import Keyframes
 from objslam.graph.variables import X0
 
 UNKNOWN_TURN, UNKNOWN_WAY = 0.5, 2.0
-"""The standard deviations (rad, m) of a motion without a measurement. Larger values tie the two keyframes less. They were
-chosen for a robot that somebody carries a few steps."""
+"""The standard deviations (rad, m) of a motion without a measurement, as if somebody carried the robot a few steps. Larger
+values tie the two keyframes less."""
 
 
 def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:

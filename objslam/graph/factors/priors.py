@@ -9,7 +9,7 @@ from objslam.graph.variables import L0, X0
 
 ANCHOR = 1e-4
 """The standard deviation (rad, m) of the prior on the first keyframe. A larger value lets the whole map drift. A smaller
-value conditions the linear system worse. It was chosen far below the noise of any measurement."""
+value conditions the linear system worse. This value is far below the noise of any measurement."""
 
 
 def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> list[gtsam.NonlinearFactor]:

@@ -13,7 +13,7 @@ def ranges(
 ) -> list[gtsam.NonlinearFactor]:
     """Return one factor for each of the distances `measured` (R,), m, between X(keyframe) and L(landmark).
 
-    offset: (R, 3) m, from where each distance was measured, in the frame of X(keyframe). None means from its origin.
+    offset: (R, 3) m, the point from which each distance was measured, in the frame of X(keyframe). None means its origin.
     """
     columns = (keyframe.tolist(), landmark.tolist(), measured.tolist(), noise)
     if offset is None:

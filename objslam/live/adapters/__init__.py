@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice
 
+ODOM = "odom"  # The name of the odometry's frame where messages do not name it (REP 105).
 _INTERFACE = "DDS: a network interface, by name or address, or auto for any. [default: from CYCLONEDDS_URI, else loopback]"
 
 
@@ -72,12 +73,16 @@ class Feed:
     """An adapter with its helpers. views: the functions that receive each snapshot. close: the functions to call at the end.
 
     image: the function that returns the image of a camera, by its name, at a stamp, s. None if the adapter has no images.
+    odom_frame: the function that returns the name of the odometry's frame, None if nobody may place this frame in a map.
+    ticks: the functions to call ten times a second.
     """
 
     adapter: Adapter
     views: tuple[Callable[[Snapshot], object], ...] = ()
     close: tuple[Callable[[], None], ...] = ()
     image: Callable[[str, float], NDArray[np.uint8] | None] | None = None
+    odom_frame: Callable[[], str | None] = lambda: ODOM
+    ticks: tuple[Callable[[], object], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -132,7 +137,9 @@ def _ros(
         worker = DetectorWorker(detector)
     messages = RosMessages(sink, options, worker, ledger=ledger)
     adapter = make(messages, TopicChoice(messages.chosen, worker is not None))
-    return Feed(adapter, close=(worker.close,) if worker is not None else (), image=messages.image)
+    return Feed(
+        adapter, close=(worker.close,) if worker is not None else (), image=messages.image, odom_frame=messages.odom_frame
+    )
 
 
 ADAPTERS = {

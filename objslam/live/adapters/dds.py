@@ -137,6 +137,7 @@ class DdsAdapter:
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(1 if images else QUEUE),
             Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.IgnoreLocal.Participant,  # The tf map -> odom that this session sends is no localisation.
         )
         if images and (receive_buffer() or _MIN_BUFFER) < _MIN_BUFFER:
             self.ledger.warn("the system's socket buffers are too small for images: run sysctl -w net.core.rmem_max=4194304")

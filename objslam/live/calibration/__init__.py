@@ -1,1 +1,1 @@
-"""A live session estimates the errors that all measurements share while it runs. It then takes them out of its map."""
+"""A live session estimates the errors that all measurements share while it runs. It then corrects its map."""

@@ -26,8 +26,8 @@ _GROWTH = 1.5
 """The growth factor of keyframes between two calibrations. A larger factor calibrates more rarely. With any factor above 1,
 the work of all calibrations together grows linearly with the session."""
 _DELAY = 0.15
-"""The keyframes from the start of a calibration until it corrects the map, as a share of all keyframes. With a larger share,
-the keyframe of the correction depends less on the speed of the machine, but the correction is later."""
+"""The keyframes between the start of a calibration and the correction of the map, as a share of all keyframes. With a larger
+share, the correction comes later, but its keyframe depends less on the speed of the machine."""
 _CHANGED = 1.0
 """The change of an error, in standard deviations, from which the map is corrected. With a larger value, corrections are
 rarer."""
@@ -68,7 +68,7 @@ class Calibrator:
         """Prepare for a session. record: writes to the journal. patient: whether the session may wait for the worker."""
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        self._asked: tuple[int, Request] | None = None  # the number of keyframes, and what is to be calibrated
+        self._asked: tuple[int, Request] | None = None  # The number of keyframes, and the request for the worker.
         self._worker: Worker | None = None
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
@@ -105,7 +105,7 @@ class Calibrator:
     def _ask(self, number: int) -> None:
         """Begin a calibration of all keyframes. Nothing begins if no shared errors are estimated.
 
-        The noise stays that of the settings, as in the map. The end of the session estimates it.
+        The noise is not estimated here. It stays as in the settings until the end of the session.
         """
         m = self._mapper.state
         found = collect(m, self._name, count_dropped=False)

@@ -18,11 +18,11 @@ from objslam.mapping.solution import seen_something
 class Collected:
     """The data that a session has collected, in the form of offline mapping.
 
-    keyframes: in time order, as they were measured. rays: those of the keyframes, as they were measured. association: that
-    of the rays. ids: (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's
-    estimate. log: the paths and cameras. errors: the same keyframes and rays as a function of the shared errors, None if
-    neither errors nor noise are estimated. theta: (P,) the values by which the session corrects its measurements. Errors
-    that the session takes out but does not estimate are already taken out of the keyframes, rays and log.
+    keyframes: in time order, as measured. rays: the rays of the keyframes, as measured. association: of these rays. ids:
+    (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths
+    and cameras. errors: the same keyframes and rays as a function of the shared errors, None if neither errors nor noise are
+    estimated. theta: (P,) the values by which the session corrects its measurements. If the session corrects an error but
+    does not estimate it, the keyframes, rays and log are corrected already.
     """
 
     keyframes: Keyframes
@@ -37,7 +37,7 @@ class Collected:
 
 
 def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
-    """Collect the keyframes, the rays, the association and the estimate of a session. name: that of the log.
+    """Collect the keyframes, the rays, the association and the estimate of a session. name: the name of the log.
 
     If there is a localisation, keyframes that it does not cover are left out, as in offline mapping, and counted if the
     caller asks for it. Tracks with enough rays become objects too, but a solve may leave them unresolved.
@@ -88,8 +88,7 @@ def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> S
 
 
 def corrections(m: MapState, errors: SharedErrors) -> Floats:
-    """Return the values (P,) of the errors: those that a session takes out of its measurements, and the expected values of
-    others."""
+    """Return the values (P,) of the errors: the values that a session corrects, and the expected values of other errors."""
     return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
 
 

@@ -1,4 +1,4 @@
-"""Take other values of the shared errors out of a live map: out of its path, keyframes, rays, tracks and graph."""
+"""Correct a live map by new values of the shared errors: its path, keyframes, rays, tracks and graph."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ _ITERATIONS = 8
 
 
 def recalibrate(m: MapState, calibration: Calibration) -> None:
-    """Take the errors of a calibration out of the map, in place of those that were taken out before.
+    """Correct the errors of a calibration in the map. They replace the errors that were corrected before.
 
     The map depends on its state and on the calibration only, so that a resumed session makes the same map.
     """
@@ -74,14 +74,14 @@ def _remeasure_keyframes(m: MapState) -> None:
 
 
 def _errors(m: MapState, log: Log, keyframes: Keyframes, rows: Ints) -> tuple[SharedErrors, Floats]:
-    """Return keyframes of a log as a function of the errors that are taken out, and these errors (P,)."""
+    """Return keyframes of a log as a function of the corrected errors, and the values (P,) of these errors."""
     names, theta = tuple(m.errors), np.array(list(m.errors.values()))
     none = offline_rays(m, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     return SharedErrors(log, keyframes, none, m.given, names, theta, np.eye(len(names))), theta
 
 
 def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
-    """Correct the rays, which had the errors `before` taken out, and return whether any may have changed."""
+    """Correct the rays, which were corrected by the errors `before`. Return whether any ray may have changed."""
     rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
     longer = _ratio(m, before, "range_scale")
     focal = [_ratio(m, before, f"{one.name}.focal") for one in m.cameras]
@@ -109,7 +109,7 @@ def _carried(m: MapState, drifted: Floats) -> Floats:
 
 
 def _shift_times(m: MapState, times: Floats) -> None:
-    """Shift the stamps of landmarks and tracks as those of the keyframes. times: (K,) s, the keyframes' stamps before."""
+    """Shift the stamps of landmarks and tracks like the stamps of keyframes. times: (K,) s, the old stamps of keyframes."""
     order = np.argsort(times, kind="stable")
     shift = (m.keyframes.stamp - times)[order]
 
@@ -122,7 +122,7 @@ def _shift_times(m: MapState, times: Floats) -> None:
 
 
 def _move_start(m: MapState, before: Floats) -> None:
-    """Move the whole map with the first keyframe, whose pose (4, 4) was held at `before`."""
+    """Move the whole map with the first keyframe. `before` is the pose (4, 4) at which this keyframe was fixed."""
     now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
     m.graph.drop_absolute()
     m.move(now @ inverse(before))
@@ -130,7 +130,7 @@ def _move_start(m: MapState, before: Floats) -> None:
 
 
 def _replace_factors(m: MapState, rays_changed: bool) -> None:
-    """Replace the factors of motions, of absolute poses and of rays by those of the corrected measurements."""
+    """Replace the factors of motions, absolute poses and rays by the factors of the corrected measurements."""
     k, rays = m.keyframes, m.rays
     for number in k.id.tolist():
         m.graph.drop_motion(number)
@@ -148,7 +148,7 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 def _solve(m: MapState) -> None:
     """Move the estimate to the corrected measurements, at once or over the next keyframes.
 
-    The next full solve tests the rays again. Until the map has settled, the rays of one object may seem to be of two.
+    The next full solve tests the rays again. Until then, the rays of one object may look like the rays of two.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

@@ -1,4 +1,4 @@
-"""Estimate shared errors in a process of its own. GTSAM lets no other thread of a process run while it solves."""
+"""Estimate shared errors in a separate process. While GTSAM solves, no other thread of its process runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _PATIENT = 600.0
 """The longest time, s, that a calibration may take. A larger value waits longer for a process that hangs."""
 _NICE = 10
-"""By how much the priority of the process is lower than that of the session. A larger number slows it down more."""
+"""The process has a priority that is lower than the session's by this. A larger number slows it down more."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -37,7 +37,7 @@ class Request:
     settings: Settings
 
     def solve(self) -> Calibration | None:
-        """Return the shared errors that fit best, None if they cannot be estimated. SolveError if there is no solution."""
+        """Return the shared errors that fit best, None if they cannot be estimated. SolveError without a solution."""
         from objslam.core.diagnostics import Ledger
         from objslam.graph.batch_solver import solve_joint
 

@@ -30,7 +30,7 @@ class DdsPublisher:
         from cyclonedds.pub import DataWriter
         from cyclonedds.topic import Topic
 
-        # a stuck subscriber must not delay the session, so a write never waits and only the last message is kept
+        # A stuck subscriber must not delay the session. So a write never waits, and only the last message is kept.
         qos = Qos(Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
         self.topics = {name: f"{prefix.rstrip('/')}/{name}" for name in TOPICS}
         self._writers: dict[str, Any] = {}

@@ -39,7 +39,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """One stretch of a path, placed on the course. drift: (6, 6) the drift that the course adds to that of the path."""
+    """One stretch of a path, placed on the course. drift: (6, 6) the drift of the course in addition to the path's drift."""
 
     stretch: int
     start_T_path: Floats
@@ -80,10 +80,10 @@ class Course:
     def recalibrate(
         self, errors: Mapping[str, float], corrected: Trajectory | None, settings: Settings, keyframes: KeyframeTable
     ) -> None:
-        """Take other errors out of the odometry, and move the pieces of the course and the keyframes on it accordingly.
+        """Correct other errors of the odometry, and move the pieces of the course and the keyframes on it accordingly.
 
         corrected: the odometry without its errors. keyframes: all keyframes, with their new stamps and their new map_T_base.
-        start_T_base and drift of the keyframes change. A piece that begins anew stays where its first keyframe is.
+        start_T_base and drift of the keyframes change. The first piece after a gap stays where its first keyframe is.
         """
         said = self.driven.trajectory()
         self._correction = OdometryCorrection(errors, said, corrected)

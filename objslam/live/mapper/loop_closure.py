@@ -88,7 +88,7 @@ def _together(m: MapState) -> Bools:
 
 
 def _close(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). A large correction is distributed first."""
+    """Merge the landmarks in rows `now` (P,) into the landmarks in rows `old` (P,). First distribute a large correction."""
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.landmarks.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
@@ -108,7 +108,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Give the landmarks around those in rows `old` (P,) the drift of the first of `now` (P,), so that they match again."""
+    """Give the landmarks around rows `old` (P,) the drift of the first row of `now` (P,), so that they match again."""
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
     since = gathered(drift, landmarks.drift)

@@ -142,7 +142,7 @@ def _forget_tracks(m: MapState) -> None:
 
 
 def _merge_duplicates(m: MapState) -> None:
-    """Merge near landmarks of one label as `duplicates.merge_unseen_together`, but with fast bounds on covariances."""
+    """Merge near landmarks of one label like `duplicates.merge_unseen_together`, but with fast bounds on covariances."""
     landmarks = m.landmarks
     if len(landmarks) < 2:
         return

@@ -73,7 +73,7 @@ class Mapper:
         return frame.stamp + self.state.errors.get(f"{frame.camera}.clock", 0.0)
 
     def map_has_moved(self) -> None:
-        """Forget what was prepared for the next frame, because keyframes and landmarks have other places now."""
+        """Forget the preparations for the next frame, because keyframes and landmarks have moved."""
         m = self.state
         self._predictor, self._predicted = PosePredictor(m), None
         for number in np.unique(m.keyframes.camera).tolist():
@@ -95,7 +95,7 @@ class Mapper:
             return None
         prediction = self._predictor.predict(before, stamp, placed, view.base_T_camera, start_T_camera)
         pose = prediction.map_T_camera
-        if not shown:  # A frame without boxes counts against the landmarks in view, but is no keyframe.
+        if not shown:  # A frame without boxes is evidence against the landmarks in view, but it is no keyframe.
             m.landmarks.expected[in_view(m.landmarks, m.cameras[view.camera], pose)] += 1
             return None
         self._selector.accept(view.camera, start_T_camera, shown)

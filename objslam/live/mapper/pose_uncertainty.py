@@ -34,7 +34,7 @@ class PoseUncertainty:
     def of_landmarks(self, to: Floats, then: Floats, map_T_camera: Floats) -> Floats:
         """Return the covariances (n, 3, 3), m^2, that the camera pose adds to landmarks relative to the camera.
 
-        Each is the smaller of two: that of the drift since the landmark was seen, and that of the pose in the map.
+        Each is the smaller of two covariances: by the drift since the landmark was seen, and by the pose in the map.
         to: (n, 3) m from the camera to each landmark, in map. then: (n, 6, 6) drift when each landmark was last seen.
         """
         turn = map_T_camera[:3, :3]

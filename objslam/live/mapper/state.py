@@ -49,8 +49,8 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, a fifth of the number
-    of frames with its less seen landmark.
+    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, the number of frames
+    with its less seen landmark, divided by 5.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)
@@ -92,7 +92,7 @@ class MapState:
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
     the course. rng: seeded by the settings.
     given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
-    the cameras as received, and without their errors. errors: by name, the errors that are taken out of all measurements.
+    the cameras as received, and without their errors. errors: by name, the errors that are corrected in all measurements.
     calibration: the estimate of these errors.
     """
 

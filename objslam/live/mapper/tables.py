@@ -93,7 +93,7 @@ class PathTable(GrowingTable):
         return Trajectory(self.stamp.copy(), self.pose.copy()) if len(self) else None
 
     def _thin(self) -> None:
-        """Keep one pose in each period, and those at gaps. The period doubles each time, up to a quarter of a gap."""
+        """Keep one pose in each period, and the poses at gaps. The period doubles each time, up to a quarter of a gap."""
         usual = (self.stamp[-1] - self.stamp[0]) / len(self)
         self._spacing = min(max(2 * self._spacing, 2 * usual), self._widest)
         period = np.floor((self.stamp - self.stamp[0]) / self._spacing)
@@ -107,7 +107,7 @@ class KeyframeTable(GrowingTable):
     """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
     camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
-    sent, mount: stamp and base_T_camera as received. stamp and base_T_camera have the shared errors taken out.
+    sent, mount: stamp and base_T_camera as received. stamp and base_T_camera are corrected by the shared errors.
     """
 
     id: Ints = column(np.int64)

@@ -60,7 +60,7 @@ class PathBuffer:
             del self._stamps[:half], self._path[:half]
 
     def replace(self, path: Trajectory, settings: Odometry) -> None:
-        """Replace the kept poses by those of another path, which must include the first pose that was ever appended."""
+        """Replace the kept poses by poses of another path, which must include the first pose that was ever appended."""
         if not self._stamps:
             return
         self._settings, self._from_start = settings, inverse(path.poses[0])

@@ -110,6 +110,13 @@ class RosMessages:
         with self._lock:
             return self._cameras.image(camera, stamp)
 
+    def odom_frame(self) -> str | None:
+        """Return the frame of the odometry. None while it is unknown, or if tf already gives it a place in a map."""
+        with self._lock, suppress(UnknownTransform):
+            odom = self._odom or find_odom(self._tf.above(self._base()))
+            return odom if odom and len(self._tf.above(odom)) == 1 else None
+        return None
+
     def _warn(self, message: str) -> None:
         with self._lock:
             self.ledger.warn(message)
@@ -178,7 +185,7 @@ class RosMessages:
             except ValueError as error:
                 frames = f"{transform.header.frame_id} -> {transform.child_frame_id}"
                 self.refuse(str(error), f"{topic}: {plain(frames)}")
-        with suppress(UnknownTransform):  # waiting boxes report what is missing in an incomplete tree
+        with suppress(UnknownTransform):  # If tf is incomplete, the waiting boxes report the missing part.
             self._read_path(changed)
         self.tick()
 

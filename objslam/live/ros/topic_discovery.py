@@ -25,8 +25,8 @@ class TopicChoice:
         """Return the wanted topics. offered: the types of all topics, by name. settled: whether probably all topics are
         known.
 
-        If so, one topic is chosen for the odometry, by the shortest name, and one for the images, as `_colour` sorts them. A
-        warning names the other topics that fit.
+        If `settled`, one topic is chosen for the odometry, by the shortest name, and one for the images, as `_colour` sorts
+        them. A warning names the other topics that fit.
         """
         names = sorted(offered, key=lambda name: (len(name), name))
         picked = {name for name in names if self._plain(name, offered[name])}

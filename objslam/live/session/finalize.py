@@ -85,7 +85,7 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     It follows the odometry, if there is one, because the localisation jitters.
     """
     way = log.odometry or log.localization
-    assert way is not None  # without a path there is no keyframe
+    assert way is not None  # There is no keyframe without a path.
     before, _ = interpolate(way.stamps, way.poses, np.clip(stamps, way.stamps[0], way.stamps[-1]), np.inf)
     return correct_path(way, stamps, before, map_T_base)
 

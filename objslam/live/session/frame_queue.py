@@ -50,7 +50,7 @@ class FrameQueue:
         while self._waiting and self._mapper.is_ready(self._waiting[0][0]):
             worked = True
             stamp, _, frame, came = self._waiting.pop(0)
-            limit = self._limit + max(0.0, stamp - frame.stamp)  # a camera whose clock is behind waits for its poses
+            limit = self._limit + max(0.0, stamp - frame.stamp)  # A camera whose clock is behind waits for its poses.
             if measured and not self._patient and time.perf_counter() - came > limit:
                 self._counters.drop_frame(frame, _RARE_POSES if arrival - came > limit else TOO_SLOW)
                 continue

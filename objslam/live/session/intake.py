@@ -30,10 +30,10 @@ from objslam.sources.journal.records import (
 _JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # The size of a pose, m and rad, below which odometry restarted in a gap. A larger value detects more restarts.
+_ZERO = 0.05  # After a gap, a pose smaller than this, m and rad, means a restart. A larger value detects more restarts.
 _FAR = 0.1  # The least size of the pose before such a gap, m and rad. A larger value takes more restarts for motion.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
-_WAIT = 2.0  # The lead over the path, s, above which earlier shifts are tried. A larger value takes old stamps for new ones.
+_WAIT = 2.0  # If a stamp leads the path by more than this, s, earlier shifts are tried. More takes old stamps for new ones.
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next one did not confirm yet"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
@@ -58,7 +58,7 @@ class Intake:
         self._lead = Lead(self._clock, settings.poses.max_gap)
 
     def push_camera(self, camera: Camera) -> bool:
-        """Push as `Sink` says. A known camera that has not changed is accepted, but not delivered again."""
+        """Push a camera, as `Sink.push_camera`. A known camera that has not changed is accepted, but not delivered again."""
         sound = checks.sound_camera(camera)
         if isinstance(sound, str):
             return self._refuse(f"camera {sound}", checks.told(camera.name if isinstance(camera, Camera) else camera))
@@ -72,15 +72,15 @@ class Intake:
             return True
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push as `Sink` says. The covariance is ignored, because the drift comes from the settings."""
+        """Push odometry, as `Sink.push_odometry`. The covariance is ignored, because the drift comes from the settings."""
         return self._push_pose("odometry", stamp, odom_T_base)
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push as `Sink` says. The covariance is ignored, because the noise comes from the settings."""
+        """Push a localisation, as `Sink.push_localization`. Its covariance is ignored: the noise comes from the settings."""
         return self._push_pose("localization", stamp, map_T_base)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
-        """Push as `Sink` says."""
+        """Push a mount, as `Sink.push_mount`."""
         pose, given = checks.rigid(base_T_camera), checks.stamp_of(stamp)
         if pose is None or given is None:
             return self._refuse("mount without a rigid pose or a stamp", f"camera {checks.told(camera)}")
@@ -100,7 +100,7 @@ class Intake:
         track_ids: Sequence[int] | None = None,
         whole: bool = False,
     ) -> bool:
-        """Push as `Sink` says."""
+        """Push boxes, as `Sink.push_detections`."""
         frame, fault, where, left_out = checks.sound_frame(stamp, camera, boxes, labels, scores, depths, track_ids, whole)
         for reason, count in left_out.items():
             self.counters.drop(reason, where, count)

@@ -22,7 +22,8 @@ from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import TOO_SLOW, FrameQueue
 from objslam.live.session.intake import Intake
 from objslam.live.session.snapshots import Describer, take_snapshot
-from objslam.sources.journal.file import Journal, calibrations, messages
+from objslam.sources.journal.journal import Journal
+from objslam.sources.journal.reader import calibrations, messages
 from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Message, NoteMessage
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
@@ -56,7 +57,11 @@ class Session(Intake):
         self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
         self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, patient)
         self._name, self._journal_file, self._resume = name, journal, resume
-        self._journal = Journal(journal, resume) if journal is not None else None
+        live = settings.live
+        self._journal = None
+        if journal is not None:
+            sizes = {"segment": round(1e6 * live.journal_segment_mb), "min_free": round(1e6 * live.journal_free_mb)}
+            self._journal = Journal(journal, resume, **sizes, warn=self.counters.ledger.warn)
         if self._journal is not None and self._journal.torn:
             self.counters.drop("torn record at the end of the journal", f"{journal}, {self._journal.torn} bytes")
         self._queue: deque[tuple[Message, float]] = deque()
@@ -155,7 +160,7 @@ class Session(Intake):
             if self._journal is not None:
                 try:
                     self._journal.write(message)
-                except OutputError as error:
+                except OutputError as error:  # It is too long. An error of the disk only ends the journal.
                     self.counters.drop(f"messages that could not be written to the journal: {error.message}")
                     return False
             if not note:

@@ -8,7 +8,7 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH, Observations, extents
 from objslam.association.refinement import normalised_residuals
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import inverse, widest_angle
+from objslam.core.geometry import interpolate, inverse, widest_angle
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.core.status import reach, status_of
@@ -87,6 +87,7 @@ def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) ->
         counters=m.counters.accepted(),
         dropped=m.counters.dropped(),
         calibration=m.calibration,
+        map_T_odom=_map_T_odom(m),
     )
 
 
@@ -95,6 +96,21 @@ def _path(m: MapState) -> Trajectory:
     k = m.keyframes
     stamps, first = np.unique(k.stamp, return_index=True)
     return Trajectory(stamps, m.graph.poses(k.id[first]) @ inverse(k.base_T_camera[first]))
+
+
+def _map_T_odom(m: MapState) -> Floats | None:
+    """Return `Snapshot.map_T_odom`. The odometry is the received one, with its errors, as tf has no other."""
+    k, driven = m.keyframes, m.course.driven
+    if not len(k) or not len(driven):
+        return None
+    row = int(k.stamp.argmax())
+    after = int(np.searchsorted(driven.stamp, k.stamp[row]))
+    near = slice(max(after - 1, 0), after + 1)
+    pose, inside = interpolate(driven.stamp[near], driven.pose[near], k.stamp[row : row + 1], m.settings.poses.max_gap)
+    if not inside[0]:
+        return None
+    map_T_base = m.graph.pose(int(k.id[row])) @ inverse(k.base_T_camera[row])
+    return np.asarray(map_T_base @ inverse(pose[0]))
 
 
 def _frames(m: MapState) -> tuple[CameraFrame, ...]:

@@ -179,7 +179,7 @@ def yaws(poses: Floats) -> Floats:
 
 
 def _yaw_times(poses: Floats, factor: float) -> Floats:
-    """Return poses with other headings."""
+    """Return poses with their headings multiplied by a factor."""
     yaw = factor * yaws(poses)
     return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
 
@@ -187,8 +187,8 @@ def _yaw_times(poses: Floats, factor: float) -> Floats:
 def _from_degrees(poses: Floats) -> Floats:
     """Return poses whose headings (degrees) were taken for radians.
 
-    Rotation matrices give a heading only up to 2 pi, here 6.3 degrees. Two assumptions resolve it: a robot turns evenly, and
-    it drives in the direction of its heading.
+    A rotation matrix keeps a heading modulo 2 pi, so multiples of 6.3 degrees are lost here. Two assumptions restore them: a
+    robot turns evenly, and it drives in the direction of its heading.
     """
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     steps = np.diff(said)

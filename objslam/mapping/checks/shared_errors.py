@@ -27,7 +27,7 @@ _CAUSES = {
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
     """Warn of each shared error that is far from the mean of its prior, and name the probable cause.
 
-    The prior is from the settings or from a calibration file. A large error that is as in the file causes no warning.
+    The prior is from the settings or from a calibration file. A large error causes no warning if the file already has it.
     """
     for name, of in calibration.to_dict()["parameters"].items():
         expected = of["prior_mean"]

@@ -55,6 +55,13 @@ class MapMessages:
         """Make a geometry_msgs/PoseStamped from a stamp, s, and a pose (4, 4)."""
         return self.make("geometry_msgs/PoseStamped", self.header(stamp), self.pose(pose))
 
+    def transform(self, stamp: float, child: str, pose: Floats) -> Any:
+        """Make a tf2_msgs/TFMessage with the pose (4, 4) of the frame `child`, from a stamp, s."""
+        turn = self._vector("Quaternion", quaternion(pose[None])[0])
+        transform = self.make("geometry_msgs/Transform", self._vector("Vector3", pose[:3, 3]), turn)
+        stamped = self.make("geometry_msgs/TransformStamped", self.header(stamp), child, transform)
+        return self.make("tf2_msgs/TFMessage", [stamped])
+
     def path(self, stamp: float, stamps: Floats, poses: Floats) -> Any:
         """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s."""
         stamped = [self.stamped(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]

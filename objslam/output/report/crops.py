@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,13 +15,15 @@ from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps
 from objslam.io.images import decode_colour
 from objslam.io.rays_parquet import RaysTable
 from objslam.io.text import read_bytes
-from objslam.output.plot.style import REJECTED_BELOW
+from objslam.output.plot.style import REJECTED_BELOW, evenly
 from objslam.sources import SourceOptions, read
 
 _SIDE = 160  # The longer side of a crop on the page has this length, px.
 _MARGIN = 0.2  # A crop has a margin on each side of the box. The margin is this share of the box's longer side.
 _MIN_SIDE = 40  # A crop covers at least this length of the image, px.
-_FRAME = (60, 190, 255)  # The box is drawn in this BGR colour, orange.
+_FRAME, _REJECTED_FRAME = (60, 190, 255), (60, 60, 235)
+"""The box is drawn in one of these BGR colours: orange, or red where the ray of the box was rejected."""
+Kind = Literal["best", "worst", "rejected", "unexplained"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Crop:
     stamp: float  # The stamp of the ray, s.
     score: float  # The score of the box.
     camera: str
+    residual_deg: float  # The angle between the ray and its object, NaN without an object.
+    kind: Kind
 
 
 def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str | None]:
@@ -78,15 +82,37 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
     return np.array([part[np.lexsort((size[part], rays.score[part]))[-1]] for part in parts], dtype=np.int64)
 
 
+def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
+    """Choose rays of an object for its pictures: `count` of the best, and half as many each of the worst and the rejected.
+
+    The worst used rays have the largest residuals, in sigmas. mine: as in `best_rays`.
+    """
+    found: dict[int, Kind] = dict.fromkeys(best_rays(rays, mine, count).tolist(), "best")
+    few = (count + 1) // 2 if count else 0
+    used = rays.weight[mine] >= REJECTED_BELOW
+    kept = [ray for ray in mine[used].tolist() if ray not in found]
+    off = np.nan_to_num(rays.residual / rays.sigma)
+    found |= dict.fromkeys(sorted(kept, key=lambda ray: -off[ray])[:few], "worst")
+    return found | dict.fromkeys(mine[~used][evenly(int((~used).sum()), few)].tolist(), "rejected")
+
+
+def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kind]:
+    """Choose rays of a label that belong to no object: those with the highest score of each part of the time."""
+    mine = np.flatnonzero((rays.object < 0) & (rays.label == label))
+    most = min(count, len(mine))
+    parts = np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], most) if most else []
+    return {int(part[np.argmax(rays.score[part])]): "unexplained" for part in parts}
+
+
 def cut_crops(
-    rays: RaysTable, chosen: Ints, images: dict[str, Images], progress: Callable[[int, int], None]
+    rays: RaysTable, chosen: dict[int, Kind], images: dict[str, Images], progress: Callable[[int, int], None]
 ) -> dict[int, Crop]:
-    """Return a crop for each ray with an index in `chosen` (C,), by this index.
+    """Return a crop for each ray whose index is in `chosen`, by this index.
 
     A ray has no crop if no readable image belongs to its stamp, or if its box is outside the image.
     """
     by_file: dict[Path, list[int]] = {}
-    for ray in chosen.tolist():
+    for ray in chosen:
         listed = images.get(str(rays.camera[ray]))
         if listed is not None:
             near = int(nearest_stamps(listed.stamps, rays.stamp[ray : ray + 1])[0])
@@ -99,14 +125,16 @@ def cut_crops(
         except ObjslamError:
             image = None
         for ray in wanted if image is not None else ():
-            picture = _cut(image, rays.box[ray])
+            picture = _cut(image, rays.box[ray], _REJECTED_FRAME if chosen[ray] == "rejected" else _FRAME)
             if picture is not None:
-                crops[ray] = Crop(*picture, float(rays.stamp[ray]), float(rays.score[ray]), str(rays.camera[ray]))
+                off = float(np.degrees(rays.residual[ray]))
+                stamp, score = float(rays.stamp[ray]), float(rays.score[ray])
+                crops[ray] = Crop(*picture, stamp, score, str(rays.camera[ray]), off, chosen[ray])
         progress(done + 1, len(by_file))
     return crops
 
 
-def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
+def _cut(image: Any, box: Floats, colour: tuple[int, int, int]) -> tuple[bytes, int, int] | None:
     """Cut the square around a box out of an image, and draw the box on it.
 
     Returns the JPEG data, the width and the height, px, or None if the box is outside the image.
@@ -125,5 +153,5 @@ def _cut(image: Any, box: Floats) -> tuple[bytes, int, int] | None:
     shape = max(round(part.shape[1] * scale), 1), max(round(part.shape[0] * scale), 1)
     part = cv2.resize(part, shape, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     corners = np.rint((box.reshape(2, 2) - low) * scale).astype(int)
-    cv2.rectangle(part, corners[0].tolist(), corners[1].tolist(), _FRAME, 1, cv2.LINE_AA)
+    cv2.rectangle(part, corners[0].tolist(), corners[1].tolist(), colour, 1, cv2.LINE_AA)
     return cv2.imencode(".jpg", part, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes(), shape[0], shape[1]

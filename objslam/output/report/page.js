@@ -18,6 +18,13 @@ for (const head of document.querySelectorAll("table.sortable th")) {
   };
   head.querySelector("button").addEventListener("click", sort);
 }
+// A table that is wider than the page says so, because nothing else shows that it goes on.
+const tellWide = () => {
+  for (const hint of document.querySelectorAll(".scroll-hint"))
+    hint.classList.toggle("needed", hint.nextElementSibling.scrollWidth > hint.nextElementSibling.clientWidth + 1);
+};
+addEventListener("resize", tellWide);
+tellWide();
 // A printed page cannot be unfolded, so all details are open in print.
 let folded = [];
 addEventListener("beforeprint", () => {

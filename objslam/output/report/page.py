@@ -2,9 +2,8 @@
 
 import base64
 import json
-import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -14,20 +13,23 @@ from typing import Any
 import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
-from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Images
 from objslam.errors import ConfigError, OutputError, printable
+from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
-from objslam.output.plot.style import REJECTED_BELOW, captions, is_date, label_colours
-from objslam.output.report.charts import Histogram, axis_end, histogram
-from objslam.output.report.crops import Crop, best_rays, cut_crops, images_of
+from objslam.output.plot.style import is_date
+from objslam.output.report.cards import make_cards
+from objslam.output.report.charts import histogram
+from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of
+from objslam.output.report.scene import scene_data
 from objslam.output.report.trends import trends
 from objslam.results.files import CONFIG, PICTURE, REPORT
-from objslam.results.read import load_evaluation, load_map, load_rays, load_summary, load_truth
+from objslam.results.read import load_evaluation, load_map, load_path, load_rays, load_summary, load_truth
 
-_BINS, _FEW_BINS = 32, 16  # The histogram of all rays has 32 bins. The histogram of one object has 16 bins.
+_BINS = 32  # The histogram of all rays has this many bars.
+_LABELS = 12  # Of so many labels, the page shows boxes that belong to no object. More would be a list that nobody reads.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -41,22 +43,6 @@ _COUNTS = {
     "unresolved": "unresolved objects",
 }
 """The words that the page shows for the counts in summary.json."""
-
-
-@dataclass(frozen=True)
-class Card:
-    """The data of one object on the page."""
-
-    object: MapObject
-    caption: str
-    colour: str
-    sigma: list[float] | None  # The standard deviations along x, y and z, m.
-    seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
-    rejected: int  # The number of rejected rays.
-    error: float | None  # The distance from the matching true object, m; None without a match.
-    matched: str | None  # A text that names the matching true object.
-    histogram: Histogram | None
-    crops: list[Crop]
 
 
 def write_report(
@@ -85,17 +71,24 @@ def write_report(
     except ConfigError as error:
         raise OutputError(error.message.splitlines()[0], where=error.where) from error
     errors, scores = _evaluation(out)
-    chosen = {o.id: best_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects.objects}
+    path = load_path(out)
+    truth = load_truth(out)
+    laid = None if truth is None else lay_truth(objects, truth)
+    up = summary.get("up", "z")
+    chosen = {o.id: choose_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects}
+    unexplained = _unexplained(rays, crops)
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
     images = _on_one_clock(images, summary.get("calibration"))
-    wanted = np.concatenate([np.zeros(0, dtype=np.int64), *chosen.values()])
+    wanted: dict[int, Kind] = {}
+    for some in (*chosen.values(), *unexplained.values()):
+        wanted |= some
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
-    if images and len(wanted) and not pictures:
+    if images and wanted and not pictures:
         no_images = "No image of the log can be read at the times of the boxes: is it the log of this run?"
-    crops_of = {number: [pictures[i] for i in index.tolist() if i in pictures] for number, index in chosen.items()}
+    crops_of = {number: [pictures[i] for i in index if i in pictures] for number, index in chosen.items()}
     begin = float(rays.stamp.min()) if len(rays) else 0.0
-    cards = _cards(objects, rays, crops_of, errors, begin)
+    cards = make_cards(objects, rays, crops_of, errors, path.poses[:, :3, 3], up)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("objslam.output.report", ""),
         autoescape=True,  # Texts of the result may contain HTML.
@@ -109,7 +102,8 @@ def write_report(
     source = resources.files("objslam.output.report")
     page = environment.get_template("page.html.jinja").render(
         style=(source / "page.css").read_text(encoding="utf-8"),
-        script=(source / "page.js").read_text(encoding="utf-8"),
+        script="\n".join((source / name).read_text(encoding="utf-8") for name in ("page.js", "scene.js")),
+        scene=scene_data(objects, rays, path, laid, up) if len(objects) else None,
         name=str(summary.get("log", out.resolve().name)),
         folder=out.resolve().name,
         mode=settings.mode,
@@ -124,10 +118,15 @@ def write_report(
         trends=trends(rays),
         calibration=summary.get("calibration"),
         assessment=summary.get("assessment"),
+        localisation=summary.get("localisation"),
         scores=scores,
         no_images=no_images,
         counts=[(_COUNTS.get(key, key), value) for key, value in counts.items()],
         unexplained=summary.get("unexplained_share", {}),
+        of_no_object={
+            label: (int(((rays.object < 0) & (rays.label == label)).sum()), [pictures[i] for i in index if i in pictures])
+            for label, index in unexplained.items()
+        },
         dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
@@ -138,40 +137,18 @@ def write_report(
     return out / REPORT
 
 
+def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
+    """Return the labels with the most boxes of no object, the most first, and the rays for their pictures."""
+    labels, counts = np.unique(rays.label[rays.object < 0].astype(str), return_counts=True)
+    most = labels[np.argsort(-counts, kind="stable")][:_LABELS]
+    return {str(label): choose_unexplained(rays, str(label), crops) for label in most}
+
+
 def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
     """Return the images of each camera with the stamps that the run gave them, if it estimated the offset of their clock."""
     found = calibration["parameters"] if calibration else {}
     clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}
     return {name: replace(listed, stamps=listed.stamps + clock[name]) for name, listed in images.items()}
-
-
-def _cards(
-    objects: ObjectMap, rays: RaysTable, crops: dict[int, list[Crop]], errors: dict[int, tuple[float, str]], begin: float
-) -> list[Card]:
-    """Return the cards, sorted by label. The times on the cards count from the stamp `begin`, s."""
-    residual_deg = np.degrees(rays.residual)
-    kept = residual_deg[(rays.weight >= REJECTED_BELOW) & np.isfinite(residual_deg)]
-    top = axis_end(kept) if len(kept) else None
-    colours = label_colours(objects)
-    cards = []
-    for o, caption in zip(objects.objects, captions(objects), strict=True):
-        mine = rays.object == o.id
-        weight = rays.weight[mine]
-        error, matched = errors.get(o.id, (None, None))
-        card = Card(
-            object=o,
-            caption=caption,
-            colour="#" + "".join(f"{round(255 * c):02x}" for c in colours[o.label]),
-            sigma=None if o.covariance is None else np.sqrt(np.diag(o.covariance)).tolist(),
-            seen=(o.first_seen - begin, o.last_seen - begin),
-            rejected=int((weight < REJECTED_BELOW).sum()),
-            error=error,
-            matched=matched,
-            histogram=histogram(residual_deg[mine], weight, _FEW_BINS, top),
-            crops=crops[o.id],
-        )
-        cards.append(card)
-    return sorted(cards, key=lambda card: (_natural(card.object.label), card.object.id))
 
 
 def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
@@ -203,9 +180,3 @@ def _flat(data: dict[str, Any], before: str = "") -> dict[str, Any]:
     for key, value in data.items():
         flat |= _flat(value, f"{before}{key}.") if isinstance(value, dict) else {f"{before}{key}": value}
     return flat
-
-
-def _natural(text: str) -> tuple[str, int]:
-    """Return a sort key that places landmark_9 before landmark_10."""
-    head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
-    return head, int(number or -1)

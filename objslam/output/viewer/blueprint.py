@@ -53,7 +53,7 @@ def blueprint(
 
 def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] = _HIDDEN) -> Any:
     """Make the 3D view of the map; the entities in `hidden` are invisible at first."""
-    controls = rrb.EyeControls3D(position=view_point.position, look_target=view_point.target, eye_up=[0, 0, 1])
+    controls = rrb.EyeControls3D(position=view_point.position, look_target=view_point.target, eye_up=view_point.up)
     return rrb.Spatial3DView(
         origin="map",
         name=name,

@@ -11,6 +11,7 @@ from objslam.core.arrays import Floats
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
 from objslam.errors import one_line
+from objslam.frontend.up import up_axis
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, log_cameras
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
@@ -28,7 +29,7 @@ _AVOIDED = 500  # Labels avoid at most this many points of the path.
 def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -> None:
     """Write a run as a rerun recording (.rrd) with its blueprint.
 
-    `map` (z up, m) has the static data: paths, objects, ground truth, a sample of the rays, surfaces. On the timeline
+    `map` (m) has the static data: paths, objects, ground truth, a sample of the rays, surfaces. On the timeline
     `stamp`, `map` also has the robot, its cameras with images, boxes and objects, and the rays of each stamp. On the
     timeline `iteration`, `map` has the path and the objects after each iteration of the solver. `plots` has curves, `log`
     has the events on both timelines, and `summary` has a table. OSError if the file cannot be written.
@@ -37,13 +38,15 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     # The recording stays in memory until the end. A file sink would report a full disk on stderr and raise no error.
     memory = recording.memory_recording()
     recording.send_recording_name(one_line(result.summary.get("log", "objslam")))
-    view_point = first_view_point(result.map, result.map_T_base[:, :3, 3])
+    up = up_axis(result.keyframes)
+    view_point = first_view_point(result.map, result.map_T_base[:, :3, 3], up)
     used = [c for i, c in enumerate(result.cameras) if (result.keyframes.camera == i).any()]
     cameras = [(camera_path(c), c.name) for c in used]
     recording.send_blueprint(
         blueprint(view_point, cameras, solver=bool(result.trace), calibrated=result.calibration is not None)
     )
-    recording.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    upright = f"RIGHT_HAND_{up[-1].upper()}_{'DOWN' if up.startswith('-') else 'UP'}"
+    recording.log("map", getattr(rr.ViewCoordinates, upright), static=True)
     log_paths(recording, result, truth)
     log_surfaces(recording, result)
     log_objects(recording, result.map, view_point, thinned(result.path_after, _AVOIDED))

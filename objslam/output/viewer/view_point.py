@@ -6,6 +6,8 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import ObjectMap
+from objslam.core.types import Up
+from objslam.frontend.up import from_above, up_vector
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
 
@@ -28,6 +30,7 @@ class ViewPoint:
     target: Floats  # (3,) m in map, at the centre of the view.
     axes: Floats  # (3, 3); the rows point right, up and towards the target.
     focal: float  # The focal length, px.
+    up: Floats  # (3,) the unit vector in map that points up in the world.
 
     @property
     def distance(self) -> float:
@@ -50,13 +53,17 @@ class ViewPoint:
         return (pixels * [1.0, -1.0] * depth[:, None] / self.focal) @ self.axes[:2]
 
 
-def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
-    """Return the view point from which the objects and the path (K, 3) fill the view; far objects are left out."""
+def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoint:
+    """Return the view point from which the objects and the path (K, 3) fill the view; far objects are left out.
+
+    up: the axis of the map that points up.
+    """
     positions = np.array([o.position for o in objects.objects]).reshape(-1, 3)
     inside, low, high = frame_objects(positions, path)
     points = np.concatenate([positions[inside], path[((path >= low) & (path <= high)).all(axis=1)], [low, high]])
     centre = (low + high) / 2
-    axes = _axes(_FROM)
+    back = _FROM @ np.stack([*np.eye(3)[from_above(up)], up_vector(up)])
+    axes = _axes(back, up_vector(up))
     tangent = _FILLED * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
     for _ in range(4):  # Perspective enlarges the near half, so the centre is found by iteration.
         x, y, ahead = ((points - centre) @ axes.T).T
@@ -64,18 +71,21 @@ def first_view_point(objects: ObjectMap, path: Floats) -> ViewPoint:
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
         shift = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance
         centre = centre + shift @ axes[:2]
-    return look_at(centre, _FROM, distance)
+    return look_at(centre, back, distance, up)
 
 
-def look_at(target: Floats, back: Floats, distance: float) -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from the target to it."""
-    axes = _axes(back)
-    return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2))
+def look_at(target: Floats, back: Floats, distance: float, up: Up = "z") -> ViewPoint:
+    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from the target to it.
+
+    up: the axis of the map that points up.
+    """
+    axes = _axes(back, up_vector(up))
+    return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2), up_vector(up))
 
 
-def _axes(back: Floats) -> Floats:
+def _axes(back: Floats, up: Floats) -> Floats:
     back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
+    right = np.cross(up, back)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(back, right), -back])
 

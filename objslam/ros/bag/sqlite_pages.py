@@ -24,7 +24,7 @@ class _CellError(ValueError):
 
 
 def missing_pages(path: Path) -> tuple[int, int]:
-    """Return how many whole pages a file has and how many are missing. The latter is 0 if the header is not reliable."""
+    """Return how many whole pages a file has and how many are missing. No page is missing if the header is not reliable."""
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:

@@ -45,7 +45,7 @@ _FIELDS: dict[str, dict[str, str]] = {
 
 
 def missing_field(store: Typestore, type_: str) -> str | None:
-    """Return the first field of a type that objslam reads and the definition in a store lacks. None if it lacks none.
+    """Return the first field of a type that objslam reads but the definition in a store lacks. None if no field is missing.
 
     A field counts as missing if it has another type. Types that objslam does not read, and boxes, have no missing field.
     """

@@ -55,8 +55,8 @@ def link(transform: Any) -> tuple[str, str]:
 
 
 def climb(frame: str, parent_of: Callable[[str], str | None]) -> tuple[tuple[str, ...], str | None]:
-    """Return the frames from a frame up to the root, and None.
-    In a cycle, the frames end before the first repeated frame, which is returned in place of None."""
+    """Return the frames from a frame up to the root, and the first repeated frame if they form a cycle, else None.
+    In a cycle, the list ends before the repeated frame."""
     way, seen = [frame], {frame}
     while (parent := parent_of(way[-1])) is not None:
         if parent in seen:

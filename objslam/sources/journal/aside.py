@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from objslam.errors import OutputError
-
-MAGIC = b"OBJSLAM1"
-"""The first bytes of a journal. A journal without messages holds nothing else."""
+from objslam.sources.journal.record_format import is_cut_header, read_header
+from objslam.sources.journal.segments import holds_messages
 
 
 def set_aside(file: Path) -> Path | None:
@@ -24,9 +23,11 @@ def set_aside(file: Path) -> Path | None:
         if not file.is_file():
             return None
         with file.open("rb") as stream:
-            if not MAGIC.startswith(stream.read(len(MAGIC))):
+            header = read_header(stream)
+            stream.seek(0)
+            if header is None and not is_cut_header(stream.read(64)):
                 raise OutputError("this file is not a journal", where=str(file), hint="move it out of the way")
-            if file.stat().st_size <= len(MAGIC):
+            if not holds_messages(file, header):
                 return None
             try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -42,8 +43,10 @@ def put_back(aside: Path, file: Path) -> bool:
     If `file` is by now a journal with messages, nothing is renamed. Raises OutputError if the journal cannot be renamed.
     """
     with refusals(f"put {aside} back", file):
-        if file.is_file() and file.stat().st_size > len(MAGIC):
-            return False
+        if file.is_file():
+            with file.open("rb") as stream:
+                if holds_messages(file, read_header(stream)):
+                    return False
         aside.replace(file)
     return True
 
@@ -64,9 +67,11 @@ def restore_after_kill(file: Path) -> Path | None:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 return None
-            content = stream.read(len(MAGIC) + 1)
+            header = read_header(stream)
+            stream.seek(0)
+            empty = is_cut_header(stream.read(64)) if header is None else not holds_messages(file, header)
             kept = [other for other in file.parent.iterdir() if numbered.fullmatch(other.name)]
-            if not MAGIC.startswith(content) or not kept:
+            if not empty or not kept:
                 return None
             newest = max(kept, key=lambda other: other.stat().st_mtime_ns)
             newest.replace(file)

@@ -26,10 +26,12 @@ from objslam.errors import LogError
 PathKind = Literal["odometry", "localization"]
 
 _POSE = struct.Struct("<c13d")  # The bytes of a pose message: its kind, its stamp and the upper three rows of the matrix.
-_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: those of a pose message, then the camera name's length.
+_MOUNT = struct.Struct("<cd12dH")  # The bytes of a mount message: the bytes of a pose message, then the name's length.
 _KINDS: dict[PathKind, bytes] = {"odometry": b"O", "localization": b"L"}
 _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
+_STOP_KIND = b"E"
+_LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
 CALIBRATION_KIND = b"S"
 """The first byte of a calibration message."""
 
@@ -112,9 +114,9 @@ class NoteMessage:
 
 @dataclass(frozen=True)
 class CalibrationMessage:
-    """The shared errors that a session takes out of its map and of all later messages.
+    """The shared errors that a session corrects in its map and in all later messages.
 
-    keyframe: the number of keyframes that the map had before the session took the errors out.
+    keyframe: the number of keyframes in the map before the correction.
     """
 
     keyframe: int
@@ -122,6 +124,25 @@ class CalibrationMessage:
 
 
 Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | CalibrationMessage
+
+
+def encode_stop(reason: str) -> bytes:
+    """Encode that a session stopped to write the journal, and why."""
+    return _STOP_KIND + json.dumps([reason]).encode()
+
+
+def is_stop(data: bytes) -> bool:
+    """Return whether a record says that a session stopped to write the journal."""
+    return data.startswith(_STOP_KIND)
+
+
+def read_stop(data: bytes) -> str:
+    """Return why a session stopped to write the journal. Raises LogError if the bytes do not say it."""
+    try:
+        (reason,) = json.loads(data[1:])
+    except (ValueError, TypeError, RecursionError) as error:
+        raise LogError(f"journal record that cannot be read: {error}") from error
+    return str(reason)[:_LONGEST_REASON]
 
 
 def encode(message: Message) -> bytes:
@@ -194,7 +215,7 @@ def _read_camera(data: bytes) -> CameraMessage:
     if known is None:
         raise ValueError("an unknown lens model")
     inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
-    # Older journals do not store whether boxes show sizes, and only sensors that tell it have a noise of their depths.
+    # Older journals do not store `sees_size`. The noise of depths is stored only if a sensor has its own.
     sees_size = bool(more[0]) if more else True
     noise = RangeNoise(*_array(more[1], (3,)).tolist()) if len(more) > 1 else None
     size = _integer(width), _integer(height)

@@ -14,6 +14,7 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject, label_table
+from objslam.core.validity import valid_depths, valid_positions, valid_stamps
 from objslam.errors import LogError
 from objslam.io.text import Table, count_drops, in_order, read_table, reading, select
 from objslam.sources.mrclam import MrclamOptions
@@ -27,6 +28,7 @@ _WIDTH, _HEIGHT = 640, 480
 _MATRIX = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 _FORWARD = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """base_T_camera of the virtual camera. The camera is in the origin of base and looks along base x."""
+_FASTEST = 1000.0  # The bound of speeds, m/s and rad/s. A larger bound lets damaged numbers in.
 _HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes, so a small box is made.
 _MARGIN = 6.0  # The least distance of a box centre from the image's edge, px. Boxes nearer to it would count as cut off.
 
@@ -60,13 +62,20 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
             raise LogError(f"{what}, the folder has: {numbers}", where=str(folder), hint="choose a robot with --robot")
         prefix = f"Robot{robot}"
         detections = _read_measurements(folder, prefix, options, ledger)
-        _, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
+        path, table = _read_forward(folder, f"{prefix}_Odometry", 3, ledger, "odometry")
+        slow = np.asarray((np.abs(table.values[:, 1:]) < _FASTEST).all(axis=1))
+        table = select(table, slow, "odometry line with a speed that no robot reaches", path, ledger)
+        if not len(table.lines):
+            raise LogError("no usable line: every stamp or speed is invalid", where=str(path))
         stamps, velocities = table.values[:, 0], table.values[:, 1:]
+        driven = integrate(stamps, velocities)
+        if not valid_positions(driven[:, :2]).all():
+            raise LogError("the odometry leads too far away", where=str(path), hint="are stamps in s and speeds in m/s?")
         camera = Camera("camera", _WIDTH, _HEIGHT, _MATRIX, base_T_camera=_FORWARD, sees_size=False)
         return Log(
             name=f"{folder.resolve().name}_robot{robot}",
             cameras=(CameraLog(camera, detections),),
-            odometry=_trajectory(stamps, integrate(stamps, velocities)),
+            odometry=_trajectory(stamps, driven),
             truth=_read_truth(folder, prefix, options.anonymous, ledger),
         )
 
@@ -104,6 +113,7 @@ def _read(folder: Path, name: str, columns: int, ledger: Ledger, what: str) -> t
 def _read_forward(folder: Path, name: str, columns: int, ledger: Ledger, what: str) -> tuple[Path, Table]:
     """Read a table, and drop the lines whose stamp (the first column) goes back. Stamps may repeat."""
     path, table = _read(folder, name, columns, ledger, what)
+    table = select(table, valid_stamps(table.values[:, 0]), f"{what} line with a stamp that is too large", path, ledger)
     forward = in_order(table.values[:, 0], repeats=True)
     return path, select(table, forward, f"{what} line with a stamp that goes back", path, ledger)
 
@@ -132,9 +142,9 @@ def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger
         count_drops(reason, int(bad.sum()), (f"{path}:{line}" for line in table.lines[bad]), ledger)
         good &= fine
     depths = distance * np.cos(bearing) if options.with_range else np.full(len(subject), np.nan)
-    wrong = good & (depths <= 0)
+    wrong = good & ~(valid_depths(depths) | np.isnan(depths))
     places = (f"{path}:{line}" for line in table.lines[wrong])
-    count_drops("range that is not above zero (taken as unknown)", int(wrong.sum()), places, ledger)
+    count_drops("range that is not above zero or too large (taken as unknown)", int(wrong.sum()), places, ledger)
     depths = np.where(wrong, np.nan, depths)
     label_names, label = label_table([_label(s, options.anonymous) for s in subject[good].tolist()])
     count = int(good.sum())
@@ -149,12 +159,16 @@ def _read_truth(folder: Path, prefix: str, anonymous: bool, ledger: Ledger) -> T
         file, table = _read(folder, "Landmark_Groundtruth", 5, ledger, "landmark")
         known = np.isin(table.values[:, 0], LANDMARKS)
         table = select(table, known, "landmark line with a subject that is no landmark", file, ledger)
+        near = valid_positions(table.values[:, 1:3])
+        table = select(table, near, "landmark line with a position that is too far away", file, ledger)
         positions = {int(subject): np.array([x, y, 0.0]) for subject, x, y, *_ in table.values.tolist()}
         objects = tuple(TruthObject(subject, _label(subject, anonymous), at) for subject, at in positions.items())
     path = None
     if _find(folder, f"{prefix}_Groundtruth"):
-        _, table = _read_forward(folder, f"{prefix}_Groundtruth", 4, ledger, "ground truth")
-        path = _trajectory(table.values[:, 0], table.values[:, 1:])
+        file, table = _read_forward(folder, f"{prefix}_Groundtruth", 4, ledger, "ground truth")
+        near = valid_positions(table.values[:, 1:3])
+        table = select(table, near, "ground truth line with a position that is too far away", file, ledger)
+        path = _trajectory(table.values[:, 0], table.values[:, 1:]) if len(table.lines) else None
     return Truth(objects, path) if objects or path else None
 
 

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, spoken_name
 from objslam.core.diagnostics import Ledger
-from objslam.errors import LogError
 from objslam.ros.messages.topic_types import COMPRESSED, TRANSFORMS
-from objslam.ros.tf.tree import TfTree
 from objslam.sources.ros_bag.log import Assembly, assemble
 from objslam.sources.ros_bag.options import BagOptions
+from objslam.sources.ros_bag.places import CameraPlace, camera_places
 from objslam.sources.ros_bag.survey import Topic
 from objslam.sources.summary import FIND_BOXES, Timing, off_path, timing
 
@@ -35,15 +33,6 @@ class TopicInfo:
     frame: str
     detail: str
     refused: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class CameraPlace:
-    """An optical frame in tf. chain: the frames from base to it. base_T_frame: (4, 4), None if it moves on the robot."""
-
-    frame: str
-    chain: tuple[str, ...]
-    base_T_frame: Floats | None
 
 
 @dataclass(frozen=True)
@@ -96,7 +85,7 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
         odometry=found.odometry_from if found else "",
         localization=found.localization_from if found else "",
         cameras=tuple(camera for _, camera, _ in assembly.cameras),
-        places=_places(assembly.tree, base),
+        places=camera_places(assembly.tree, base),
         missing=_missing(assembly),
         damage=survey.damage(),
         warnings=tuple(ledger.lines()),
@@ -151,13 +140,3 @@ def _detail(topic: Topic) -> str:
         image = topic.image
         return str(image.format) if topic.type == COMPRESSED else f"{image.width}x{image.height} {image.encoding}"
     return ""
-
-
-def _places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
-    places = []
-    for frame in sorted(frame for frame in tree.frames if frame.endswith(("optical_frame", "optical"))):
-        try:
-            places.append(CameraPlace(frame, tree.chain(base, frame), tree.still(base, frame)))
-        except LogError:  # tf does not connect the frame to base. If a camera needs it, `missing` reports that.
-            continue
-    return tuple(places)

@@ -26,8 +26,10 @@ from objslam.ros.messages.images import DEPTH_SCALE, image_file
 from objslam.ros.messages.topic_types import is_tags
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
+from objslam.sources.no_camera import NoCamera
 from objslam.sources.ros_bag.cameras import CameraTopics, build_camera, find_cameras
 from objslam.sources.ros_bag.options import BagOptions
+from objslam.sources.ros_bag.places import camera_places
 from objslam.sources.ros_bag.survey import Survey, take_survey
 from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
@@ -59,7 +61,8 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
 
     The first pass reads everything except the images. The second pass reads the images. Stamps are those of the headers.
     Damaged files are read as far as possible and never changed. The ledger counts the lost messages.
-    Raises LogError if the robot's path or every camera is missing, and ConfigError for options that do not fit the bag.
+    Raises LogError if the robot's path or every camera is missing (NoCamera if it is only the cameras), and ConfigError for
+    options that do not fit the bag.
     """
     options = options or BagOptions()
     assembly = assemble(paths, ledger, options)
@@ -70,6 +73,8 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
     if assembly.problems:
         first = assembly.problems[0]
         hint = "; ".join(filter(None, [first.hint, *assembly.survey.damage()]))
+        if isinstance(first, NoCamera):
+            raise first
         raise LogError(first.message, where=first.where, hint=hint)
     for error in assembly.left_out:
         ledger.warn(f"{error}: left out")
@@ -113,7 +118,13 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
         images = any(topic.type.endswith(("/Image", "/CompressedImage")) for topic in survey.topics.values())
         what = "images, but none with a CameraInfo" if images else "no images and no detections"
         hint = "record Detection2DArray or AprilTag detections, or images with CameraInfo (or give --camera-info FILE)"
-        problems.append(LogError(f"no camera: the recording has {what}", where=survey.recording.name, hint=hint))
+        message, where = f"no camera: the recording has {what}", survey.recording.name
+        if found is None or images:
+            problems.append(LogError(message, where=where, hint=hint))
+        else:
+            places = camera_places(tree, base)
+            known = {place.frame: place.base_T_frame for place in places if place.base_T_frame is not None}
+            problems.append(NoCamera(message, where, hint, found.odometry, found.localization, known))
     if not cameras:
         problems += refused
     return Assembly(survey, tree, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))

@@ -1,9 +1,9 @@
 """Read RGB-D recordings of the TUM benchmark (Sturm et al., IROS 2012) with text files of detector boxes.
 
-The numbered layout is that of the cube_slam sample. truth_cam_poses.txt has a pose for each image. The names of files in
-boxes/, raw_imgs/ and depth_imgs/ begin with the number of the image, from 0. The stamped layout is that of the benchmark,
-with groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are those of the camera, so the base
-frame is the camera's frame.
+The numbered layout is the layout of the cube_slam sample. truth_cam_poses.txt has a pose for each image. The names of files
+in boxes/, raw_imgs/ and depth_imgs/ begin with the number of the image, from 0. The stamped layout is the layout of the
+benchmark, with groundtruth.txt, rgb.txt, depth.txt, and box files named after stamps. The poses are camera poses, so the
+base frame is the camera's frame.
 """
 
 import lzma

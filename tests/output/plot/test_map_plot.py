@@ -134,15 +134,52 @@ def test_ellipses_are_two_sigma_in_the_plane(drawn: Any) -> None:
         np.testing.assert_allclose(distance, 2.0, rtol=1e-6)
 
 
-def test_a_far_object_is_counted_not_shown(drawn: Any) -> None:
+def test_a_triangle_at_the_edge_points_to_a_far_object(drawn: Any) -> None:
     positions, labels = clusters()
     positions[3, :2] = [500, -900]
     figure = drawn(synthetic_result(positions, labels, keyframes=50)[0])
     axes = figure.axes[0]
-    assert axes.get_title(loc="left").endswith("\n1 object far outside this picture")
     assert np.ptp(axes.get_xlim()) < 20
     assert np.ptp(axes.get_ylim()) < 25
-    assert labels[3] not in texts(figure)
+    (triangle,) = (line for line in axes.get_lines() if isinstance(line.get_marker(), tuple))
+    (at,) = triangle.get_xydata()
+    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
+    assert ((at >= low) & (at <= high)).all()
+    way = np.array([500, -900]) - (low + high) / 2
+    ahead = np.radians(triangle.get_marker()[2] + 90)
+    np.testing.assert_allclose([np.cos(ahead), np.sin(ahead)], way / np.linalg.norm(way), atol=1e-3)
+    (text,) = (text for text in texts(figure) if text.startswith(labels[3]))
+    assert abs(float(text.split(", ")[1].removesuffix(" m out")) - np.linalg.norm([500, -900] - at)) < 0.06
+
+
+def test_a_world_with_y_down_is_drawn_from_above(drawn: Any) -> None:
+    """The map of the same drive with every pose and point turned: the picture has the same points, on other axes."""
+    result, _ = synthetic_result(*clusters(), keyframes=50)
+    y_down = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    keyframes = result.keyframes
+    poses = keyframes.map_T_base.copy()
+    poses[:, 2, 3] += np.sin(np.arange(len(poses)))  # held in a hand, for a planar path tells where up is
+    moved = [
+        dataclasses.replace(
+            o, position=y_down[:3, :3] @ o.position, covariance=y_down[:3, :3] @ o.covariance @ y_down[:3, :3].T
+        )
+        for o in result.map.objects
+    ]
+    turned = dataclasses.replace(
+        result,
+        map=dataclasses.replace(result.map, objects=tuple(moved)),
+        keyframes=dataclasses.replace(keyframes, map_T_base=y_down @ poses),
+        map_T_base=y_down @ result.map_T_base,
+        path=dataclasses.replace(result.path, poses=y_down @ result.path.poses),
+        path_after=dataclasses.replace(result.path_after, poses=y_down @ result.path_after.poses),
+        origins=result.origins @ y_down[:3, :3].T,
+        directions=result.directions @ y_down[:3, :3].T,
+    )
+    before, after = drawn(result), drawn(turned)
+    assert (after.axes[0].get_xlabel(), after.axes[0].get_ylabel()) == ("x (m)", "z (m)")
+    np.testing.assert_allclose(lines(after)["path after"].get_xydata(), lines(before)["path after"].get_xydata(), atol=1e-9)
+    for one, other in zip(after.axes[0].patches, before.axes[0].patches, strict=True):
+        assert [*one.center, one.width, one.height] == pytest.approx([*other.center, other.width, other.height])
 
 
 def test_a_path_before_that_drifted_off_does_not_squeeze_the_map(drawn: Any) -> None:

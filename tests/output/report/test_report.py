@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import re
+from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ EVIL = [
     "Bücher & Töpfe",
 ]
 QUICK = Settings(mode="joint", output=config.Output(recording=False, picture=False))
-VOID = {"meta", "img", "line", "rect", "br"}
+VOID = {"meta", "img", "line", "rect", "br", "input"}
 
 
 class Page(HTMLParser):
@@ -96,8 +97,11 @@ def evil_result(tmp_path: Path) -> Path:
 
 def test_text_of_others_is_text(tmp_path: Path) -> None:
     page = Page(evil_result(tmp_path))
-    assert len(page.of("script")) == 1
-    assert "alert" not in page.text["script"][0]
+    data, program = page.text["script"]
+    assert [script.get("type") for script in page.of("script")] == ["application/json", None]
+    assert "alert" not in program
+    assert "<" not in data
+    assert {o["name"] for o in json.loads(data)["objects"]} == set(EVIL)
     assert {row[1] for row in page.rows if row} == set(EVIL)
     assert page.all_text.count("<b onmouseover=alert(3)>late</b>") == 4
     for _, attributes in page.elements:
@@ -109,7 +113,7 @@ def test_it_asks_for_nothing_outside(tmp_path: Path) -> None:
     for tag, attributes in page.elements:
         for name in ("src", "href", "action", "data", "srcset", "xlink:href"):
             if name in attributes:
-                assert re.match(r"data:image/(png|jpeg);base64,|#object-\d+$", attributes[name] or ""), (tag, name)
+                assert re.match(r"data:image/(png|jpeg);base64,|#object-\d+$|#map$", attributes[name] or ""), (tag, name)
     (policy,) = [m["content"] for m in page.of("meta") if m.get("http-equiv") == "Content-Security-Policy"]
     assert (policy or "").startswith("default-src 'none'; img-src data:;")
     assert not re.search(r"url\(|@import", page.text["style"][0])
@@ -127,7 +131,7 @@ def test_the_table_is_the_map(tmp_path: Path) -> None:
         sigma = "" if o.covariance is None else f"{np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.3f}"
         assert row[5:7] == [sigma, str(o.rays)]
         assert row[-1] == o.status
-    links = {a["href"] for a in page.of("a")}
+    links = {a["href"] for a in page.of("a")} - {"#map"}
     cards = {f"#{c['id']}" for c in page.of("article")}
     assert links == cards == {f"#object-{o.id}" for o in result.map.objects}
     png = next(image["src"] for image in page.of("img"))
@@ -165,7 +169,7 @@ def test_a_comparison_of_two_maps_is_not_called_the_truth(tmp_path: Path) -> Non
     assert "truth id" not in told[other].all_text
     assert f"Against {other}, without alignment" in told[other].all_text
     assert "objects' RMSE, against other/objects.json" in told[other].text["span"]
-    assert len(told[other].of("script")) == 1
+    assert len(told[other].of("script")) == 2
 
 
 def test_an_error_names_the_id_of_its_truth(tmp_path: Path) -> None:
@@ -300,7 +304,8 @@ def pictures(page: Page) -> list[tuple[str, Any]]:
 def test_the_pictures_show_the_objects(mapped: Path) -> None:
     page = Page(write_report(mapped / "out", crops=3))
     found = pictures(page)
-    assert sorted(label for label, _ in found) == sorted(3 * list(COLOURS))
+    per_object = Counter(label for label, _ in found)
+    assert all(per_object[label] > 3 for label in COLOURS)  # three of the best, and some of the worst
     for label, pixels in found:
         middle = pixels[pixels.shape[0] // 2 - 3 :, pixels.shape[1] // 2 - 3 :][:6, :6].reshape(-1, 3)
         assert np.abs(np.median(middle, axis=0) - COLOURS[label]).max() < 30
@@ -313,7 +318,7 @@ def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
     page = Page(write_report(mapped / "out"))
     assert not pictures(page)
     assert f"No pictures. The log is not at {mapped / 'log'} any more" in page.all_text
-    assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) == 16
+    assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) > 16
 
 
 def test_another_log_in_the_place_of_the_runs_is_noticed(mapped: Path) -> None:

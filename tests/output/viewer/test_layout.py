@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_result import clusters, synthetic_result
 
-from objslam.core.types import Images
+from objslam.core.types import Images, Up
+from objslam.frontend.up import from_above, up_vector
 from objslam.output.viewer.images import choose_images
 from objslam.output.viewer.view_point import first_view_point, label_places, label_rows, look_at
 
@@ -29,6 +31,20 @@ def test_the_first_look_has_everything_in_it_and_is_filled() -> None:
     assert spread.max() > 0.6
     np.testing.assert_allclose((pixels.max(axis=0) + pixels.min(axis=0)) / 2, VIEW / 2, atol=60)
     assert view_point.position[2] > places[:, 2].max()
+
+
+@pytest.mark.parametrize("up", ["z", "-y", "x", "-z"])
+def test_the_first_look_is_from_above_whatever_axis_points_up(up: Up) -> None:
+    """A map that is turned as a whole looks the same from its first view point."""
+    result, _ = synthetic_result(*clusters(), keyframes=60)
+    path = result.map_T_base[:, :3, 3]
+    turn = np.stack([*np.eye(3)[from_above(up)], up_vector(up)], axis=1)
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+    moved = dataclasses.replace(
+        result.map, objects=tuple(dataclasses.replace(o, position=turn @ o.position) for o in result.map.objects)
+    )
+    pixels, _ = first_view_point(result.map, path).project(path)
+    np.testing.assert_allclose(first_view_point(moved, path @ turn.T, up).project(path @ turn.T)[0], pixels, atol=25.0)
 
 
 def test_what_is_higher_in_the_map_is_higher_in_the_view() -> None:

@@ -7,8 +7,10 @@ from drive_bag import rows_of, simulated
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.io.camera_yaml import read_mounts, write_camera
+from objslam.io.detections_jsonl import write_detections
 from objslam.mapping import pipeline
-from objslam.sources import SourceOptions, read
+from objslam.sources import SourceOptions, convert, read
 from objslam.sources.log_folder import read_log_folder, write_log_folder
 
 KINDS = ["1-bag", "1-bag-bz2", "1-bag-lz4", "1-mcap-zstd", "2-sqlite3", "2-sqlite3-old", "3-sqlite3-message", "3-mcap-none",
@@ -80,3 +82,22 @@ def test_convert_and_read_again(tmp_path, makers, log):
     again = read_log_folder(tmp_path / "log", Ledger())
     _same_path(again.odometry, found.odometry)
     assert np.array_equal(again.cameras[0].detections.boxes, found.cameras[0].detections.boxes)
+
+
+def test_a_bag_without_a_camera_gives_its_path_and_the_mounts_and_with_boxes_beside_them_a_log(tmp_path, makers, log):
+    maker = makers["4"]
+    rows = [row for row in rows_of(log, maker) if not row[0].startswith("/front/")]
+    ledger = Ledger()
+    convert(write_bag(tmp_path / "drive", "mcap-none", maker, rows), tmp_path / "log", ledger, SourceOptions())
+    assert sorted(file.name for file in (tmp_path / "log").iterdir()) == ["localization.txt", "mounts.yaml", "odometry.txt"]
+    (warning,) = ledger.warnings
+    assert warning.endswith("odometry.txt, localization.txt, mounts.yaml need a camera.yaml and a detections.jsonl")
+    (mount,) = read_mounts(tmp_path / "log" / "mounts.yaml")
+    assert mount.name == "front_optical_frame"
+    _close(mount.base_T_camera, log.cameras[0].camera.base_T_camera)
+    write_camera(log.cameras[0].camera, tmp_path / "log" / "camera.yaml")
+    write_detections(log.cameras[0].detections, tmp_path / "log" / "detections.jsonl")
+    found = read(tmp_path / "log", Ledger())
+    _same_path(found.odometry, log.odometry)
+    _same_path(found.localization, log.localization)
+    _close(found.cameras[0].detections.boxes, log.cameras[0].detections.boxes)

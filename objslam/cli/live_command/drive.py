@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
-from objslam.cli.live_status import status_line, times
-from objslam.errors import ObjslamError, one_line
+from objslam.cli.live_command.status import status_line, times
+from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:
     from objslam.core.snapshot import Snapshot
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from objslam.live.adapters import Feed
     from objslam.live.session.session import Session
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
 _POLL = 0.1  # The time in s between two checks for the end of the source.
 
 
@@ -28,7 +29,20 @@ class LatestObjects:
     """The writer of objects.json during a session. Its first write removes an older result."""
 
     def __init__(self, out: Path) -> None:
-        self._out, self._begun = out, False
+        self._out, self._begun, self._refused = out, False, False
+
+    def try_write(self, snapshot: Snapshot) -> None:
+        """Write as `write` does, but let an error of the disk cost no map: warn of the first one, and of its end."""
+        refused = None
+        try:
+            self.write(snapshot)
+        except OutputError as error:
+            refused = error
+        if refused is not None and not self._refused:
+            say(f"warning: {refused}; the mapping goes on", stderr=True)
+        elif refused is None and self._refused:
+            say(f"objects.json can be written again into {self._out}", stderr=True)
+        self._refused = refused is not None
 
     def write(self, snapshot: Snapshot) -> None:
         """Write the objects of a snapshot, unless the session has no keyframe yet."""
@@ -47,7 +61,7 @@ class LatestObjects:
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
     """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
-    the views and the status line. An error of the disk or of a view also ends the loop. It is returned instead of raised,
+    the views and the status line. An error of a view also ends the loop. It is returned instead of raised,
     so that `finish` can write the map first."""
     from objslam.live.session import low_latency
 
@@ -61,20 +75,23 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
             ended.append(error)
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
-    shown = 0
+    ledgers, shown = (feed.adapter.ledger, session.counters.ledger), [0, 0]
     with _ends_by_signal(stop), status_line() as show:
         bringing.start()
         due = time.monotonic() + interval
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
                 bringing.join(_POLL)
-                for warning in feed.adapter.ledger.warnings[shown:]:
-                    shown += 1
-                    say(f"warning: {warning}", stderr=True)
+                for tick in feed.ticks:
+                    tick()
+                for i, ledger in enumerate(ledgers):
+                    for warning in ledger.warnings[shown[i] :]:
+                        shown[i] += 1
+                        say(f"warning: {warning}", stderr=True)
                 if time.monotonic() >= due:
                     due = time.monotonic() + interval
                     snapshot = session.snapshot()
-                    latest.write(snapshot)
+                    latest.try_write(snapshot)
                     for view in feed.views:
                         view(snapshot)
                     show(snapshot, feed.adapter.ledger)
@@ -119,7 +136,7 @@ def finish(
 
 
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
-    from objslam.sources.journal.file import NAME
+    from objslam.sources.journal.segments import NAME
 
     internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
     more = f"; `objslam run {out}` maps all received messages" if (out / NAME).is_file() else ""
@@ -128,14 +145,18 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
 
 @contextmanager
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` at Ctrl-C or SIGTERM. A second signal interrupts immediately."""
+    """Set `stop` at Ctrl-C, SIGTERM, or when the terminal closes (SIGHUP). A second signal interrupts immediately.
+
+    A signal that is ignored, as nohup ignores SIGHUP, stays so.
+    """
 
     def end(number: int, frame: object) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         stop.set()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = (number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN)
+    before = {number: signal.signal(number, end) for number in heard}
     try:
         yield
     finally:

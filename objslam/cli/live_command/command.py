@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import progress_bar, say
-from objslam.cli.live_drive import LatestObjects, drive, finish
+from objslam.cli.live_command.drive import LatestObjects, drive, finish
 from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.diagnostics import Ledger
     from objslam.core.types import Log
+    from objslam.live.session.session import Session
 
 
 Speed = Annotated[float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0: as fast as possible.")]
@@ -28,6 +29,7 @@ Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s 
 Publish = Annotated[
     bool, typer.Option("--publish", help="At each --interval, publish objects, markers and path over DDS for RViz and Nav2.")
 ]
+PublishTf = Annotated[bool, typer.Option("--publish-tf", help="Publish the tf map -> odom over DDS, ten times a second.")]
 View = Annotated[
     str | None, typer.Option("--view", help="Where to show the map: window, web (browser), FILE.rrd, or viewer address.")
 ]
@@ -54,6 +56,7 @@ def live(
     options: LiveOptions,
     calibration: CalibrationFile = None,
     publish: Publish = False,
+    publish_tf: PublishTf = False,
     view: View = None,
 ) -> None:
     """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C)."""
@@ -62,14 +65,16 @@ def live(
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
-    from objslam.sources.journal.file import NAME
+    from objslam.sources.journal.segments import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
         raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")
     if resume and not journal:
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
+    if publish_tf and source == "rclpy":
+        raise ConfigError("--publish-tf and rclpy: the session would hear its own tf", hint="use the source dds")
     settings = settings_of("joint", config, set_, calibration)
-    _say_what_is_not_used(source, options, speed, publish)
+    _say_what_is_not_used(source, options, speed, publish or publish_tf)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
     recording = None if source in ADAPTERS else _read(Path(source), options, settings)
     with output_folder(out), ExitStack() as stack:
@@ -88,10 +93,9 @@ def live(
         for close in feed.close:
             stack.callback(close)
         if publish:
-            from objslam.live.dds.network import open_network
-            from objslam.live.dds.publisher import DdsPublisher
-
-            feed = replace(feed, views=(*feed.views, DdsPublisher(open_network(options.domain, options.interface)).publish))
+            feed = _publishing(feed, options)
+        if publish_tf:
+            feed = _publishing_tf(feed, options, session)
         if view is not None:
             from objslam.output.viewer.images import of_log
             from objslam.output.viewer.live.live_view import open_view
@@ -105,6 +109,26 @@ def live(
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval)
         finish(session, feed, out, latest, truth, broken)
+
+
+def _publishing(feed: Feed, options: LiveOptions) -> Feed:
+    from objslam.live.dds.network import open_network
+    from objslam.live.dds.publisher import DdsPublisher
+
+    publisher = DdsPublisher(open_network(options.domain, options.interface))
+    return replace(feed, views=(*feed.views, publisher.publish))
+
+
+def _publishing_tf(feed: Feed, options: LiveOptions, session: Session) -> Feed:
+    """Return the feed with a publisher of tf, on the topic from which the robot's tf is read."""
+    from objslam.live.dds.network import open_network
+    from objslam.live.dds.transform_publisher import TransformPublisher
+    from objslam.ros.topics import parse_topics
+
+    topic = next(iter(parse_topics(options.topics, live=True).of("tf")), "/tf")
+    publisher = TransformPublisher(open_network(options.domain, options.interface), feed.odom_frame, topic)
+    ticks = (*feed.ticks, lambda: publisher.send(session.newest))
+    return replace(feed, views=(*feed.views, publisher.update), ticks=ticks)
 
 
 def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publish: bool) -> None:

@@ -62,7 +62,7 @@ class _Rates:
         found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
-            f"{found if snapshot.keyframes else ''}{shown} | {_lost(snapshot, ledger)} | lag {1e3 * snapshot.lag:.0f} ms | "
+            f"{found if snapshot.keyframes else ''}{_lost(snapshot, ledger)} | {shown} | lag {1e3 * snapshot.lag:.0f} ms | "
             f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, '')}"
         ).rstrip(" |")
 

@@ -1,0 +1,72 @@
+"""Join and compare the maps of several sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+from objslam.api.result import Result
+from objslam.core import object_map
+from objslam.mapping.sites.compare import Comparison, compare
+from objslam.mapping.sites.merge import Island, merge_sessions
+from objslam.mapping.sites.session import Session
+from objslam.results.files import SUMMARY
+from objslam.results.object_map import ObjectMap
+from objslam.results.read import load_summary
+
+Given = Result | object_map.ObjectMap | str | PathLike[str]
+"""A session as a user gives it: a result, a map alone, or the path of a result folder, a site or an objects.json."""
+
+
+def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
+    """Join the maps of several sessions, each in a frame of its own, to one map of the site.
+
+    sessions: in the order of time. Return one island for each group of sessions that share objects, the largest first.
+    `Island.objects` is its map, in the frame of its first session, and `MapObject.life` says what became of each object.
+    ValueError without a session. OutputError if a path cannot be read.
+    """
+    if not sessions:
+        raise ValueError("merge needs at least one session")
+    found = merge_sessions([_session(one, f"session {number}") for number, one in enumerate(sessions)])
+    return tuple(replace(one, objects=ObjectMap(one.objects.objects, one.objects.frame, one.objects.gone)) for one in found)
+
+
+def diff(a: Given, b: Given) -> Comparison:
+    """Compare a map with the map of a later session: which objects are confirmed, moved, gone, new, and unseen.
+
+    The later session must be a result: a map alone does not say what was in view, so that none of its objects is gone. If
+    the registration is refused, there are no changes, and `reason` says why. OutputError if a path cannot be read.
+    """
+    return compare(_session(a, "the first map"), _session(b, "the other map"))
+
+
+def load_session(path: Path) -> Session:
+    """Load one session. OutputError names what is missing or damaged."""
+    return Session.load(path)
+
+
+def warnings_of(sessions: Sequence[Session], islands: Sequence[Island]) -> list[str]:
+    """Return what a user is to know of a merge: sessions that stay apart, and results that already contain a map."""
+    found = []
+    if len(islands) > 1:
+        apart = "; ".join(", ".join(sessions[s].name for s in one.sessions) for one in islands)
+        found.append(f"the sessions are {len(islands)} islands without objects in common: {apart}")
+    for session in sessions:
+        folder = Path(session.name)
+        told = load_summary(folder).get("localisation") if (folder / SUMMARY).is_file() else None
+        if told and told["localised"]:
+            what = f"{session.name} was localised in a map, and has the objects of that map in its own"
+            found.append(f"{what}: merge a run without --map, so that the map does not count twice")
+    return found
+
+
+def _session(given: Given, name: str) -> Session:
+    if isinstance(given, object_map.ObjectMap):
+        return Session(name, given)
+    if not isinstance(given, Result):
+        return Session.load(given)
+    if given.folder is not None:
+        return Session.load(given.folder)
+    return Session(name, given.objects, given.views, given.rays)

@@ -1,0 +1,56 @@
+"""How likely objects of a map are still there, session after session: the persistence filter.
+
+Rosen, Mason, Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. An object survives for a time
+that is exponentially distributed, so that the filter needs only the last probability and the time since. A session is one
+measurement: it finds the object or misses it. A miss counts only as far as the object was in view.
+"""
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+
+LIFETIME = 60.0
+"""The mean time (days) that an object stays where it is. A larger value needs more misses before an object is gone. At 60
+days, a tenth of the objects change in a week, which is a lived-in place."""
+_OVERLOOKED = 0.03
+"""The probability that a session in which an object is in view misses it, however many looks there are: the map, the light
+or a person is in the way. A larger value needs more misses before an object is gone."""
+_BY_CHANCE = 0.02
+"""The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
+_CONCENTRATION = 5.0
+"""How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
+distribution. A larger value makes many misses count more. It is in the middle of the range that offline association
+finds."""
+_RATE = 0.5
+"""The share of looks that detect an object of which nothing is known. A larger value makes a miss count more."""
+_LOOKS = 4.0
+"""How many looks the share `_RATE` counts for. A larger value trusts it longer."""
+_LEAST, _MOST = 1e-9, 1 - 1e-9
+"""The limits of a probability. They let an object come back after any number of misses."""
+
+
+def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_looks: Ints, past_detections: Ints) -> Floats:
+    """Return the probability (N,) that each object is still there after a session.
+
+    Args:
+        before: (N,) the probability after the session before.
+        days: (N,) the time since that session.
+        found: (N,) whether the session found the object.
+        looks: (N,) in how many frames of the session it should have been detected if it was there.
+        past_looks, past_detections: (N,) the looks and detections of all sessions before, which tell the detection rate.
+    """
+    prior = np.clip(before * np.exp(-np.maximum(days, 0.0) / LIFETIME), _LEAST, _MOST)
+    missed = np.maximum(missed_by_all(looks, past_looks, past_detections), np.where(looks > 0, _OVERLOOKED, 1.0))
+    as_present = np.where(found, 1 - _OVERLOOKED, missed)
+    as_absent = np.where(found, _BY_CHANCE, np.where(looks > 0, 1 - _BY_CHANCE, 1.0))
+    odds = prior / (1 - prior) * as_present / as_absent
+    return np.asarray(np.clip(odds / (1 + odds), _LEAST, _MOST))
+
+
+def missed_by_all(looks: Ints, past_looks: Ints, past_detections: Ints) -> Floats:
+    """Return the probability (N,) that none of the looks at an object that is there detects it (beta-binomial)."""
+    from scipy.special import betaln
+
+    rate = np.clip((past_detections + _RATE * _LOOKS) / (past_looks + _LOOKS), 0.01, 0.99)
+    a, b = _CONCENTRATION * rate, _CONCENTRATION * (1 - rate)
+    return np.asarray(np.exp(betaln(a, b + looks) - betaln(a, b)))

@@ -1,0 +1,122 @@
+"""Solve the frames of many maps and the positions of their objects together.
+
+Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
+frame is the frame of the result. Gauss-Newton steps eliminate the objects first, each of which is a block of its own (Schur
+complement), so that a step costs as much as the measurements and the cube of the few frames. Cauchy's weights limit the
+influence of an object that a map has at another place.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import lift_se2, split_se2
+from objslam.core.statistics import HALF_RAY
+
+_STEPS = 30
+"""The most Gauss-Newton steps. More are slower. Fewer than ten are usual from a registration."""
+_STILL = 1e-9
+"""The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """R measurements: map (R,) has object (R,) at position (R, 3) m in its own frame, with covariance (R, 3, 3) m^2."""
+
+    map: Ints
+    object: Ints
+    position: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class JointFrames:
+    """S frames and N objects in the frame of the first map.
+
+    site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
+    (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1].
+    """
+
+    site_T_map: Floats
+    frame_covariance: Floats
+    positions: Floats
+    covariance: Floats
+    weight: Floats
+
+
+def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFrames:
+    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object is measured.
+
+    Each frame must share at least two objects with the others, directly or through other frames. Else its covariance is not
+    finite.
+    """
+    frames = len(site_T_map)
+    x = np.column_stack([site_T_map[:, :3, 3], split_se2(site_T_map)[0][:, 2]])
+    weight = np.ones(len(measured.object))
+    for _ in range(_STEPS):
+        moved, lever, rotation = _moved(measured, x)
+        information = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2)) * weight[:, None, None]
+        total = _sums(information, measured.object, count)
+        positions = np.linalg.solve(
+            total, _sums((information @ moved[..., None])[..., 0], measured.object, count)[..., None]
+        )
+        positions = positions[..., 0]
+        miss = positions[measured.object] - moved
+        system, gradient, half = _reduced(measured, lever, information, total, miss, frames)
+        step = np.zeros((frames, 4))
+        if frames > 1:
+            step[1:] = np.linalg.lstsq(system, gradient, rcond=None)[0].reshape(-1, 4)
+        x = x + step
+        if np.abs(step).max() < _STILL:
+            break
+        plain = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
+        alone = np.bincount(measured.object, minlength=count)[measured.object] < 2
+        weight = np.where(alone, 1.0, 1 / (1 + np.einsum("ri,rij,rj->r", miss, plain, miss) / HALF_RAY))
+    spread = np.zeros((4 * frames, 4 * frames))
+    if frames > 1:
+        held = np.linalg.cond(system) < 1e14
+        spread[4:, 4:] = np.linalg.inv(system) if held else np.nan
+    covariance = np.linalg.inv(total)
+    gain = covariance[:, None] @ half  # (N, S, 3, 4): how each object moves with each frame.
+    flat = np.swapaxes(gain, 1, 2).reshape(count, 3, 4 * frames)
+    covariance = covariance + flat @ np.nan_to_num(spread) @ np.swapaxes(flat, 1, 2)
+    poses = lift_se2(x[:, [0, 1, 3]])
+    poses[:, 2, 3] = x[:, 2]
+    blocks = np.array([spread[4 * s : 4 * s + 4, 4 * s : 4 * s + 4] for s in range(frames)])
+    symmetric = np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+    return JointFrames(poses, blocks, np.asarray(positions), symmetric, weight)
+
+
+def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the measurements (R, 3) in the frame of the result, their Jacobians (R, 3, 4) by their frame, and rotations."""
+    poses = lift_se2(x[:, [0, 1, 3]])[measured.map]
+    rotation = poses[:, :3, :3]
+    turned = (rotation @ measured.position[..., None])[..., 0]
+    lever = np.zeros((len(turned), 3, 4))
+    lever[:, :, :3] = np.eye(3)
+    lever[:, 0, 3], lever[:, 1, 3] = -turned[:, 1], turned[:, 0]
+    return turned + x[measured.map, :3], lever, rotation
+
+
+def _reduced(
+    measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, frames: int
+) -> tuple[Floats, Floats, Floats]:
+    """Return the system and the right side for the frames after the first, and what ties the objects to all (N, S, 3, 4)."""
+    count = len(total)
+    pull = information @ lever
+    half = np.zeros((count, frames, 3, 4))
+    np.add.at(half, (measured.object, measured.map), pull)
+    own = _sums(np.swapaxes(lever, 1, 2) @ pull, measured.map, frames)
+    flat = np.swapaxes(half, 1, 2).reshape(count, 3, 4 * frames)
+    system = -np.einsum("nia,nij,njb->ab", flat, np.linalg.inv(total), flat, optimize=True)
+    for s in range(frames):
+        system[4 * s : 4 * s + 4, 4 * s : 4 * s + 4] += own[s]
+    gradient = _sums((np.swapaxes(pull, 1, 2) @ miss[..., None])[..., 0], measured.map, frames).reshape(-1)
+    return system[4:, 4:], gradient[4:], half
+
+
+def _sums(values: Floats, group: Ints, count: int) -> Floats:
+    sums = np.zeros((count, *values.shape[1:]))
+    np.add.at(sums, group, values)
+    return sums

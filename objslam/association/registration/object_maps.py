@@ -1,0 +1,49 @@
+"""Register the map of one drive to that of another, where nobody knows how their frames lie to each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.association.place_recognition import Constellation
+from objslam.association.registration.map_registration import MIN_LOG_ODDS, Registration, register_maps
+from objslam.core.object_map import ObjectMap
+
+
+def register(a: ObjectMap, b: ObjectMap) -> Registration:
+    """Find the transform b_T_a from the frame of map a to that of map b, by how their objects lie to each other.
+
+    Both frames have z up. The transform turns about z and shifts along x, y and z. Only resolved objects count. `matches`
+    are indices into the objects of a and b. Use the transform only if `accepted` is true: `verdict` says why it is not.
+    """
+    names = sorted({o.label for m in (a, b) for o in m})
+    number = {name: k for k, name in enumerate(names)}
+    kept = [placed(a), placed(b)]
+    maps = (
+        Constellation(
+            m.positions[some], m.covariances[some], np.array([number[m.objects[i].label] for i in some], dtype=np.int64)
+        )
+        for m, some in zip((a, b), (np.array(k, dtype=np.int64) for k in kept), strict=True)
+    )
+    found = register_maps(*maps)
+    pairs = [(kept[0][i], kept[1][k]) for i, k in found.matches.tolist()]
+    return replace(found, matches=np.array(pairs, dtype=np.int64).reshape(-1, 2))
+
+
+def placed(objects: ObjectMap) -> list[int]:
+    """Return the indices of the objects that a registration can use: resolved ones with a covariance."""
+    return [i for i, o in enumerate(objects.objects) if o.status == "ok" and o.covariance is not None]
+
+
+def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
+    """Return in a few words why the registration of a to b was accepted or refused. names: of a and b."""
+    for name, objects in zip(names, (a, b), strict=True):
+        if len(placed(objects)) < 2:
+            return f"too little evidence, because {name} has {len(placed(objects))} resolved objects"
+    if not len(found.matches):
+        return "too little evidence, because no two objects lie to each other alike in both maps"
+    odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"
+    return {"accepted": odds, "ambiguous": f"ambiguous, because another place fits as well ({odds})"}.get(
+        found.verdict, f"too little evidence ({odds}, and {MIN_LOG_ODDS:.1f} are needed)"
+    )

@@ -1,0 +1,109 @@
+"""The commands `objslam merge` and `objslam diff`, for the maps of several sessions."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from objslam.cli.console import say
+from objslam.cli.options import Json, Out
+
+NOT_REGISTERED = 1
+"""The exit code of a comparison of two maps that do not show one place, as far as their objects tell."""
+
+
+def merge_results(
+    results: Annotated[
+        list[Path], typer.Argument(metavar="RESULT...", help="Result folders, sites, or objects.json files.")
+    ],
+    out: Out = Path("site"),
+) -> None:
+    """Join the maps of several sessions to one map of the site, with the life of each object.
+
+    Give the sessions in the order of time. The first one gives the frame. Sessions that share no objects stay apart, each
+    group in a folder of its own.
+    """
+    from objslam.api.sites import load_session, warnings_of
+    from objslam.mapping.sites.merge import merge_sessions
+    from objslam.output.site_folder import summarise_site, write_site
+
+    sessions = [load_session(path) for path in results]
+    islands = merge_sessions(sessions)
+    names = [session.name for session in sessions]
+    warnings = warnings_of(sessions, islands)
+    folders = write_site(islands, names, out, warnings)
+    for line in warnings:
+        say(f"warning: {line}", stderr=True)
+    for folder, island in zip(folders, islands, strict=True):
+        for told in summarise_site(island, names)["sessions"]:
+            say(f"{told['name']}: " + _session_line(told))
+        objects = island.objects
+        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {len(island.sessions)} sessions")
+        say(f"wrote {folder}")
+
+
+def _session_line(told: dict[str, Any]) -> str:
+    at = "x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw_deg:.2f} deg, {common_objects} objects in common".format(**told)
+    odds = told["log_odds"]
+    return f"{at}, log odds {odds:.1f}" if math.isfinite(odds) else at
+
+
+def diff_results(
+    a: Annotated[Path, typer.Argument(metavar="MAP_A", help="The earlier map: result folder, site, or objects.json.")],
+    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later one: a result folder, which has what was in view.")],
+    picture: Annotated[Path | None, typer.Option("-o", "--out", help="Draw the changes into this PNG file.")] = None,
+    json: Json = False,
+) -> None:
+    """Compare two maps of one place: which objects are confirmed, moved, gone and new.
+
+    The exit code is 1 if the maps cannot be registered to each other.
+    """
+    from objslam.api.sites import diff
+    from objslam.io.atomic_files import disk_errors
+    from objslam.mapping.sites.compare import OUTCOMES
+
+    found = diff(a, b)
+    if picture is not None and found.registration.accepted:
+        from objslam.output.plot.changes_plot import draw_comparison
+
+        with disk_errors(picture):
+            draw_comparison(found, picture)
+    if json:
+        _say_json(found)
+    elif not found.registration.accepted:
+        say(f"not registered: {found.reason}")
+    else:
+        for one in found.changes:
+            x, y, z = one.item.position
+            was = None if one.item.life is None else one.item.life.moved_from
+            came = "" if was is None or one.outcome != "moved" else f", was at ({was[0]:.3f}, {was[1]:.3f}, {was[2]:.3f}) m"
+            place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m{came}"
+            say(f"{one.outcome:<10}{one.item.label} #{one.item.id} {place}, probability {one.probability:.2f}")
+        say(", ".join(f"{len(found.of(outcome))} {outcome}" for outcome in OUTCOMES))
+        if picture is not None:
+            say(f"wrote {picture}")
+    if not found.registration.accepted:
+        raise typer.Exit(NOT_REGISTERED)
+
+
+def _say_json(found: object) -> None:
+    from objslam.mapping.sites.compare import Comparison
+    from objslam.results.files import dump_json
+
+    assert isinstance(found, Comparison)
+    changes = [
+        {
+            "outcome": one.outcome,
+            "id": one.item.id,
+            "label": one.item.label,
+            "position": one.item.position,
+            "moved_from": None if one.item.life is None else one.item.life.moved_from,
+            "probability": one.probability,
+        }
+        for one in found.changes
+    ]
+    said = {"registered": found.registration.accepted, "reason": found.reason, "a_T_b": found.a_T_b, "changes": changes}
+    say(dump_json(said), end="")

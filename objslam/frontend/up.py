@@ -1,0 +1,42 @@
+"""Which axis of a map points up, by the cameras that saw it, and the view of the map from above."""
+
+from typing import get_args
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import is_planar
+from objslam.core.types import Keyframes, Up
+
+_STEADY = 0.7
+"""How long the mean of the cameras' unit up vectors must be. A smaller value judges cameras that roll about, too."""
+_TILT = np.radians(45)
+"""The angle, rad, between this mean and the map's z axis, above which the map lies on its side. Cameras on robots look up or
+down by less. A larger angle takes z more often."""
+_FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
+"""The axes that point right and up in a view from above, so that right, up and the upward axis are a right-handed frame."""
+
+
+def up_axis(keyframes: Keyframes) -> Up:
+    """Return the axis of the map that points up: z, or that nearest to the cameras' mean up in a map that lies on its side.
+
+    Visual SLAM often has the first camera's frame, in which y points down. A planar path tells where up is by itself.
+    """
+    if not len(keyframes) or is_planar(keyframes.map_T_base):
+        return "z"
+    up = -keyframes.map_T_camera[:, :3, 1].mean(axis=0)
+    length = float(np.linalg.norm(up))
+    if length < _STEADY or np.arccos(np.clip(up[2] / length, -1.0, 1.0)) <= _TILT:
+        return "z"
+    axis = int(np.argmax(np.abs(up)))
+    return get_args(Up)[axis + 3 * bool(up[axis] < 0)]
+
+
+def from_above(up: Up) -> list[int]:
+    """Return the two axes that point right and up in a view from above."""
+    return list(_FROM_ABOVE[up])
+
+
+def up_vector(up: Up) -> Floats:
+    """Return the unit vector (3,) of an axis."""
+    return np.eye(3)["xyz".index(up[-1])] * (-1.0 if up.startswith("-") else 1.0)

@@ -1,0 +1,48 @@
+"""Factors between the frame of a drive and the frame of an older map."""
+
+import gtsam
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.graph.factors.noise import huber
+from objslam.graph.variables import L0
+
+F0 = gtsam.symbol("f", 0)
+"""The key of the pose map_T_drive, the frame of the drive in the map."""
+P0 = gtsam.symbol("p", 0)
+"""The key of P(0), the true position of object 0 in the map. The key of P(j) is P0 + j."""
+_UPRIGHT = 1e-5
+"""The standard deviation (rad) of roll and pitch between two frames with z up. A larger value lets frames tilt. It was
+chosen far below what a map can tell, and large enough to keep the linear system well conditioned."""
+_FREE = 100.0
+"""The standard deviation (m, rad) of a frame about its registration, before any object counts. A larger value holds it
+less, and conditions the linear system worse."""
+
+
+def frame_prior(map_T_drive: Floats) -> gtsam.NonlinearFactor:
+    """Return the factor that holds only roll and pitch of the frame at map_T_drive (4, 4)."""
+    sigmas = np.array([_UPRIGHT, _UPRIGHT, _FREE, _FREE, _FREE, _FREE])
+    return gtsam.PriorFactorPose3(F0, gtsam.Pose3(map_T_drive), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]:
+    """Return for each of the objects (n,) the factor F * L(j) = P(j) with a covariance (n, 3, 3) m^2 in the map."""
+    make = gtsam.noiseModel.Gaussian.Covariance
+    return [
+        gtsam.ReferenceFrameFactorPoint3Pose3(L0 + j, F0, P0 + j, make(c))
+        for j, c in zip(objects.tolist(), covariance, strict=True)
+    ]
+
+
+def object_priors(
+    first: int, objects: Ints, position: Floats, covariance: Floats, *, robust: bool
+) -> list[gtsam.NonlinearFactor]:
+    """Return a prior with mean (n, 3) m and covariance (n, 3, 3) m^2 on the points first + j of objects (n,).
+
+    robust: whether the priors have Huber's loss.
+    """
+    make = gtsam.noiseModel.Gaussian.Covariance
+    return [
+        gtsam.PriorFactorPoint3(first + j, point, huber(make(c)) if robust else make(c))
+        for j, point, c in zip(objects.tolist(), position, covariance, strict=True)
+    ]

@@ -1,0 +1,201 @@
+"""Solve a drive once more, with objects of an older map as priors: its poses, its objects, and its frame in the map.
+
+The drive keeps its graph in its own frame. One more variable is that frame in the map, F. Each object has two points: L(j),
+to which the rays of the drive point, and P(j) = F * L(j) + e(j), where it is in the map. The error e(j) holds what the graph
+of the drive does not know, such as the offsets of boxes. An object that the map has gets the map's estimate as prior on
+P(j).
+
+The registration gives the start and the matches, and no factor, so that the map counts once. Its objects may share errors,
+and its file does not say which. The priors count as independent in the estimate. The covariance of the frame takes them as
+one shared error, so that many objects of a drifted map do not make the frame look sure.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.estimate import Estimate
+from objslam.core.geometry import lift_se2, split_se2
+from objslam.core.statistics import HUBER_K
+from objslam.core.types import Association
+from objslam.graph.assembly import Measurements
+from objslam.graph.factors.frames import F0, P0, frame_prior, object_priors, own_errors
+from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marquardt
+from objslam.graph.variables import L0, make_values, read_poses, with_points
+
+_LEAST = 1e-3
+"""The least standard deviation (m) of an error of an object. A larger value makes exact maps less exact. It was chosen far
+below the errors of real maps, and keeps the linear system well conditioned."""
+_ITERATIONS = 50
+"""The most iterations of the solve. More are slower. A handful is usual, because the registration is a close start."""
+
+
+@dataclass(frozen=True)
+class MapObjects:
+    """M objects of an older map that the drive saw, with M indices (M,) of the same objects in the drive.
+
+    positions: (M, 3) m. covariance: (M, 3, 3) m^2, both in the frame of the map.
+    """
+
+    index: Ints
+    positions: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True)
+class MappedDrive:
+    """A drive with N objects and K keyframes in the frame of an older map.
+
+    map_T_drive: (4, 4) the drive's own frame in the map. It turns about z only. covariance: (4, 4) of the shift (m) in x, y
+    and z at the middle of the matched objects, and of the yaw (rad). map_T_base: (K, 4, 4). seen: (N, 3) m, where the rays
+    of the drive see the objects. positions: (N, 3) m, where they are if the older map counts too. object_covariance: (N, 3,
+    3) m^2 of `positions`. Unknown values are NaN.
+    """
+
+    map_T_drive: Floats
+    covariance: Floats
+    map_T_base: Floats
+    seen: Floats
+    positions: Floats
+    object_covariance: Floats
+
+
+def solve_in_map(
+    estimate: Estimate,
+    association: Association,
+    there: Ints,
+    known: MapObjects,
+    map_T_drive: Floats,
+    measured: Measurements | None,
+) -> MappedDrive:
+    """Solve a drive in an older map, from the drive's own solution and its registration map_T_drive (4, 4).
+
+    there: (n,) the resolved objects of the drive. The others go over into the frame of the map without a covariance.
+    measured: the measurements of the joint solve, None where the poses of the drive are fixed in its own frame. SolveError
+    if the linear system is indeterminate.
+    """
+    solved = there if measured is None else np.flatnonzero(estimate.solved & np.isfinite(estimate.positions[:, 0]))
+    keep = np.isin(known.index, there)
+    index, anchor = known.index[keep], known.positions[keep]
+    prior = known.covariance[keep] + _LEAST**2 * np.eye(3)
+    values = make_values(_poses(estimate, measured), estimate.positions, solved)
+    drive, plain = (_drive_factors(estimate, association, solved, measured, robust=robust) for robust in (True, False))
+    rotation = map_T_drive[:3, :3]
+    own = rotation @ _unknown_to(build_graph(plain), values, estimate, there, measured) @ rotation.T
+    values.insert(F0, gtsam.Pose3(map_T_drive))
+    for j in there.tolist():
+        values.insert(P0 + j, map_T_drive[:3, :3] @ estimate.positions[j] + map_T_drive[:3, 3])
+    frames = [frame_prior(map_T_drive), *own_errors(there, own)]
+    priors = object_priors(P0, index, anchor, prior, robust=True)
+    found = levenberg_marquardt(build_graph(drive, frames, priors), values, _ITERATIONS).values
+    placed = np.array([found.atPoint3(P0 + j) for j in there.tolist()]).reshape(-1, 3)
+    miss = anchor - placed[np.searchsorted(there, index)]
+    deviation = np.sqrt(np.einsum("mi,mi->m", miss, np.linalg.solve(prior, miss[..., None])[..., 0]))
+    weighted = prior * np.maximum(deviation / HUBER_K, 1.0)[:, None, None]
+    last = object_priors(P0, index, anchor, weighted, robust=False)
+    graph = build_graph(plain, frames, last)
+    frame = lift_se2(split_se2(found.atPose3(F0).matrix())[0])
+    frame[2, 3] = found.atPose3(F0).matrix()[2, 3]
+    pivot = anchor.mean(axis=0)
+    covariance, doubt, spread = _covariances(graph, found, there, index, weighted, frame, pivot)
+    positions, seen, spreads = (
+        np.full(a.shape, np.nan) for a in (estimate.positions, estimate.positions, estimate.covariance)
+    )
+    fixed = np.isfinite(estimate.positions[:, 0])
+    seen[fixed] = estimate.positions[fixed] @ frame[:3, :3].T + frame[:3, 3]
+    if measured is not None:
+        seen[solved] = with_points(estimate.positions, solved, found)[solved] @ frame[:3, :3].T + frame[:3, 3]
+    positions[fixed] = seen[fixed]
+    positions[there], spreads[there] = placed, _with_doubt(spread, placed, there, index, weighted, doubt, pivot)
+    drive_T_base = estimate.map_T_base if measured is None else measured.map_T_base(read_poses(found))
+    return MappedDrive(frame, covariance, frame @ drive_T_base, seen, positions, spreads)
+
+
+def _poses(estimate: Estimate, measured: Measurements | None) -> Floats:
+    if measured is None:
+        return np.zeros((0, 4, 4))
+    first = measured.multiframes.first
+    return estimate.map_T_base[first] @ measured.images.base_T_camera[first]
+
+
+def _drive_factors(
+    estimate: Estimate, association: Association, solved: Ints, measured: Measurements | None, *, robust: bool
+) -> list[gtsam.NonlinearFactor]:
+    """Return the factors of the drive alone. robust: whether its rays have the loss of the settings."""
+    if measured is None:
+        return object_priors(L0, solved, estimate.positions[solved], estimate.covariance[solved] / 2, robust=False)
+    used = (estimate.weight > 0) & np.isin(association.object, solved)
+    loss = measured.settings.joint.loss if robust and measured.settings.joint.loss != "gnc" else "gnc"
+    return measured.factors(association.object, np.flatnonzero(used), solved, estimate.positions, loss)
+
+
+def _unknown_to(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
+) -> Floats:
+    """Return what the covariance of each object (n, 3, 3) holds beyond that of the graph. `_LEAST` is its floor."""
+    floor = _LEAST**2 * np.eye(3)
+    if measured is None:  # Half on each side of a factor conditions the linear system best.
+        return estimate.covariance[there] / 2 + floor
+    try:
+        marginals = gtsam.Marginals(graph, values)
+        alone = np.array([marginals.marginalCovariance(L0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
+    except RuntimeError as error:
+        raise indeterminate(error) from error
+    size, axes = np.linalg.eigh(estimate.covariance[there] - alone)
+    return np.asarray((axes * np.maximum(size, _LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+
+
+def _covariances(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    there: Ints,
+    index: Ints,
+    prior: Floats,
+    frame: Floats,
+    pivot: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """Return the covariance (4, 4) of the frame at a pivot (3,) m, what shared errors add to it, and that of points P."""
+    try:
+        marginals = gtsam.Marginals(graph, values)
+        spread = np.array([marginals.marginalCovariance(P0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
+        joint = [marginals.jointMarginalCovariance([F0, P0 + j]) for j in index.tolist()]
+        tangent = marginals.marginalCovariance(F0)
+    except RuntimeError as error:
+        raise indeterminate(error) from error
+    to_pivot = np.zeros((4, 6))  # From the tangent of F, rotation first, to a shift of the pivot and a yaw.
+    to_pivot[:3, 3:], to_pivot[3, 2] = values.atPose3(F0).rotation().matrix(), 1.0
+    to_pivot[:3, 2] = _turned(pivot - frame[:3, 3])
+    gain = np.array([to_pivot @ j.at(F0, P0 + k) for j, k in zip(joint, index.tolist(), strict=True)]) @ np.linalg.inv(prior)
+    parts = gain @ prior @ np.swapaxes(gain, 1, 2)
+    doubt = shared_at_worst(parts) - parts.sum(axis=0)
+    return to_pivot @ tangent @ to_pivot.T + doubt, doubt, spread
+
+
+def shared_at_worst(parts: Floats) -> Floats:
+    """Return a bound (n, n) on the covariance of a sum of errors with covariances (M, n, n), however they are correlated.
+
+    By Cauchy and Schwarz, it is the sum of parts / w for weights w that sum up to 1. Weights in proportion to the standard
+    deviations give the least trace. The bound is reached if one error moves all parts.
+    """
+    size = np.sqrt(np.maximum(np.trace(parts, axis1=1, axis2=2), 1e-300))
+    return np.asarray((parts * (size.sum() / size)[:, None, None]).sum(axis=0))
+
+
+def _with_doubt(
+    spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
+) -> Floats:
+    """Return the covariances (n, 3, 3) of points (n, 3) with the doubt about the frame. A prior holds a point against it."""
+    move = np.zeros((len(there), 3, 4))
+    move[:, :, :3] = np.eye(3)
+    move[:, :, 3] = np.array([_turned(p - pivot) for p in placed]).reshape(-1, 3)
+    row = np.searchsorted(there, index)
+    move[row] = (np.eye(3) - spread[row] @ np.linalg.inv(prior)) @ move[row]
+    covariance = spread + move @ doubt @ np.swapaxes(move, 1, 2)
+    return np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+
+
+def _turned(lever: Floats) -> Floats:
+    """Return how a point at a lever (3,) m moves with the yaw, m per rad."""
+    return np.array([-lever[1], lever[0], 0.0])

@@ -1,0 +1,77 @@
+"""Read and write views.parquet, the camera frames of a result: where each image was taken, also images without a box."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Keyframes
+from objslam.core.validity import rigid_poses, valid_stamps
+from objslam.errors import LogError, OutputError
+from objslam.io.camera_yaml import dump_camera, parse_camera
+
+_CAMERAS, _MARGINS = b"objslam.cameras", b"objslam.margins"  # The keys of the cameras and the margins in the file's header.
+_BETWEEN = "\n---\n"  # The line between the texts of two cameras.
+
+
+@dataclass(frozen=True)
+class Views:
+    """F camera frames in the order of time. margin, margin_share: as `rays.border` and `rays.border_share` of the run.
+
+    stamps: (F,) s. camera: (F,) index into cameras. map_T_camera: (F, 4, 4).
+    """
+
+    stamps: Floats
+    camera: Ints
+    map_T_camera: Floats
+    cameras: tuple[Camera, ...]
+    margin: float
+    margin_share: float
+
+    @classmethod
+    def of(cls, frames: Keyframes, cameras: tuple[Camera, ...], margin: float, margin_share: float) -> Self:
+        """Return the views of frames at their poses."""
+        return cls(frames.stamps, frames.camera, frames.map_T_camera, cameras, margin, margin_share)
+
+
+def dump_views(views: Views) -> bytes:
+    """Return the content of views.parquet, with one row per frame and the calibrations in its header."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pose = pa.FixedSizeListArray.from_arrays(pa.array(views.map_T_camera.reshape(-1)), 16)
+    table = pa.table({"stamp": views.stamps, "camera": views.camera, "map_T_camera": pose})
+    cameras = _BETWEEN.join(dump_camera(camera) for camera in views.cameras)
+    margins = f"{float(views.margin)!r} {float(views.margin_share)!r}"
+    buffer = io.BytesIO()
+    pq.write_table(table.replace_schema_metadata({_CAMERAS: cameras.encode(), _MARGINS: margins.encode()}), buffer)
+    return buffer.getvalue()
+
+
+def read_views(file: Path) -> Views:
+    """Read a views.parquet. Raises OutputError for any other content."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(file, columns=["stamp", "camera", "map_T_camera"], partitioning=None)
+        header = table.schema.metadata or {}
+        texts = header[_CAMERAS].decode().split(_BETWEEN)
+        cameras = tuple(parse_camera(text.encode(), str(file), Ledger(), None) for text in texts)
+        margin, share = (float(word) for word in header[_MARGINS].decode().split())
+        stamps = np.asarray(table["stamp"].to_numpy(), dtype=np.float64)
+        camera = np.asarray(table["camera"].to_numpy(), dtype=np.int64)
+        flat = np.asarray(table["map_T_camera"].combine_chunks().flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
+        poses, rigid = rigid_poses(flat.reshape(len(stamps), 4, 4))
+        if not (rigid.all() and valid_stamps(stamps).all() and np.isfinite([margin, share]).all()):
+            raise ValueError("a pose, a stamp or a margin cannot be")
+        if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
+            raise ValueError("a frame of no camera")
+    except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError, LogError) as error:
+        raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
+    return Views(stamps, camera, poses, cameras, margin, share)

@@ -1,0 +1,49 @@
+"""Publishes the tf transform from the map to the odometry over DDS, so that other nodes can place the map's objects."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from objslam.core.arrays import Floats
+from objslam.core.snapshot import Snapshot
+from objslam.live.dds.network import Network
+from objslam.live.dds.types import dds_topic, layouts_of
+from objslam.output.export.map_messages import MapMessages
+
+_TYPE = "tf2_msgs/msg/TFMessage"
+_QUEUE = 100  # The most transforms that wait for a slow subscriber, as in tf2. A larger number costs memory.
+_AHEAD = 0.2
+"""How far a transform is dated ahead of the newest pose, s. Localisers do so, because tf2 does not extrapolate. The
+transforms are 0.1 s apart, so that 0.2 s bridge one that comes late. A larger value lets an old correction count longer."""
+
+
+class TransformPublisher:
+    """Publishes the newest `Snapshot.map_T_odom` on /tf. Call its methods from one thread only.
+
+    odom_frame: returns the frame of the odometry, None if it is unknown or has another parent. tf allows one parent only.
+    """
+
+    def __init__(self, network: Network, odom_frame: Callable[[], str | None], topic: str = "/tf") -> None:
+        from cyclonedds.core import Policy, Qos
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.topic import Topic
+
+        self._odom_frame = odom_frame
+        self._newest: Floats | None = None
+        self._messages, self._layout = MapMessages(""), layouts_of(_TYPE)[0]
+        qos = Qos(Policy.Reliability.Reliable(0), Policy.Durability.Volatile, Policy.History.KeepLast(_QUEUE))
+        at: Any = Topic(network.participant, dds_topic(topic), self._layout)
+        self._writer: Any = DataWriter(network.participant, at, qos=qos)
+
+    def update(self, snapshot: Snapshot) -> None:
+        """Take the correction of a snapshot. A snapshot without one leaves the last."""
+        if snapshot.map_T_odom is not None:
+            self._newest, self._messages.frame = snapshot.map_T_odom, snapshot.map.frame
+
+    def send(self, stamp: float) -> None:
+        """Publish the transform, dated just after the newest pose of the odometry, whose stamp, s, is given."""
+        child = self._odom_frame()
+        if self._newest is None or child is None or not math.isfinite(stamp):
+            return
+        message = self._messages.transform(stamp + _AHEAD, child, self._newest)
+        self._writer.write(self._layout(bytes(self._messages.store.serialize_cdr(message, _TYPE))))

@@ -1,0 +1,197 @@
+"""Find a drive in the map of another day, and bring it into the frame of that map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from objslam.association.registration.map_registration import Registration
+from objslam.association.registration.object_maps import placed, reason, register
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import split_se2
+from objslam.core.object_map import ObjectMap
+from objslam.core.trace import Round
+from objslam.core.types import Log, Trajectory
+from objslam.errors import SolveError
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.solution import Solution
+
+if TYPE_CHECKING:
+    from objslam.graph.maps.prior_map import MappedDrive
+
+
+@dataclass(frozen=True)
+class PriorMap:
+    """The map of another day. name: how messages call it. objects: in its own frame."""
+
+    name: str
+    objects: ObjectMap
+
+
+@dataclass(frozen=True)
+class Localization:
+    """A drive in the frame of an older map, or the reason why it is not there.
+
+    registration: of the drive to the map. told: the entry of summary.json. solution: the drive in the frame of the map, with
+    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2, the same with the map's objects
+    as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
+    """
+
+    registration: Registration
+    told: dict[str, Any]
+    solution: Solution | None = None
+    positions: Floats | None = None
+    covariance: Floats | None = None
+    map_T_drive: Floats | None = None
+
+
+def localize(
+    solution: Solution, objects: ObjectMap, known: PriorMap, errors: SharedErrors | None, settings: Settings, ledger: Ledger
+) -> Localization:
+    """Register a drive to an older map, and solve it once more with the matched objects as priors.
+
+    objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
+    the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
+    """
+    found = register(objects, known.objects)
+    why = reason(found, objects, known.objects, ("the drive", "the map"))
+    told: dict[str, Any] = {
+        "map": known.name,
+        "localised": found.accepted,
+        "reason": why,
+        "objects": len(found.matches),
+        "log_odds": _number(found.log_odds),
+        "lead": _number(found.lead),
+    }
+    if not found.accepted:
+        return _refused(found, told, why, ledger)
+    try:
+        solved = _solve(_with_covariances(solution, objects), placed(objects), known.objects, found, errors, settings)
+    except SolveError as error:
+        return _refused(found, told, error.message, ledger)
+    sigma = np.sqrt(np.diagonal(solved.covariance))
+    told["transform"] = {**_named(solved.map_T_drive), "matrix": solved.map_T_drive.tolist()}
+    told["sigma"] = dict(zip(("x", "y", "z", "yaw_deg"), (sigma * [1, 1, 1, np.degrees(1)]).tolist(), strict=True))
+    told["matches"] = [
+        {"id": known.objects[k].id, "label": known.objects[k].label, "drive": i} for i, k in found.matches.tolist()
+    ]
+    estimate = replace(solution.estimate, map_T_base=solved.map_T_base, positions=solved.seen)
+    at = solved.map_T_drive
+    moved = replace(
+        solution,
+        keyframes=replace(solution.keyframes, map_T_base=at @ solution.keyframes.map_T_base),
+        estimate=estimate,
+        trace=tuple(_moved_round(one, at) for one in solution.trace),
+    )
+    told["line"] = _line(told)
+    return Localization(found, told, moved, solved.positions, solved.object_covariance, at)
+
+
+def _with_covariances(solution: Solution, objects: ObjectMap) -> Solution:
+    """Return the solution with the covariances of its map, which hold the errors that checks found after the solve."""
+    widened = objects.covariances
+    covariance = np.where(np.isfinite(widened), widened, solution.estimate.covariance)
+    return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
+
+
+def _refused(found: Registration, told: dict[str, Any], why: str, ledger: Ledger) -> Localization:
+    told = {**told, "localised": False, "reason": why}
+    told["line"] = _line(told)
+    ledger.warn(f"{told['line']}; the result stays in the frame of the drive")
+    return Localization(found, told)
+
+
+def _solve(
+    solution: Solution,
+    there: list[int],
+    known: ObjectMap,
+    found: Registration,
+    errors: SharedErrors | None,
+    settings: Settings,
+) -> MappedDrive:
+    from objslam.graph.assembly import Measurements
+    from objslam.graph.batch_solver import share_bias
+    from objslam.graph.maps.prior_map import MapObjects, solve_in_map
+    from objslam.graph.multiframes import Multiframes
+
+    ours, theirs = found.matches.T
+    matched = MapObjects(ours, known.positions[theirs], known.covariances[theirs])
+    measured = None
+    if settings.mode == "joint":
+        estimate, images, keyframes, rays = solution.estimate, solution.keyframes, solution.keyframes, solution.rays
+        if errors is not None and estimate.calibration is not None:
+            # Inside a solve, lengths make up for its shrinkage. Those of the solution are as measured.
+            noise = errors.noise if estimate.noise is None else estimate.noise
+            images = errors.keyframes
+            keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
+        rays = share_bias(rays, solution.association, settings)
+        measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
+    resolved = np.array(there, dtype=np.int64)
+    return solve_in_map(solution.estimate, solution.association, resolved, matched, found.b_T_a, measured)
+
+
+def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
+    """Return the objects of a drive that was found in a map, at the places that the map gives them, with the ids of the map.
+
+    objects: the drive's, described in the frame of the map. Objects that the map does not have get new ids.
+    """
+    assert where.positions is not None
+    assert where.covariance is not None
+    ids = {int(i): known.objects[int(k)].id for i, k in where.registration.matches}
+    free = max((o.id for o in known.objects), default=-1) + 1
+    moved = []
+    for j, item in enumerate(objects.objects):
+        number = ids.get(j, free)
+        free += number == free
+        covariance = where.covariance[j] if item.covariance is not None else None
+        position = where.positions[j] if item.covariance is not None else item.position
+        moved.append(replace(item, id=number, position=position, covariance=covariance))
+    return ObjectMap(tuple(moved), known.objects.frame)
+
+
+def moved_log(log: Log, map_T_drive: Floats) -> Log:
+    """Return the log with its poses in the frame of the map. The ground truth stays, because nobody says where it lies."""
+    odometry, localization = (
+        None if path is None else Trajectory(path.stamps, map_T_drive @ path.poses)
+        for path in (log.odometry, log.localization)
+    )
+    return replace(log, odometry=odometry, localization=localization)
+
+
+def _moved_round(one: Round, map_T_drive: Floats) -> Round:
+    steps = tuple(
+        replace(step, path=_moved(step.path, map_T_drive), positions=_moved(step.positions, map_T_drive))
+        for step in one.iterations
+    )
+    positions = _moved(one.positions, map_T_drive)
+    return replace(one, iterations=steps, map_T_base=map_T_drive @ one.map_T_base, positions=positions)
+
+
+def _moved(points: Any, pose: Floats) -> Any:
+    return (points @ pose[:3, :3].T + pose[:3, 3]).astype(points.dtype)
+
+
+def _named(pose: Floats) -> dict[str, float]:
+    x, y, z = pose[:3, 3].tolist()
+    return {"x": x, "y": y, "z": z, "yaw_deg": float(np.degrees(split_se2(pose)[0][2]))}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _line(told: dict[str, Any]) -> str:
+    """Return the sentence that terminal and report show."""
+    if not told["localised"]:
+        return f"not localised in {told['map']}: {told['reason']}"
+    at, sigma = told["transform"], told["sigma"]
+    return (
+        f"localised in {told['map']} by {told['objects']} objects, log odds {told['log_odds']:.1f}, "
+        f"lead {told['lead']:.1f}: "
+        f"x {at['x']:.3f} y {at['y']:.3f} z {at['z']:.3f} m, yaw {at['yaw_deg']:.2f} deg, sigma at the objects "
+        f"{max(sigma['x'], sigma['y'], sigma['z']):.3f} m and {sigma['yaw_deg']:.2f} deg"
+    )

@@ -1,0 +1,94 @@
+"""The life of the objects of a site: what each session says of each of them, in the order of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from objslam.association.persistence import persistence
+from objslam.core.arrays import Bools, Ints
+from objslam.core.object_map import Fate, Life, MapObject
+
+GONE = 0.5
+"""The probability below which an object counts as gone. A larger value gives objects up sooner."""
+FORGOTTEN = 0.01
+"""The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
+_UNPROVEN = 0.9
+"""The probability that an object of one session exists if the session does not say. A larger value trusts it more."""
+_DAY = 86_400.0  # The seconds of a day.
+_ALIKE = 2.0
+"""The largest ratio of the sizes of an object before and after it moved. A larger value takes more pairs for one object."""
+
+
+@dataclass
+class Track:
+    """One object over the sessions. item: as it was seen last. number: its id in the site, None for a new object.
+
+    life: after the sessions so far, None before the first. places: the rows of the joint solve that measure it. begun, met:
+    the first and the last session that found it, counted in the order of time. since: when it was seen first, s.
+    """
+
+    item: MapObject
+    number: int | None = None
+    life: Life | None = None
+    places: list[int] = field(default_factory=list)
+    begun: int = 0
+    met: int = 0
+    since: float = np.nan
+
+
+def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
+    """Return the lives (N) of the tracks after one session.
+
+    found: (N,) whether the session found each. looks: (N,) how often it should have. seen: the objects that it found, None
+    elsewhere. when: the time of the session, s. A track without a life begins here.
+    """
+    old = [t.life for t in tracks]
+    before = np.array([_UNPROVEN if life is None else life.probability for life in old])
+    days = np.array([0.0 if life is None else max(when - life.updated, 0.0) / _DAY for life in old])
+    past = np.array([(0, 0) if life is None else (life.looks, life.detections) for life in old]).reshape(-1, 2)
+    probability = persistence(before, days, found, looks, past[:, 0], past[:, 1])
+    lives = []
+    for k, life in enumerate(old):
+        item = seen[k]
+        detections = 0 if item is None else item.frames
+        views = max(int(looks[k]), detections)
+        if life is None:
+            assert item is not None
+            exists = _UNPROVEN if item.existence is None else min(item.existence, _UNPROVEN)
+            lives.append(Life("new", exists, 1, 1, views, detections, when))
+            continue
+        p = float(probability[k])
+        met = bool(found[k])
+        lives.append(
+            replace(
+                life,
+                state=_fate(life, p, met),
+                probability=p,
+                sessions_expected=life.sessions_expected + int(met or looks[k] > 0),
+                sessions_seen=life.sessions_seen + int(met),
+                looks=life.looks + views,
+                detections=life.detections + detections,
+                updated=when,
+            )
+        )
+    return lives
+
+
+def _fate(life: Life, probability: float, found: bool) -> Fate:
+    if probability < GONE:
+        return "gone"
+    if found:
+        return "confirmed"
+    return "confirmed" if life.state == "gone" else life.state
+
+
+def may_be_one(a: MapObject, b: MapObject) -> bool:
+    """Return whether an object that is gone and one that is new may be the same: one label, and sizes that are alike."""
+    if a.label != b.label:
+        return False
+    if a.extent is None or b.extent is None:
+        return True
+    ratio = np.array(a.extent).prod() / max(np.array(b.extent).prod(), 1e-9)
+    return bool(_ALIKE**-2 <= ratio <= _ALIKE**2)

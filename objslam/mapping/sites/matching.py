@@ -1,0 +1,48 @@
+"""Which objects of two maps in one frame are the same: by place, and by label as far as labels can be trusted."""
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.object_map import MapObject
+from objslam.core.statistics import SAME_POINT
+
+STILL = 0.05
+"""The standard deviation (m) of the shift of an object that nobody moved: it is nudged, or a detector sees it otherwise. A
+larger value takes larger shifts for the same place."""
+_MISLABELLED = 0.02
+"""The probability that a detector gives an object one other label. A larger value matches objects with unlike labels from
+farther away."""
+
+
+def same_objects(
+    ours: list[MapObject], theirs: list[MapObject], positions: Floats, covariance: Floats, other: Floats, other_cov: Floats
+) -> Ints:
+    """Return pairs (P, 2) of indices of one object, one-to-one, with the least sum of costs.
+
+    The cost is the squared Mahalanobis distance, less 2 ln of the probability of both labels. positions, covariance: (N, 3)
+    m and (N, 3, 3) m^2 of `ours`. other, other_cov: (M, 3) and (M, 3, 3) of `theirs`, in the same frame.
+    """
+    if not len(ours) or not len(theirs):
+        return np.zeros((0, 2), dtype=np.int64)
+    widest = [float(np.linalg.eigvalsh(c)[:, -1].max()) for c in (covariance, other_cov)]
+    reach = float(np.sqrt(SAME_POINT * (sum(widest) + STILL**2)))
+    near = KDTree(positions).sparse_distance_matrix(KDTree(other), reach, output_type="coo_matrix")
+    i, k = (np.asarray(rows, dtype=np.int64) for rows in (near.row, near.col))
+    apart = positions[i] - other[k]
+    spread = covariance[i] + other_cov[k] + STILL**2 * np.eye(3)
+    squared = np.einsum("pi,pi->p", apart, np.linalg.solve(spread, apart[..., None])[..., 0])
+    labels = np.array([label_agreement(ours[a], theirs[b]) for a, b in zip(i.tolist(), k.tolist(), strict=True)])
+    cost = squared - 2 * np.log(labels.reshape(-1))
+    gain = np.zeros((len(ours), len(theirs)))
+    gain[i, k] = np.maximum(SAME_POINT - cost, 0.0)
+    pairs = np.column_stack(linear_sum_assignment(-gain))
+    return np.asarray(pairs[gain[pairs[:, 0], pairs[:, 1]] > 0], dtype=np.int64)
+
+
+def label_agreement(a: MapObject, b: MapObject) -> float:
+    """Return the probability that one object has the labels of both, at least `_MISLABELLED`."""
+    shares = [o.labels or {o.label: 1.0} for o in (a, b)]
+    both = sum(share * shares[1].get(name, 0.0) for name, share in shares[0].items())
+    return max(min(both, 1.0), _MISLABELLED)

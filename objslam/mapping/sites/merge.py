@@ -1,0 +1,258 @@
+"""Join many sessions, each in a frame of its own, to one map of the site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from objslam.association.registration.joint_frames import JointFrames, Measured, solve_frames
+from objslam.association.registration.map_registration import Registration
+from objslam.association.registration.object_maps import register
+from objslam.core.arrays import Floats
+from objslam.core.geometry import inverse
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, may_be_one
+from objslam.mapping.sites.matching import same_objects
+from objslam.mapping.sites.session import Session
+
+_REMEMBERED = 5
+"""The most sessions that an object of a site counts as in the next solve. A larger number averages more sessions, and
+follows an object that is nudged more slowly."""
+_YOUNG = 2
+"""The most sessions that an object was seen in to count as one that moved there. A larger number finds more late moves, and
+takes more objects that were added for moved ones."""
+
+
+@dataclass(frozen=True)
+class Island:
+    """Sessions that share objects, in one map. The frame is that of the first session.
+
+    objects: the map, with the life of each object. sessions: the indices (S,) of the sessions, in their order.
+    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first.
+    log_odds: (S,) the evidence that tied each session to those before it, NaN for the first. common: (S,) how many of its
+    objects other sessions have. seen_by: for the id of each object the indices of the sessions that found it.
+    """
+
+    objects: ObjectMap
+    sessions: tuple[int, ...]
+    site_T_session: Floats
+    covariance: Floats
+    log_odds: Floats
+    common: tuple[int, ...]
+    seen_by: dict[int, tuple[int, ...]]
+
+
+def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
+    """Register all pairs of sessions, and join those that overlap to one map each. The largest island comes first.
+
+    The sessions are in the order of time, and the first of an island gives its frame. Sessions whose registrations are all
+    refused stay alone. A site among the sessions brings the life of its objects, so that adding a session to it costs what
+    that session costs.
+    """
+    edges = {
+        (a, b): found
+        for a, b in combinations(range(len(sessions)), 2)
+        if (found := register(sessions[b].objects, sessions[a].objects)).accepted
+    }
+    left = list(range(len(sessions)))
+    islands = []
+    while left:
+        order, starts, odds = _tree(left, edges)
+        left = [s for s in left if s not in order]
+        islands.append(_island(sessions, order, starts, odds))
+    return tuple(sorted(islands, key=lambda one: -len(one.sessions)))
+
+
+def _tree(
+    left: list[int], edges: dict[tuple[int, int], Registration]
+) -> tuple[list[int], list[tuple[int, Floats]], list[float]]:
+    """Return the sessions that are tied to the first of those left, by the best evidence first (Prim).
+
+    For each, return the one before it in the tree, its pose in the frame of that one, and the log odds of the two.
+    """
+    order, starts, odds = [left[0]], [(left[0], np.eye(4))], [np.nan]
+    while True:
+        ties = [
+            (found.log_odds, -s, p, s, pose)
+            for (a, b), found in edges.items()
+            for p, s, pose in ((a, b, found.b_T_a), (b, a, inverse(found.b_T_a)))
+            if p in order and s not in order
+        ]
+        if not ties:
+            return order, starts, odds
+        evidence, _, parent, session, pose = max(ties, key=lambda tie: tie[:2])
+        order.append(session)
+        starts.append((parent, pose))
+        odds.append(evidence)
+
+
+def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[int, Floats]], odds: list[float]) -> Island:
+    tracks: list[Track] = []
+    rows: list[tuple[int, int, MapObject]] = []  # The number of the map, the track, and the object of each measurement.
+    frames = np.zeros((0, 4, 4))
+    solved: JointFrames | None = None
+    for number, (s, (parent, pose)) in enumerate(zip(order, starts, strict=True)):
+        start = pose if solved is None else frames[order.index(parent)] @ pose
+        items = _items(sessions[s].objects)
+        pairs = {} if solved is None else dict(_matched(tracks, solved, items, start))
+        for k, item in enumerate(items):
+            at = pairs.get(k, len(tracks))
+            if at == len(tracks):
+                tracks.append(Track(item))
+            rows.append((number, at, item))
+        solved = solve_frames(_measured(rows), np.concatenate([frames, start[None]]), len(tracks))
+        frames = solved.site_T_map
+    assert solved is not None
+    for row, (_, at, _) in enumerate(rows):
+        tracks[at].places.append(row)
+    alive = _live(sessions, order, tracks, rows, solved)
+    objects, track_of = _objects(tracks, alive, rows, solved)
+    seen_by = {number: tuple(order[rows[row][0]] for row in tracks[at].places) for number, at in track_of.items()}
+    shared = {at for at, track in enumerate(tracks) if len(track.places) > 1}
+    common = tuple(sum(n == number and at in shared for n, at, _ in rows) for number in range(len(order)))
+    by_time = sorted(range(len(order)), key=order.__getitem__)
+    return Island(
+        objects,
+        tuple(order[n] for n in by_time),
+        frames[by_time],
+        solved.frame_covariance[by_time],
+        np.array(odds)[by_time],
+        tuple(common[n] for n in by_time),
+        seen_by,
+    )
+
+
+def _items(objects: ObjectMap) -> list[MapObject]:
+    """Return the objects that can be matched: those with a covariance, also those that are gone and may come back."""
+    return [o for o in (*objects.objects, *objects.gone) if o.status == "ok" and o.covariance is not None]
+
+
+def _matched(tracks: list[Track], solved: JointFrames, items: list[MapObject], start: Floats) -> list[tuple[int, int]]:
+    """Return for each object of a session that a track has its index and the track, at the pose `start` (4, 4)."""
+    positions = np.array([o.position for o in items]).reshape(-1, 3) @ start[:3, :3].T + start[:3, 3]
+    spread = np.array([o.covariance for o in items]).reshape(-1, 3, 3)
+    turned = start[:3, :3] @ spread @ start[:3, :3].T
+    old = [t.item for t in tracks]
+    return [(k, i) for i, k in same_objects(old, items, solved.positions, solved.covariance, positions, turned).tolist()]
+
+
+def _measured(rows: list[tuple[int, int, MapObject]]) -> Measured:
+    maps, objects = (np.array([row[n] for row in rows], dtype=np.int64) for n in (0, 1))
+    positions = np.array([o.position for _, _, o in rows]).reshape(-1, 3)
+    often = np.array([1 if o.life is None else min(max(o.life.sessions_seen, 1), _REMEMBERED) for _, _, o in rows])
+    covariance = np.array([o.covariance for _, _, o in rows]).reshape(-1, 3, 3)
+    return Measured(maps, objects, positions, covariance / often[:, None, None])
+
+
+def _live(
+    sessions: Sequence[Session],
+    order: list[int],
+    tracks: list[Track],
+    rows: list[tuple[int, int, MapObject]],
+    solved: JointFrames,
+) -> list[int]:
+    """Let the tracks live through the sessions in the order of time. Return those that are not another one that moved."""
+    begun: list[int] = []
+    for turn, number in enumerate(sorted(range(len(order)), key=order.__getitem__)):
+        session = sessions[order[number]]
+        here = {at: item for n, at, item in rows if n == number}
+        fresh = [at for at in here if at not in begun]
+        for at in fresh:
+            tracks[at].life, tracks[at].begun, tracks[at].since = here[at].life, turn, here[at].first_seen
+            if turn == 0 or here[at].life is not None:
+                tracks[at].number = here[at].id
+        site = any(item.life is not None for item in here.values())
+        begun += fresh
+        some = [at for at in begun if not (site and at in fresh and tracks[at].life is not None)]
+        back = inverse(solved.site_T_map[number])
+        places = solved.positions[some] @ back[:3, :3].T + back[:3, 3]
+        looks = session.looks(tuple(tracks[at].item for at in some), places)
+        for at, item in here.items():
+            tracks[at].item, tracks[at].met = replace(item, life=None), turn
+        found = np.array([at in here for at in some], dtype=bool)
+        lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
+        for at, life in zip(some, lives, strict=True):
+            tracks[at].life = life
+        begun = _follow(tracks, begun, solved.positions)
+    return begun
+
+
+def _follow(tracks: list[Track], begun: list[int], positions: Floats) -> list[int]:
+    """Give an object that moved the number of the one that is gone. Return the tracks that are left."""
+    lives = {at: life for at in begun if (life := tracks[at].life) is not None}
+    old = [at for at, life in lives.items() if life.state == "gone"]
+    young = [at for at, life in lives.items() if life.state != "gone" and life.sessions_seen <= _YOUNG]
+    left = list(begun)
+    for at in old:
+        may = [k for k in young if _later(tracks[k], tracks[at]) and may_be_one(tracks[at].item, tracks[k].item)]
+        if not may:
+            continue
+        now = min(may, key=lambda k: float(np.linalg.norm(positions[k] - positions[at])))
+        tracks[now].life = replace(lives[now], state="moved", moved_from=positions[at])
+        if tracks[at].number is not None:
+            tracks[now].number = tracks[at].number
+        left.remove(at)
+        young.remove(now)
+    return left
+
+
+def _later(young: Track, old: Track) -> bool:
+    """Return whether one object was seen first after the other was seen last, by the sessions or by the stamps of a site."""
+    return young.begun > old.met or (young.begun == old.met == 0 and young.since > old.item.last_seen)
+
+
+def _objects(
+    tracks: list[Track], alive: list[int], rows: list[tuple[int, int, MapObject]], solved: JointFrames
+) -> tuple[ObjectMap, dict[int, int]]:
+    """Return the map of the tracks, and the track of each id. Objects that are gone are apart, or forgotten."""
+    free = max((t.number for t in tracks if t.number is not None), default=-1) + 1
+    there, gone = [], []
+    used: dict[int, int] = {}
+    for at in alive:
+        track = tracks[at]
+        number = track.number if track.number is not None and track.number not in used else free
+        free = max(free, number + 1)
+        used[number] = at
+        of = [rows[row] for row in track.places]
+        assert track.life is not None
+        item = replace(
+            track.item,
+            id=number,
+            position=solved.positions[at],
+            covariance=_at_least_the_best(solved, at, of),
+            labels=_labels([o for _, _, o in of]),
+            first_seen=min(o.first_seen for _, _, o in of),
+            last_seen=max(o.last_seen for _, _, o in of),
+            life=track.life,
+        )
+        item = replace(item, label=max(item.labels, key=lambda n: (item.labels or {})[n]) if item.labels else item.label)
+        if track.life.probability >= GONE:
+            there.append(item)
+        elif track.life.probability >= FORGOTTEN:
+            gone.append(item)
+    return ObjectMap(tuple(there), "site", tuple(gone)), used
+
+
+def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, MapObject]]) -> Floats:
+    """Return the covariance of an object, but no smaller one than that of the session that knew it best.
+
+    The errors of its boxes repeat from session to session, so that many sessions do not average them out.
+    """
+    best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
+    rotation = solved.site_T_map[best[1], :3, :3]
+    return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
+
+
+def _labels(items: list[MapObject]) -> dict[str, float] | None:
+    """Return the mean share of each label over the sessions, the largest first. None if a session has no shares."""
+    if any(o.labels is None for o in items):
+        return None
+    often = [1 if o.life is None else o.life.sessions_seen for o in items]
+    total: dict[str, float] = {}
+    for o, weight in zip(items, often, strict=True):
+        for name, share in (o.labels or {}).items():
+            total[name] = total.get(name, 0.0) + share * weight / sum(often)
+    return dict(sorted(total.items(), key=lambda entry: -entry[1]))

@@ -1,0 +1,99 @@
+"""One session of a site: its map, and what its cameras could have seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from objslam.association.observations import Observations
+from objslam.association.visibility import CameraFrames, count_looks
+from objslam.core.arrays import Floats, Ints
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.io.objects_json import read_objects
+from objslam.io.rays_parquet import RaysTable
+from objslam.io.views_parquet import Views
+from objslam.results.read import load_map, load_rays, load_views
+
+_SAME_FRAME = 0.005
+"""The longest time (s) between a ray and the camera frame that it belongs to. A larger value matches damaged stamps, and may
+take the wrong frame of a fast camera."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """A map in a frame of its own. name: how messages call it. views, rays: what a result folder says of its drive, None for
+    a map alone, which does not say what was in view."""
+
+    name: str
+    objects: ObjectMap
+    views: Views | None = None
+    rays: RaysTable | None = None
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Load a result folder, a site, or an objects.json. OutputError names what is missing or damaged."""
+        at = Path(path)
+        if at.is_file():
+            return cls(str(path), read_objects(at))
+        views = load_views(at) if at.is_dir() else None
+        return cls(str(path), load_map(at), views, None if views is None else load_rays(at))
+
+    @property
+    def when(self) -> float:
+        """The time of the session, s: that of its last update for a site, else that of its last sight of an object."""
+        lives = [o.life.updated for o in (*self.objects, *self.objects.gone) if o.life is not None]
+        seen = lives or [o.last_seen for o in self.objects if np.isfinite(o.last_seen)]
+        return max(seen, default=0.0)
+
+    def looks(self, objects: tuple[MapObject, ...], positions: Floats) -> Ints:
+        """Return in how many frames (N,) each object should have been detected if it was at positions (N, 3), m.
+
+        Positions are in the frame of this session. Objects of which no distances are known have no look, and no object has
+        one if the session does not know its views.
+        """
+        nothing = np.zeros(len(objects), dtype=np.int64)
+        if self.views is None or self.rays is None or not objects:
+            return nothing
+        known = np.array([o.seen_from is not None for o in objects]) & np.isfinite(positions).all(axis=1)
+        if not known.any():
+            return nothing
+        some = [o for o, there in zip(objects, known, strict=True) if there]
+        extent = np.array([(np.nan, np.nan) if o.extent is None else o.extent for o in some])
+        seen_from = np.array([o.seen_from for o in some])
+        views = self.views
+        frames = CameraFrames(
+            views.stamps, views.cameras, views.camera, views.map_T_camera, views.margin, views.margin_share
+        )
+        obs, distance = _boxes(self.rays, self.objects, views)
+        nothing[known] = count_looks(positions[known], extent, seen_from, frames, obs, distance)
+        return nothing
+
+
+def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:
+    """Return the boxes of all frames in the order of the frames, and how far (R,) their objects are, NaN where unknown."""
+    frame = np.full(len(rays), -1, dtype=np.int64)
+    for number, camera in enumerate(views.cameras):
+        mine, own = np.flatnonzero(rays.camera == camera.name), np.flatnonzero(views.camera == number)
+        if len(own) == 0:
+            continue
+        after = np.clip(np.searchsorted(views.stamps[own], rays.stamp[mine]), 1, max(len(own) - 1, 1))
+        near = np.clip(np.column_stack([after - 1, after]), 0, len(own) - 1)
+        off = np.abs(views.stamps[own][near] - rays.stamp[mine, None])
+        best = off.argmin(axis=1)
+        frame[mine] = np.where(off.min(axis=1) <= _SAME_FRAME, own[near[np.arange(len(mine)), best]], -1)
+    kept = np.flatnonzero(frame >= 0)
+    kept = kept[np.argsort(frame[kept], kind="stable")]
+    order = np.argsort([o.id for o in objects], kind="stable")
+    ids = np.array([o.id for o in objects], dtype=np.int64)[order]
+    at = np.searchsorted(ids, rays.object[kept])
+    there = np.isin(rays.object[kept], ids)
+    distance = np.full(len(kept), np.nan)
+    places = objects.positions[order]
+    distance[there] = np.linalg.norm(places[at[there]] - rays.origin[kept][there], axis=1)
+    unknown = np.full(len(kept), np.nan)
+    lines = Observations.of_lines(rays.origin[kept], rays.direction[kept], rays.sigma[kept], unknown, unknown)
+    return replace(lines, frame=frame[kept], box=rays.box[kept]), distance

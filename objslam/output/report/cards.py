@@ -1,0 +1,127 @@
+"""The cards of the page: what it says and draws of each object."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.types import Up
+from objslam.frontend.up import from_above
+from objslam.io.rays_parquet import RaysTable
+from objslam.output.plot.style import REJECTED_BELOW, captions, label_colours
+from objslam.output.report.charts import Histogram, axis_end, histogram
+from objslam.output.report.crops import Crop
+from objslam.output.report.scene import hexadecimal
+from objslam.output.report.sketch import Sketch, sketch
+from objslam.output.report.timeline import Timeline, timeline
+
+_BINS = 16  # The histogram of an object has this many bars.
+_NEIGHBOURS = 2  # A card names this many of the nearest objects of the label. More say little about duplicates.
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """Another object of the same label. sigmas: the distance in standard deviations of the difference of the two places."""
+
+    object: MapObject
+    caption: str
+    distance: float
+    sigmas: float | None
+
+
+@dataclass(frozen=True)
+class Card:
+    """The data of one object on the page."""
+
+    object: MapObject
+    caption: str
+    colour: str
+    sigma: list[float] | None  # The standard deviations along x, y and z, m.
+    seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
+    rejected: int  # The number of rejected rays.
+    promised_deg: float | None  # The rms that the noise of the boxes promises, deg; None without used rays.
+    error: float | None  # The distance from the matching true object, m; None without a match.
+    matched: str | None  # A text that names the matching true object.
+    histogram: Histogram | None
+    timeline: Timeline | None
+    sketch: Sketch | None
+    neighbours: list[Neighbour]
+    crops: list[Crop]
+
+
+def make_cards(
+    objects: ObjectMap,
+    rays: RaysTable,
+    crops: dict[int, list[Crop]],
+    errors: dict[int, tuple[float, str]],
+    path: Floats,
+    up: Up,
+) -> list[Card]:
+    """Return the cards, sorted by label. Their times count from the first ray, s.
+
+    crops, errors: by the id of the object. path: (K, 3) positions of the robot, m in map. up: the axis that points up.
+    """
+    begin, end = (float(rays.stamp.min()), float(rays.stamp.max())) if len(rays) else (0.0, 0.0)
+    residual_deg = np.degrees(rays.residual)
+    used = rays.weight >= REJECTED_BELOW
+    kept = residual_deg[used & np.isfinite(residual_deg)]
+    top = axis_end(kept) if len(kept) else None
+    colours, names, plane = label_colours(objects), captions(objects), from_above(up)
+    cards = []
+    for i, o in enumerate(objects):
+        mine = np.flatnonzero(rays.object == o.id)
+        counted = mine[used[mine]]
+        error, matched = errors.get(o.id, (None, None))
+        alike = np.array([other.label == o.label and other.id != o.id for other in objects])
+        card = Card(
+            object=o,
+            caption=names[i],
+            colour=hexadecimal(colours[o.label]),
+            sigma=None if o.covariance is None else np.sqrt(np.diag(o.covariance)).tolist(),
+            seen=(o.first_seen - begin, o.last_seen - begin),
+            rejected=len(mine) - len(counted),
+            promised_deg=float(np.degrees(np.sqrt(2 * np.mean(rays.sigma[counted] ** 2)))) if len(counted) else None,
+            error=error,
+            matched=matched,
+            histogram=histogram(residual_deg[mine], rays.weight[mine], _BINS, top),
+            timeline=timeline(rays.stamp[mine], used[mine], begin, end) if len(mine) else None,
+            sketch=sketch(
+                rays.origin[mine][:, plane],
+                rays.direction[mine][:, plane],
+                used[mine],
+                o.position[plane],
+                None if o.covariance is None else o.covariance[np.ix_(plane, plane)],
+                path[:, plane],
+                objects.positions[alike][:, plane],
+            ),
+            neighbours=_neighbours(objects, names, i),
+            crops=crops.get(o.id, []),
+        )
+        cards.append(card)
+    return sorted(cards, key=lambda card: (natural(card.object.label), card.object.id))
+
+
+def _neighbours(objects: ObjectMap, names: list[str], i: int) -> list[Neighbour]:
+    """Return the nearest resolved objects of the same label as a resolved object."""
+    o = objects[i]
+    if o.status != "ok":
+        return []
+    found = []
+    for other, name in zip(objects, names, strict=True):
+        if other.id == o.id or other.label != o.label or other.status != "ok":
+            continue
+        apart, sigmas = other.position - o.position, None
+        if o.covariance is not None and other.covariance is not None:
+            spread = o.covariance + other.covariance
+            if np.isfinite(spread).all() and np.linalg.eigvalsh(spread)[0] > 0:
+                sigmas = float(np.sqrt(apart @ np.linalg.solve(spread, apart)))
+        found.append(Neighbour(other, name, float(np.linalg.norm(apart)), sigmas))
+    return sorted(found, key=lambda neighbour: neighbour.distance)[:_NEIGHBOURS]
+
+
+def natural(text: str) -> tuple[str, int]:
+    """Return a sort key that places landmark_9 before landmark_10."""
+    head, number = re.fullmatch(r"(.*?)([0-9]{0,18})", text, re.DOTALL).groups()  # type: ignore[union-attr]
+    return head, int(number or -1)

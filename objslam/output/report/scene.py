@@ -1,0 +1,95 @@
+"""The data of the 3D view on the page: what scene.js draws, in a frame that has z up."""
+
+import base64
+from typing import Any
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import ObjectMap
+from objslam.core.types import Trajectory, Truth, Up
+from objslam.frontend.up import from_above, up_vector
+from objslam.io.rays_parquet import RaysTable
+from objslam.output.plot.style import REJECTED_BELOW, captions, ellipsoid, evenly, frame_objects, label_colours, sample
+
+_MAX_USED, _MAX_REJECTED = 1500, 300
+"""The most rays of each kind. More rays make the page larger and the view slower, and hide the objects."""
+_MAX_PATH = 1000  # The most poses of a path. More make the page larger, and nobody sees the difference.
+
+
+def upright(up: Up) -> Floats:
+    """Return the rotation (3, 3) from the map's frame to the frame of the view, which has z up."""
+    return np.stack([*np.eye(3)[from_above(up)], up_vector(up)])
+
+
+def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Truth | None, up: Up) -> dict[str, Any]:
+    """Return the data as JSON values. Positions are in the frame of the view, m. Arrays are float32 in base64.
+
+    truth: the ground truth in the frame of the map. up: the axis of the map that points up.
+    """
+    turn = upright(up)
+    names, colours = captions(objects), label_colours(objects)
+    shown = [i for i, o in enumerate(objects) if np.isfinite(o.position).all()]
+    positions = objects.positions @ turn.T
+    way = path.poses[:, :3, 3] @ turn.T
+    _, low, high = frame_objects(positions, way)
+    return {
+        "axes": [[name, turn[:, i].round(3).tolist()] for i, name in enumerate("xyz")],
+        "low": low.round(3).tolist(),
+        "high": high.round(3).tolist(),
+        "objects": [
+            {
+                "id": objects[i].id,
+                "name": names[i],
+                "colour": hexadecimal(colours[objects[i].label]),
+                "ok": objects[i].status == "ok",
+                "at": positions[i].round(3).tolist(),
+                "axes": _half_axes(objects, i, turn),
+            }
+            for i in shown
+        ],
+        "path": _packed(way[evenly(len(way), _MAX_PATH)]),
+        "truth": [] if truth is None else [(turn @ t.position).round(3).tolist() for t in truth.objects],
+        "true_path": _packed(_thinned(truth, turn)),
+        **_rays(objects, rays, turn),
+    }
+
+
+def hexadecimal(colour: tuple[float, float, float]) -> str:
+    """Return a colour, r, g, b in [0, 1], as CSS writes it."""
+    return "#" + "".join(f"{round(255 * c):02x}" for c in colour)
+
+
+def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
+    """Return the half axes of an object's 2-sigma ellipsoid as vectors, m, none where it has no covariance."""
+    found = ellipsoid(objects[i])
+    return [] if found is None else (turn @ (found[1] * found[0])).T.round(4).tolist()
+
+
+def _thinned(truth: Truth | None, turn: Floats) -> Floats:
+    if truth is None or truth.trajectory is None:
+        return np.zeros((0, 3))
+    way = truth.trajectory.poses[:, :3, 3] @ turn.T
+    return way[evenly(len(way), _MAX_PATH)]
+
+
+def _rays(objects: ObjectMap, rays: RaysTable, turn: Floats) -> dict[str, Any]:
+    """Return the rays of objects: both ends (6 numbers), the object's id, and how many of them, the first, are used."""
+    row = {o.id: i for i, o in enumerate(objects)}
+    index = np.array([row.get(int(j), -1) for j in rays.object], dtype=np.int64)
+    used = (index >= 0) & (rays.weight >= REJECTED_BELOW)
+    kept, out = sample(used, _MAX_USED), sample((index >= 0) & ~used, _MAX_REJECTED)
+    chosen = np.concatenate([kept, out])
+    chosen = chosen[np.isfinite(objects.positions[index[chosen]]).all(axis=1)] if len(chosen) else chosen
+    origins = rays.origin[chosen]
+    reach = np.linalg.norm(objects.positions[index[chosen]] - origins, axis=1)[:, None] if len(chosen) else np.zeros((0, 1))
+    ends = origins + reach * rays.direction[chosen]
+    return {
+        "rays": _packed(np.hstack([origins @ turn.T, ends @ turn.T])),
+        "of": rays.object[chosen].tolist(),
+        "used": int(np.isin(chosen, kept).sum()),
+    }
+
+
+def _packed(values: Floats) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()

@@ -1,0 +1,68 @@
+"""Write the map of a site: objects.json, summary.json and a picture, for each island of sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from objslam.core.geometry import split_se2
+from objslam.io.atomic_files import encode, replace_files
+from objslam.io.objects_json import dump_objects
+from objslam.mapping.sites.merge import Island
+from objslam.output.plot.changes_plot import draw_site
+from objslam.output.result_folder import RESULT_FILES, prepare_output
+from objslam.results import files
+from objslam.results.files import dump_json
+
+
+def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:
+    """Write the largest island into the folder `out`, the others into `out`/island_2 and so on. Return their folders.
+
+    names: of all sessions. warnings: what the user is to know. OutputError if a folder cannot be written.
+    """
+    folders = [out if number == 0 else out / f"island_{number + 1}" for number in range(len(islands))]
+    for folder, island in zip(folders, islands, strict=True):
+        prepare_output(folder)
+        summary = {**summarise_site(island, names), "islands": len(islands), "warnings": list(warnings)}
+        replace_files(
+            folder,
+            RESULT_FILES,
+            {
+                files.OBJECTS: partial(_write, dump_objects(island.objects)),
+                files.PICTURE: partial(draw_site, island.objects),
+                files.SUMMARY: partial(_write, dump_json(summary)),
+            },
+        )
+    return folders
+
+
+def summarise_site(island: Island, names: Sequence[str]) -> dict[str, Any]:
+    """Return what summary.json says of an island: its counts, and how each session lies in the frame of the first."""
+    objects = island.objects
+    sigma = np.sqrt(np.diagonal(island.covariance, axis1=1, axis2=2)) * [1, 1, 1, np.degrees(1)]
+    planar = split_se2(island.site_T_session)[0]
+    sessions = [
+        {
+            "name": names[s],
+            "x": float(pose[0, 3]),
+            "y": float(pose[1, 3]),
+            "z": float(pose[2, 3]),
+            "yaw_deg": float(np.degrees(place[2])),
+            "sigma": dict(zip(("x", "y", "z", "yaw_deg"), one.tolist(), strict=True)),
+            "log_odds": float(odds),
+            "common_objects": common,
+        }
+        for s, pose, place, one, odds, common in zip(
+            island.sessions, island.site_T_session, planar, sigma, island.log_odds, island.common, strict=True
+        )
+    ]
+    counts = {"objects": len(objects), "unresolved": 0, "gone": len(objects.gone), "sessions": len(sessions)}
+    return {"map_frame": "site", "counts": counts, "sessions": sessions}
+
+
+def _write(text: str, file: Path) -> None:
+    file.write_bytes(encode(text))

@@ -1,0 +1,117 @@
+"""The bytes of a journal file: a header, then records, each with a checksum of its own.
+
+Format 2, which is written: the header is `OBJSLAM2`, 8 bytes that identify the journal, the number of this segment from 1
+on, and a CRC-32 of all that. A record is a mark, the length of its content, a CRC-32 of length and content, and the
+content. The mark lets a reader find the next record behind a damaged one. Format 1, which is only read and continued, has
+the header `OBJSLAM1`; its records have no mark, and the CRC-32 is that of the content. All numbers are little endian and of
+4 bytes.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import BinaryIO
+
+MAGICS = {1: b"OBJSLAM1", 2: b"OBJSLAM2"}
+"""The first bytes of a journal file, by format."""
+LONGEST = 1 << 26
+"""The largest content of a record, bytes. A record that states a greater length counts as damaged."""
+_HEADER = struct.Struct("<8s8sII")
+_MARK = b"\xf5REC"
+_HEADS = {1: struct.Struct("<II"), 2: struct.Struct("<4sII")}
+_CHUNK = 1 << 18  # The bytes of one read. A larger number makes fewer reads.
+_MOST_WASTED = 1 << 30  # The most bytes of damaged records that are checked, so that no file takes hours to read.
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a journal file. size: its bytes. identity: 8 bytes, the same in all segments. number: from 1 on."""
+
+    version: int
+    size: int
+    identity: bytes = bytes(8)
+    number: int = 1
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record. start, end: its place in the file, bytes."""
+
+    start: int
+    end: int
+    content: bytes
+
+
+def pack_header(identity: bytes, number: int) -> bytes:
+    """Return the header of a file of format 2."""
+    first = _HEADER.pack(MAGICS[2], identity, number, 0)[:-4]
+    return first + zlib.crc32(first).to_bytes(4, "little")
+
+
+def pack_record(version: int, content: bytes) -> bytes:
+    """Return a record with its content in a format."""
+    if version == 1:
+        return _HEADS[1].pack(len(content), zlib.crc32(content)) + content
+    return _HEADS[2].pack(_MARK, len(content), _checksum(content)) + content
+
+
+def read_header(stream: BinaryIO) -> Header | None:
+    """Read the header. Return None if the file is no journal or its header is damaged or incomplete."""
+    magic = stream.read(len(MAGICS[1]))
+    if magic == MAGICS[1]:
+        return Header(1, len(magic))
+    data = magic + stream.read(_HEADER.size - len(magic))
+    if magic != MAGICS[2] or len(data) < _HEADER.size:
+        return None
+    _, identity, number, checksum = _HEADER.unpack(data)
+    return Header(2, _HEADER.size, identity, number) if zlib.crc32(data[:-4]) == checksum and number > 0 else None
+
+
+def is_cut_header(data: bytes) -> bool:
+    """Return whether a file that holds no more than `data` is a journal that was cut in its header, or is empty."""
+    return len(data) < _HEADER.size and any((data + magic[len(data) :]).startswith(magic) for magic in MAGICS.values())
+
+
+def records(stream: BinaryIO, header: Header) -> Iterator[Record]:
+    """Yield the undamaged records that follow the header. The stream stands behind the header, and need not be seekable.
+
+    Where `start` is not the `end` of the record before, the bytes between are damaged. In format 1, what follows a damaged
+    record cannot be found.
+    """
+    head, buffer, base, at, wasted = _HEADS[header.version], bytearray(), header.size, 0, 0
+
+    def has(count: int) -> bool:
+        while len(buffer) - at < count and (chunk := stream.read(max(_CHUNK, count - (len(buffer) - at)))):
+            buffer.extend(chunk)
+        return len(buffer) - at >= count
+
+    while wasted < _MOST_WASTED:
+        if at > _CHUNK:
+            del buffer[:at]
+            base, at = base + at, 0
+        if not has(head.size):
+            return
+        *mark, length, checksum = head.unpack_from(buffer, at)
+        if length <= LONGEST and mark in ([], [_MARK]) and has(head.size + length):
+            content = bytes(buffer[at + head.size : at + head.size + length])
+            if (zlib.crc32(content) if header.version == 1 else _checksum(content)) == checksum:
+                yield Record(base + at, base + at + head.size + length, content)
+                at += head.size + length
+                continue
+            wasted += length
+        if header.version == 1:
+            return
+        at += 1
+        while (found := buffer.find(_MARK, at)) < 0:
+            at = max(at, len(buffer) - len(_MARK) + 1)
+            if not has(len(buffer) - at + 1):
+                return
+            if at > _CHUNK:
+                del buffer[:at]
+                base, at = base + at, 0
+        at = found
+
+
+def _checksum(content: bytes) -> int:
+    return zlib.crc32(content, zlib.crc32(len(content).to_bytes(4, "little")))

@@ -1,0 +1,27 @@
+"""The error of a recording that tells where the robot drove, but has no camera. It carries what the recording tells."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from objslam.errors import LogError
+
+if TYPE_CHECKING:
+    from objslam.core.arrays import Floats
+    from objslam.core.types import Trajectory
+
+
+class NoCamera(LogError):
+    """A recording without a camera. mounts: base_T_camera (4, 4) by the name of the optical frame, as tf tells them."""
+
+    def __init__(
+        self,
+        message: str,
+        where: str,
+        hint: str,
+        odometry: Trajectory | None,
+        localization: Trajectory | None,
+        mounts: dict[str, Floats],
+    ) -> None:
+        super().__init__(message, where=where, hint=hint)
+        self.odometry, self.localization, self.mounts = odometry, localization, mounts

@@ -1,0 +1,92 @@
+"""The commands `merge` and `diff` on the results of two days, between which one object was taken, moved and added."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import objslam
+from objslam.cli import main
+from objslam.config import Settings
+from objslam.config.settings import change_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.mapping.localization import moved_log
+from objslam.mapping.pipeline import run
+from objslam.output.result_folder import write_result
+from objslam.simulation import preset, simulate
+
+UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
+TAKEN, MOVED = 0, 4
+TO, ADDED = (0.44, 0.18, 0.7), (-1.0, 1.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory):
+    """The folders of both days, and the true objects of the first."""
+    out = tmp_path_factory.mktemp("days")
+    settings = change_settings(Settings(), {"output": {"recording": False, "picture": False}})
+    first = simulate(preset("demo", objects=14), 2)
+    objects = [(o.label, tuple(o.position)) for o in first.truth.objects]
+    later = [o for k, o in enumerate(objects) if k not in (TAKEN, MOVED)] + [(objects[MOVED][0], TO), ("plant", ADDED)]
+    second = simulate(preset("demo", objects=0, placed=tuple(later), path=(3, 2)), 102)
+    for name, log in (("a", first), ("b", moved_log(second, UNKNOWN))):
+        write_result(run(log, settings, Ledger()), out / name)
+    return out, objects
+
+
+def call(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    return ended.value.code, said.out, said.err
+
+
+def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsys):
+    out, objects = days
+    picture = tmp_path / "diff.png"
+    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "-o", picture)
+    assert code == 0
+    assert "12 confirmed, 1 moved, 1 gone, 1 new, 0 unseen" in said
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "--json")
+    told = json.loads(said)
+    by = {one["outcome"]: one for one in told["changes"]}
+    np.testing.assert_allclose(by["gone"]["position"], objects[TAKEN][1], atol=0.05)
+    np.testing.assert_allclose(by["moved"]["position"], TO, atol=0.05)
+    np.testing.assert_allclose(by["moved"]["moved_from"], objects[MOVED][1], atol=0.05)
+    np.testing.assert_allclose(by["new"]["position"], ADDED, atol=0.05)
+    np.testing.assert_allclose(np.array(told["a_T_b"]) @ UNKNOWN, np.eye(4), atol=0.05)
+
+
+def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeypatch, capsys):
+    out, _ = days
+    code, said, _ = call(monkeypatch, capsys, "merge", out / "a", out / "b", "-o", tmp_path / "site")
+    assert code == 0
+    assert "14 objects (1 gone) from 2 sessions" in said
+    site = objslam.ObjectMap.load(tmp_path / "site")
+    assert [len(site), len(site.gone)] == [14, 1]
+    assert {o.life.state for o in site} == {"confirmed", "moved", "new"}
+    assert (tmp_path / "site" / "map.png").is_file()
+    again = objslam.merge([tmp_path / "site", out / "b"])
+    assert len(again) == 1
+    assert {o.id for o in again[0].objects} == {o.id for o in site}
+    assert all(o.life.sessions_seen >= 2 for o in again[0].objects)
+    found = objslam.diff(objslam.Result.load(out / "a"), tmp_path / "site")
+    assert found.registration.accepted
+
+
+def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, monkeypatch, capsys):
+    out, _ = days
+    (tmp_path / "empty.json").write_text('{"format": "objslam.objects/2", "frame": "map", "objects": []}')
+    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", tmp_path / "empty.json")
+    assert code == 1
+    assert said == f"not registered: too little evidence, because {tmp_path / 'empty.json'} has 0 resolved objects\n"
+    code, _, warned = call(monkeypatch, capsys, "merge", out / "a", tmp_path / "empty.json", "-o", tmp_path / "site")
+    assert code == 0
+    assert "2 islands without objects in common" in warned
+    assert (tmp_path / "site" / "island_2" / "objects.json").is_file()
+    with pytest.raises(ValueError, match="at least one"):
+        objslam.merge([])

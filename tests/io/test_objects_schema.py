@@ -1,0 +1,78 @@
+"""The JSON schema of objects.json: what is written fits it, and what it refuses is refused by the reader."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from objslam.core.object_map import Life, MapObject, ObjectMap
+from objslam.errors import OutputError
+from objslam.io.objects_json import dump_objects, parse_objects
+
+SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs" / "objects.schema.json").read_text("utf-8"))
+PLAIN = MapObject(0, "cup", np.array([1.0, 2.0, 0.5]), np.eye(3) * 1e-4, "ok", 9, 8, 40.0, 0.3, 0.0, 1.0)
+LIFE = Life("moved", 0.9, 3, 2, 120, 40, 86_400.0, np.array([0.0, 1.0, 0.5]))
+FULL = replace(PLAIN, id=1, extent=(0.1, 0.2), labels={"cup": 1.0}, existence=0.9, seen_from=(0.5, 3.0), life=LIFE)
+LOST = replace(
+    PLAIN, id=2, status="unresolved", covariance=None, position=np.full(3, np.nan), ray=(np.zeros(3), np.eye(3)[0])
+)
+MAP = ObjectMap((PLAIN, FULL, LOST), "site", (replace(FULL, id=3, life=replace(LIFE, state="gone", moved_from=None)),))
+
+
+def test_the_schema_is_one():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+@pytest.mark.parametrize("objects", [ObjectMap(()), MAP], ids=["empty", "full"])
+def test_what_is_written_fits_the_schema_and_is_read_back(objects):
+    text = dump_objects(objects)
+    jsonschema.validate(json.loads(text), SCHEMA)
+    back = parse_objects(json.loads(text))
+    assert dump_objects(back) == text
+    for one, other in zip((*objects, *objects.gone), (*back, *back.gone), strict=True):
+        assert one.seen_from == other.seen_from
+        assert (one.life is None) == (other.life is None)
+
+
+def test_format_1_is_read():
+    old = json.loads(dump_objects(ObjectMap((PLAIN,)))) | {"format": "objslam.objects/1"}
+    jsonschema.validate(old, SCHEMA)
+    (read,) = parse_objects(old)
+    assert read.life is None
+    assert read.seen_from is None
+
+
+WRONG = [
+    (("format",), "objslam.objects/3"),
+    (("gone",), {}),
+    (("objects", 1, "position"), [1.0, 2.0]),
+    (("objects", 1, "status"), "gone"),
+    (("objects", 1, "label"), ""),
+    (("objects", 1, "covariance"), [[1.0]]),
+    (("objects", 1, "seen_from"), [1.0]),
+    (("objects", 1, "seen_from"), [-1.0, 2.0]),
+    (("objects", 1, "life"), "long"),
+    (("objects", 1, "life", "state"), "dead"),
+    (("objects", 1, "life", "probability"), 1.5),
+    (("objects", 1, "life", "sessions_seen"), -1),
+    (("objects", 1, "life", "looks"), 0.5),
+    (("objects", 1, "life", "moved_from"), [0.0]),
+    (("gone", 0, "rays"), "many"),
+]
+
+
+@pytest.mark.parametrize(("path", "value"), WRONG, ids=lambda x: str(x)[:40])
+def test_what_the_schema_refuses_the_reader_refuses(path, value):
+    data = copy.deepcopy(json.loads(dump_objects(MAP)))
+    at = data
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, SCHEMA)
+    with pytest.raises(OutputError):
+        parse_objects(data)

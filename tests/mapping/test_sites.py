@@ -1,0 +1,171 @@
+"""The map of a site over many days: what is there, what moved, what is gone, and which sessions belong together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping.site_days import DAY, Day, Place, session
+
+from objslam.core.geometry import inverse
+from objslam.core.object_map import ObjectMap
+from objslam.mapping.sites.compare import compare
+from objslam.mapping.sites.merge import merge_sessions
+
+
+def there(objects, at, within=0.25):
+    """The object of a map at a place, None if there is none."""
+    distance = np.linalg.norm(objects.positions - at, axis=1)
+    return objects[int(distance.argmin())] if distance.min() < within else None
+
+
+def test_thirty_days_of_changes():
+    """A tenth of the objects moves, comes or goes each week. Two visits later the map knows it, and no phantom is left."""
+    place, site, since = Place(np.random.default_rng(0)), None, {}
+    right, errors, phantoms = [], [], []
+    for day in range(30):
+        if day and day % 7 == 0:
+            place.change(0.1, day)
+            since |= {k: day for k in place.truth if k not in since and day}
+        today, _ = session(place, day)
+        (island,) = merge_sessions([today] if site is None else [site, today])
+        site = Day("site", island.objects)
+        known = [(k, there(site.objects, at)) for k, (_, at) in place.truth.items()]
+        right += [o is not None for k, o in known if day > since.get(k, 0)]
+        standing = np.array([at for _, at in place.truth.values()])
+        for when, _, at in place.past.values():
+            if day > when and np.linalg.norm(standing - at, axis=1).min() > 0.5:
+                right.append(there(site.objects, at) is None)
+        errors.append([np.linalg.norm(o.position - place.truth[k][1]) for k, o in known if o is not None])
+        real = {o.id for _, o in known if o is not None}
+        phantoms += [
+            o for o in site.objects if o.id not in real and o.life.sessions_seen == 1 < o.life.sessions_expected - 1
+        ]
+    assert np.mean(right) >= 0.95
+    assert not phantoms  # Nothing that one session saw and two missed is left.
+    first, last = (np.sqrt(np.mean(np.concatenate(part) ** 2)) for part in (errors[:7], errors[-7:]))
+    assert last <= first
+    confirmed = [o.life.state == "confirmed" for o in site.objects if o.life.sessions_seen > 3]
+    assert np.mean(confirmed) >= 0.9
+
+
+def quiet(place, day):
+    return session(place, day, wrong_label=0.0, missed=0.0, phantoms=0.0)
+
+
+class Sees(Day):
+    """A session that had every place in view."""
+
+    def looks(self, objects, positions):
+        return np.full(len(objects), 60)
+
+
+def all_in_view(place, day):
+    seen, own = quiet(place, day)
+    back = inverse(own)
+    model = seen.objects[0]
+    found = tuple(
+        replace(
+            model, id=k, label=label, position=back[:3, :3] @ at + back[:3, 3], labels=None,
+            first_seen=day * DAY, last_seen=day * DAY + 600,
+        )
+        for k, (label, at) in place.truth.items()
+    )  # fmt: skip
+    return Sees(f"day {day}", ObjectMap(found)), own
+
+
+def test_what_became_of_each_object_is_told():
+    place = Place(np.random.default_rng(1), count=20)
+    a, _ = all_in_view(place, 0)
+    gone = place.truth.pop(3)
+    label, start = place.truth[5]
+    place.truth[5] = (label, place.spot())
+    lone = next(k for k, (name, _) in place.truth.items() if name not in (gone[0], label))
+    place.truth[99] = (place.truth[lone][0], place.spot())
+    b, own = all_in_view(place, 1)
+    found = compare(a, b)
+    assert found.registration.accepted
+    np.testing.assert_allclose(found.a_T_b, own, atol=1e-6)
+    assert len(found.of("confirmed")) == 18
+    assert {one.item.id for one in found.of("confirmed")} == set(range(20)) - {3, 5}
+    (moved,) = found.of("moved")
+    assert moved.item.id == 5
+    np.testing.assert_allclose(moved.item.position, place.truth[5][1], atol=1e-6)
+    np.testing.assert_allclose(moved.item.life.moved_from, start, atol=1e-6)
+    assert [one.item.id for one in found.of("gone")] == [3]
+    assert found.of("gone")[0].probability > 0.5
+    (new,) = found.of("new")
+    np.testing.assert_allclose(new.item.position, place.truth[99][1], atol=1e-6)
+
+
+def test_a_map_without_views_says_of_nothing_that_it_is_gone():
+    place = Place(np.random.default_rng(2), count=20)
+    a, _ = all_in_view(place, 0)
+    del place.truth[3]
+    b, _ = all_in_view(place, 1)
+    from objslam.mapping.sites.session import Session
+
+    found = compare(a, Session("objects alone", b.objects))
+    assert not found.of("gone")
+    assert [one.item.id for one in found.of("unseen")] == [3]
+
+
+def test_an_object_that_comes_back_is_the_same_one():
+    place = Place(np.random.default_rng(3), count=20)
+    a, _ = all_in_view(place, 0)
+    taken = place.truth.pop(4)
+    b, _ = all_in_view(place, 1)
+    site = merge_sessions([a, b])[0].objects
+    assert [o.id for o in site.gone] == [4]
+    place.truth[4] = taken
+    c, _ = all_in_view(place, 2)
+    (island,) = merge_sessions([Sees("site", site), c])
+    again = there(island.objects, taken[1])
+    assert again.id == 4
+    assert again.life.state == "confirmed"
+    assert not island.objects.gone
+
+
+def test_sessions_of_two_places_are_two_islands():
+    one, two = Place(np.random.default_rng(4), count=20), Place(np.random.default_rng(5), count=20)
+    sessions = [quiet(one, 0)[0], quiet(two, 1)[0], quiet(one, 2)[0], quiet(two, 3)[0], quiet(one, 4)[0]]
+    islands = merge_sessions(sessions)
+    assert [island.sessions for island in islands] == [(0, 2, 4), (1, 3)]
+    for island, place in zip(islands, (one, two), strict=True):
+        if place is one:
+            assert all(there(island.objects, at) for _, at in place.truth.values())
+        assert len(island.objects) <= 20
+    assert not compare(sessions[0], sessions[1]).changes
+
+
+def test_all_at_once_is_as_good_as_one_after_the_other():
+    place = Place(np.random.default_rng(6), count=25)
+    days = [quiet(place, day) for day in range(5)]
+    (at_once,) = merge_sessions([day for day, _ in days])
+    site = days[0][0]
+    for day, _ in days[1:]:
+        site = Day("site", merge_sessions([site, day])[0].objects)
+    for objects in (at_once.objects, site.objects):
+        off = [np.linalg.norm(there(objects, at).position - at) for _, at in place.truth.values()]
+        assert len(objects) == 25
+        assert np.sqrt(np.mean(np.square(off))) < 0.045  # A session alone has 0.052 m, of which 0.02 m are its frame.
+    own = np.array([frame for _, frame in days])
+    np.testing.assert_allclose(at_once.site_T_session[:, :3, 3], own[:, :3, 3], atol=0.15)
+    assert (np.diagonal(at_once.covariance, axis1=1, axis2=2)[1:] > 0).all()
+
+
+def test_an_empty_session_stays_alone():
+    place = Place(np.random.default_rng(7), count=12)
+    islands = merge_sessions([quiet(place, 0)[0], Day("nothing", ObjectMap(()))])
+    assert sorted(len(island.objects) for island in islands)[0] == 0
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.05])
+def test_a_covariance_is_never_below_that_of_the_best_session(sigma):
+    place = Place(np.random.default_rng(8), count=20)
+    days = []
+    for day in range(3):
+        seen, _ = quiet(place, day)
+        cov = sigma**2 * np.eye(3) * (1 + day)
+        days.append(Day(seen.name, ObjectMap(tuple(replace(o, covariance=cov) for o in seen.objects))))
+    for o in merge_sessions(days)[0].objects:
+        assert o.sigma >= 0.999 * sigma
