@@ -1,9 +1,10 @@
 """How well association finds objects without identities, and how long it takes.
 
-    python tools/bench_association.py [--seeds 20] [--parts scenes speed drift mrclam] [--picture PNG]
+    python tools/bench_association.py [--seeds 20] [--parts scenes speed drift mrclam unnamed] [--picture PNG]
 
 scenes: drives with known poses and truth. speed: growth with the log. drift: from odometry alone, poses and objects
-together. mrclam: UTIAS MRCLAM 6 without identities, from odometry, from the folder in OBJSLAM_DATA.
+together. mrclam: UTIAS MRCLAM 6 without identities, from odometry, from the folder in OBJSLAM_DATA. unnamed: the drives of
+peers/drives.py that name their landmarks, against the same drives with the names hidden.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from peers.drives import drives
 
 from objslam.association.global_association import associate_globally
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import widest_angle
+from objslam.core.geometry import align, widest_angle
 from objslam.core.types import Association, Keyframes, Log, Rays
 from objslam.evaluation.alignment import lay_truth, match_points
 from objslam.evaluation.evaluate import evaluate
@@ -34,7 +36,9 @@ from objslam.simulation import DriveSettings, pair, preset, simulate
 from objslam.sources import SourceOptions, read
 from objslam.triangulation.triangulate import triangulate
 
-PARTS = ("scenes", "speed", "drift", "mrclam")
+PARTS = ("scenes", "speed", "drift", "mrclam", "unnamed")
+UNNAMED = ("lost in the woods", "Victoria Park")
+"""The drives of the part `unnamed`."""
 STEP_DRIFT = {
     **{"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0},
     **{"floor_xy": 0.01, "floor_yaw": float(np.radians(0.3))},
@@ -182,6 +186,63 @@ def mrclam() -> None:
         print(f"{name:<22}{len(found.matches):>9}{15:>4}{len(found.false):>7}{error:>9.3f}{seconds:>7.1f}")
 
 
+def unnamed() -> None:
+    """Print what is left of the names of landmarks after a run without them, and how far its path is from the named one.
+
+    F1 counts pairs of observations: a pair is right if the run and the names both say that it is one landmark.
+    """
+    columns = f"{'landmarks':>10}{'of':>5}{'F1 of pairs':>12}{'path off m':>12}{'dead reckoning m':>18}{'CPU s':>7}"
+    print(f"{'names hidden':<20}{columns}")
+    data = os.environ.get("OBJSLAM_DATA")
+    for name, known in drives(Path(data) if data else None).items():
+        if name not in UNNAMED:
+            continue
+        if isinstance(known, str):
+            print(f"{name:<20} left out, {known}")
+            continue
+        log, settings = known().log, Settings.model_validate({"mode": "joint", "output": {"recording": False}})
+        named = pipeline.run(log, settings, Ledger())
+        begin = time.process_time()
+        result = pipeline.run(without_names(log), settings, Ledger())
+        seconds = time.process_time() - begin
+        assert np.array_equal(named.rays.keyframe, result.rays.keyframe)  # the same rays in the same order
+        found, truth = result.association.object, named.rays.label
+        off = path_off(result.map_T_base, named.map_T_base)
+        dead = result.keyframes.odom_T_base
+        assert dead is not None
+        print(
+            f"{name:<20}{len(result.map.resolved()):>10}{len(np.unique(truth)):>5}{pair_f1(found, truth):>12.3f}"
+            f"{off:>12.3f}{path_off(dead, named.map_T_base):>18.3f}{seconds:>7.1f}",
+            flush=True,
+        )
+
+
+def without_names(log: Log) -> Log:
+    """Return the log with one label for all landmarks."""
+    cameras = tuple(
+        replace(c, detections=replace(c.detections, label=np.zeros_like(c.detections.label), label_names=("landmark",)))
+        for c in log.cameras
+        if c.detections is not None
+    )
+    return replace(log, cameras=cameras)
+
+
+def pair_f1(found: Ints, truth: Ints) -> float:
+    """Return the F1 of pairs of observations (R,). -1 in `found` means no landmark."""
+    held = found >= 0
+    table = np.zeros((found.max(initial=-1) + 1, truth.max() + 1))
+    np.add.at(table, (found[held], truth[held]), 1)
+    right, ours, theirs = (float((n * (n - 1) / 2).sum()) for n in (table, table.sum(axis=1), np.bincount(truth)))
+    return 2 * right / max(ours + theirs, 1.0)
+
+
+def path_off(map_T_base: Floats, other: Floats) -> float:
+    """Return the root mean square distance (m) of two paths (K, 4, 4) after an SE(2) alignment."""
+    pose, _ = align(map_T_base[:, :3, 3], other[:, :3, 3], "se2")
+    moved = map_T_base[:, :3, 3] @ pose[:3, :3].T + pose[:3, 3]
+    return float(np.sqrt(((moved - other[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -206,6 +267,8 @@ def main() -> None:
         drift(seeds, arguments.picture)
     if "mrclam" in arguments.parts:
         mrclam()
+    if "unnamed" in arguments.parts:
+        unnamed()
 
 
 if __name__ == "__main__":

@@ -144,6 +144,26 @@ def individual_covariances(f: Filter, expected: Expected) -> Floats:
     return np.asarray(total + cross + cross.swapaxes(1, 2) + expected.variance[:, :, None] * np.eye(3))
 
 
+def within_reach(f: Filter, sight: Sight, ray: Ints, gate: float) -> Bools:
+    """Return a mask (n, N) of the rays (n,) and all landmarks, without pairs whose squared deviation must exceed the gate.
+
+    The trace of a landmark's covariance relative to the base is at least its variance in any direction. So no pair within
+    the gate is left out.
+    """
+    turn, centre = f.map_T_base[:3, :3], f.map_T_base[:3, 3]
+    moved = _carried(f.position - centre)
+    own = np.diagonal(f.covariance)[f.head :].reshape(-1, 3).sum(axis=1)
+    mixed = np.einsum("nip,pni->n", moved, f.covariance[:POSE, f.head :].reshape(POSE, -1, 3))
+    spread = np.maximum(own - 2 * mixed + ((moved @ f.covariance[:POSE, :POSE]) * moved).sum(axis=(1, 2)), 0.0)
+    to = f.position - (centre + sight.offset[ray] @ turn.T)[:, None]
+    distance = np.maximum(np.linalg.norm(to, axis=2), _LEAST_DISTANCE)
+    ahead = np.einsum("ri,rni->rn", sight.direction[ray] @ turn.T, to) / distance
+    across = np.where(ahead > 0, 1 - ahead**2, 2 * BEHIND**2)
+    off = np.nan_to_num((sight.range[ray][:, None] - distance) ** 2)
+    near = off <= gate * (spread + np.nan_to_num(sight.range_sigma[ray])[:, None] ** 2)
+    return np.asarray(near & (across <= gate * (spread / distance**2 + sight.sigma[ray][:, None] ** 2)))
+
+
 def joint_covariance(f: Filter, expected: Expected) -> Floats:
     """Return the covariance (P, 3, P, 3) of all residuals. Their noise is independent, because at most one pair of a ray is
     true."""

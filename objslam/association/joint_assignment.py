@@ -50,6 +50,10 @@ def assign_jointly(pairings: Pairings) -> JointAssignment:
         return none
     odds = _odds(pairings, pairings.residual, _blocks(pairings.covariance))
     allowed = np.isfinite(odds)
+    if _is_unambiguous(pairings, allowed):
+        whole = _whole(pairings, np.flatnonzero(allowed))
+        if whole is not None:
+            return whole
     chosen, best = _best(pairings, odds, allowed)
     if len(chosen) == 0:
         return none
@@ -60,6 +64,32 @@ def assign_jointly(pairings: Pairings) -> JointAssignment:
         others, second = _best(pairings, odds, without)
         margin[i], rival[i] = best - second, pairings.row[pairing] in pairings.row[others]
     return JointAssignment(chosen, margin, rival, best)
+
+
+def _is_unambiguous(pairings: Pairings, allowed: Bools) -> bool:
+    """Return whether no two allowed pairings (P,) share a measurement or a landmark."""
+    return bool(allowed.any()) and all(np.bincount(n[allowed]).max() == 1 for n in (pairings.row, pairings.column))
+
+
+def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
+    """Return the hypothesis with the pairings `which` (n,), None if it is better without one of them.
+
+    The inverse of the covariance gives each residual's deviation and covariance, given all others. So nothing has to grow.
+    """
+    residual, rarity = pairings.residual[which], pairings.rarity[which]
+    size, dimension = residual.shape
+    covariance = pairings.covariance[which][:, :, which].reshape(size * dimension, -1)
+    precision = np.linalg.inv(covariance)
+    pull = (precision @ residual.ravel()).reshape(size, dimension)
+    each = np.arange(size)
+    given_others = precision.reshape(size, dimension, size, dimension)[each, :, each]
+    squared = np.einsum("pi,pi->p", pull, np.linalg.solve(given_others, pull[..., None])[..., 0])
+    margin = rarity - 0.5 * (squared - np.linalg.slogdet(given_others / (2 * np.pi))[1])
+    if not ((squared <= pairings.gate) & (margin > 0)).all():
+        return None
+    spread = np.linalg.slogdet(2 * np.pi * covariance)[1]
+    odds = float(rarity.sum() - 0.5 * (residual.ravel() @ pull.ravel() + spread))
+    return JointAssignment(which, margin, np.zeros(size, dtype=bool), odds)
 
 
 def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float]:

@@ -138,8 +138,10 @@ class _Exploration:
         self.hits[mine] += 1
 
     def _match(self, rays: Ints) -> None:
-        row, column = np.nonzero(self.rays.label[rays][:, None] == self.label)
-        f, expected = self.filter, ekf.Expected.of(self.filter, self.sight, rays[row], column)
+        f = self.filter
+        reach = ekf.within_reach(f, self.sight, rays, SAME_POINT_WIDE)
+        row, column = np.nonzero(reach & (self.rays.label[rays][:, None] == self.label))
+        expected = ekf.Expected.of(f, self.sight, rays[row], column)
         alone = ekf.individual_covariances(f, expected)
         squared = np.einsum("pi,pi->p", expected.residual, np.linalg.solve(alone, expected.residual[..., None])[..., 0])
         near = _likeliest(squared)

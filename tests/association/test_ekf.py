@@ -116,3 +116,21 @@ def test_tied_landmarks_come_together_and_others_can_be_dropped():
     ekf.keep(f, np.arange(len(f)) != 0)
     np.testing.assert_array_equal(f.position, left)
     assert f.covariance.shape == (f.head + 3 * len(f),) * 2
+
+
+@pytest.mark.parametrize("ranged", [True, False])
+def test_every_pair_within_the_gate_is_within_reach(ranged):
+    gate, left_out = 16.0, 0
+    for seed in range(20):
+        f, _ = drive(seed)
+        rng = np.random.default_rng(seed)
+        true = moved(f.map_T_base, PRIOR * rng.standard_normal(3))
+        sight = sight_from(true, f.position + 0.2 * rng.standard_normal(f.position.shape), rng, ranged)
+        row, column = np.divmod(np.arange(len(f) ** 2), len(f))
+        expected = ekf.Expected.of(f, sight, row, column)
+        spread = ekf.individual_covariances(f, expected)
+        squared = np.einsum("pi,pij,pj->p", expected.residual, np.linalg.inv(spread), expected.residual)
+        reach = ekf.within_reach(f, sight, np.arange(len(f)), gate)[row, column]
+        assert reach[squared <= gate].all()
+        left_out += int((~reach).sum())
+    assert left_out > 20 * 8  # of 20 x 64 pairs

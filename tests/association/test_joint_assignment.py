@@ -51,6 +51,26 @@ def test_the_odds_are_those_of_the_best_of_all_hypotheses():
         assert found.odds >= multivariate_normal(np.zeros(6), truth).logpdf(right.ravel()) + 6.0 - 1e-9
 
 
+def test_margins_of_pairings_without_rivals_are_those_over_all_hypotheses():
+    rng = np.random.default_rng(1)
+    compared = 0
+    for _ in range(40):
+        residual = 0.3 * rng.standard_normal(2) + 0.03 * rng.standard_normal((4, 2))
+        every = pairings(range(4), range(4), residual, shared(residual, 0.3, 0.03), 2.0)
+        found = assign_jointly(every)
+        assert found.odds <= best_of_all(every) + 1e-9
+        if len(found.chosen) < 4:
+            continue
+        assert found.odds >= best_of_all(every) - 1e-9
+        for i, margin in zip(found.chosen.tolist(), found.margin, strict=True):
+            kept = [n for n in range(4) if n != i]
+            others = pairings(kept, kept, residual[kept], shared(residual[kept], 0.3, 0.03), 2.0)
+            np.testing.assert_allclose(margin, found.odds - best_of_all(others), atol=1e-9)
+        assert not found.rival.any()
+        compared += 1
+    assert compared > 20
+
+
 def test_one_common_error_is_no_hindrance_and_different_errors_are():
     """Two residuals of 3 standard deviations: in one direction they are one error of the pose, else one is wrong."""
     same, opposite = np.array([[0.3, 0.0], [0.3, 0.0]]), np.array([[0.3, 0.0], [-0.3, 0.0]])
