@@ -123,7 +123,7 @@ rm -f "$stamp"
 system_libraries
 say "installing objslam and what it needs into .venv (the first time, this takes some minutes)"
 small_torch
-extras=
+extras="[open3d,torch]"
 [ "$want" = run ] || extras="[dev]"
 # compat: a path that mypy and editors follow too; the default is an import hook that only Python sees
 pip_install --config-settings editable_mode=compat --editable "$root$extras" || die "pip could not install everything: see above (the network is needed for the first set-up)"

@@ -9,6 +9,8 @@ from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
+from objslam.core.geometry import evenly_spread
+from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
@@ -16,6 +18,8 @@ _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distance
 _CORE_SHARE = 0.8  # The strongest objects, with this share of a class's boxes, set its distances. Others may be phantoms.
 _FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
 _CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it: in m, and as a share of its distance.
+_SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. More are finer.
+_SAME_SIDE = np.cos(np.radians(45.0))  # The cosine of the turn within which a side looks alike. A smaller one counts more.
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
 
 
@@ -99,27 +103,58 @@ def detection_history(
     return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
 
 
+def seen_from(position: Floats, origins: Floats) -> SeenFrom:
+    """Return from where an object at a position (3,) was detected by cameras at origins (n, 3), m."""
+    toward = origins - position
+    distance = np.linalg.norm(toward, axis=1)
+    sides = thinned(toward / np.maximum(distance, MIN_DEPTH)[:, None])
+    return SeenFrom(round(float(distance.min()), 3), round(float(distance.max()), 3), sides)
+
+
+def thinned(directions: Floats) -> Floats:
+    """Return the mean direction (S, 3) of each group of unit directions (n, 3). The groups are about 20 degrees wide."""
+    cell = (directions @ evenly_spread(_SIDES).T).argmax(axis=1)
+    number, group = np.unique(cell, return_inverse=True)
+    mean = grouped_sums(directions, group.ravel(), len(number))
+    return np.asarray(np.round(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9), 4))
+
+
 def count_looks(
-    position: Floats, extent: Floats, seen_from: Floats, view: CameraFrames, obs: Observations, distance: Floats
+    position: Floats, extent: Floats, known: list[SeenFrom], view: CameraFrames, obs: Observations, distance: Floats
 ) -> Ints:
     """Return in how many frames (N,) each object of a map should be detected if it is where the map says.
 
-    Its box lies in the image, its distance is one from which it was detected before, and no closer box covers it.
-    extent: (N, 2) m, NaN where unknown. seen_from: (N, 2) m, the least and the greatest distance. obs: the boxes of the
-    frames. distance: (R,) m, how far their objects are, NaN where unknown.
+    Its box lies in the image, it is seen from a distance and from a side from which it was detected before, and no closer
+    box covers it. extent: (N, 2) m, NaN where unknown. known: for each object from where it was detected, with the sides in
+    the frame of the positions. obs: the boxes of the frames. distance: (R,) m, how far their objects are, NaN where unknown.
     """
+    near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
     found = np.zeros(len(position), dtype=np.int64)
     for number, camera in enumerate(view.cameras):
         frames = np.flatnonzero(view.camera == number)
         step = max(1, _PAIRS_AT_ONCE // max(len(position), 1))
         for begin in range(0, len(frames), step):
             some = frames[begin : begin + step]
-            obj, frame, away, pixel = _in_image(position, np.nan_to_num(extent), seen_from[:, 1], camera, some, view)
-            usual = away >= seen_from[obj, 0]
+            obj, frame, away, pixel = _in_image(position, np.nan_to_num(extent), far, camera, some, view)
+            usual = away >= near[obj]
+            usual &= _from_known_sides(obj, view.map_T_camera[frame, :3, 3] - position[obj], known)
             obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
             clear = ~_hidden(frame, away, pixel, obs, distance)
             found += np.bincount(obj[clear], minlength=len(position))
     return found
+
+
+def _from_known_sides(obj: Ints, toward: Floats, known: list[SeenFrom]) -> Bools:
+    """Return whether each camera, at `toward` (V, 3) m from its object (V,), sees a side that was detected before."""
+    toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    order = np.argsort(obj, kind="stable")
+    bounds = np.searchsorted(obj[order], np.arange(len(known) + 1))
+    seen = np.zeros(len(obj), dtype=bool)
+    for j, one in enumerate(known):
+        mine = order[bounds[j] : bounds[j + 1]]
+        if len(mine) and len(one.sides):
+            seen[mine] = (toward[mine] @ one.sides.T).max(axis=1) >= _SAME_SIDE
+    return seen
 
 
 def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:

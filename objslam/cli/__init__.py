@@ -17,8 +17,7 @@ from objslam.cli.export import export
 from objslam.cli.info import info
 from objslam.cli.journal import journal_app
 from objslam.cli.live_command.command import live
-from objslam.cli.merge import diff_results, merge_results
-from objslam.cli.register import register_results
+from objslam.cli.maps import diff_results, merge_results, register_results
 from objslam.cli.report import report_result
 from objslam.cli.run import run
 from objslam.cli.view import view

@@ -15,4 +15,4 @@ Device = Literal["auto", "cpu", "cuda"]
 class Section(BaseModel):
     """Hold one section of the settings. A section is immutable and rejects unknown keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from types import ModuleType
 from typing import Any, Literal
 
@@ -28,14 +29,18 @@ Backend = Literal["numpy", "cpu", "cuda"]
 def array_backend(device: str, large: bool) -> Iterator[Backend]:
     """Give the backend for the setting `triangulation.device`, and prepare its library.
 
-    A batch that is not `large` runs in numpy, without an import of torch. The setting "auto" gives a large one to CUDA if
-    torch sees a CUDA device. The setting "cuda" always gives CUDA, and raises ConfigError if torch sees no CUDA device.
+    A batch that is not `large` runs in numpy, without an import of torch. If torch is not installed, every batch does. The
+    setting "auto" gives a large one to CUDA if torch sees a CUDA device. The setting "cuda" always gives CUDA, and raises
+    ConfigError if torch is not installed or sees no CUDA device.
 
     numpy does not warn of divisions by zero, as torch does not. torch gets one thread, because a thread pool waits actively
     while other processes need the cores. On two cores, one of which was busy, a run took 4 s with one thread and up to 18 s
     with two.
     """
-    if device != "cuda" and not large:
+    installed = find_spec("torch") is not None
+    if device == "cuda" and not installed:
+        raise ConfigError("triangulation.device=cuda needs torch", hint='pip install "objslam[torch]"')
+    if not installed or (device != "cuda" and not large):
         with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
             yield "numpy"
         return

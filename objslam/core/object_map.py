@@ -31,6 +31,19 @@ COLUMNS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
+class SeenFrom:
+    """From where an object was detected.
+
+    near, far: the least and the greatest distance, m. sides: (S, 3) unit directions from the object to the cameras, in the
+    frame of the map, about 20 degrees apart.
+    """
+
+    near: float
+    far: float
+    sides: Floats
+
+
+@dataclass(frozen=True)
 class Life:
     """What several sessions say of one object.
 
@@ -57,8 +70,8 @@ class MapObject:
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
     the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
     rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
-    existence are None if the run took all boxes of a label as one object. seen_from: the least and the greatest distance (m)
-    from which it was detected, None if unknown. life: what several sessions say of it, None if there was one.
+    existence are None if the run took all boxes of a label as one object. seen_from: from where it was detected, None if
+    unknown. life: what several sessions say of it, None if there was one.
     """
 
     id: int
@@ -76,7 +89,7 @@ class MapObject:
     ray: tuple[Floats, Floats] | None = None
     labels: dict[str, float] | None = None
     existence: float | None = None
-    seen_from: tuple[float, float] | None = None
+    seen_from: SeenFrom | None = None
     life: Life | None = None
 
     @property

@@ -18,7 +18,7 @@ def read_images(path: Path, ledger: Ledger) -> Images:
     """
     inside = Inside(path.parent)
     name = path.name
-    stamps, files, places = [], [], []
+    stamps, files, places, gone = [], [], [], 0
     lines = read_lines(path, ledger)
     for number, text in lines:
         place = f"{path}:{number}"
@@ -31,6 +31,7 @@ def read_images(path: Path, ledger: Ledger) -> Images:
         file = path.parent / relative
         outside = relative.is_absolute() or ".." in relative.parts
         reason = "leaves the folder" if outside else inside.reason_against(file)
+        gone += reason == "leaves the folder"
         if reason is not None:
             ledger.drop(f"{name} line whose file {reason}", where=place)
             continue
@@ -42,7 +43,10 @@ def read_images(path: Path, ledger: Ledger) -> Images:
     drop_rows(f"{name} line with a stamp that repeats or goes back", ~forward, places, ledger)
     if not forward.any():
         state = f"none of its {len(lines)} lines leads to an image" if lines else "nothing in it"
-        raise LogError(state, where=str(path), hint='a line is "stamp path", the path relative to this file')
+        hint = 'a line is "stamp path", the path relative to this file'
+        if gone:
+            hint = "images outside the log, also behind a link, are not read: copy them into the log (cp -r, or cp -rl)"
+        raise LogError(state, where=str(path), hint=hint)
     return Images(times[forward], tuple(files[i] for i in np.flatnonzero(forward)))
 
 

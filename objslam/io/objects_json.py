@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.object_map import FATES, Life, MapObject, ObjectMap
+from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
@@ -102,7 +102,7 @@ def _entry(o: MapObject) -> dict[str, Any]:
     if o.existence is not None:
         entry["existence"] = float(o.existence)
     if o.seen_from is not None:
-        entry["seen_from"] = [float(x) for x in o.seen_from]
+        entry["seen_from"] = {**vars(o.seen_from), "sides": o.seen_from.sides.tolist()}
     if o.life is not None:
         moved = o.life.moved_from
         entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
@@ -207,16 +207,21 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         ray=ray,
         labels=labels,
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
-        seen_from=None if entry.get("seen_from") is None else _distances(entry["seen_from"]),
+        seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
     )
 
 
-def _distances(value: Any) -> tuple[float, float]:
-    near, far = _vector(value, "seen_from", 2).tolist()
+def _seen_from(value: Any) -> SeenFrom:
+    if not isinstance(value, dict) or not isinstance(value.get("sides"), list):
+        raise _Malformed("seen_from must have near, far and a list of sides")
+    near, far = (_number(value.get(name), f"seen_from.{name}") for name in ("near", "far"))
     if not 0 <= near <= far < MAX_POSITION:
-        raise _Malformed("seen_from must be the least and the greatest distance in metres")
-    return near, far
+        raise _Malformed("seen_from must go from a least to a greatest distance in metres")
+    sides = np.array([_vector(side, "a side of seen_from") for side in value["sides"]]).reshape(-1, 3)
+    if not (np.abs(np.linalg.norm(sides, axis=1) - 1) < _UNIT).all():
+        raise _Malformed("a side of seen_from must have the length 1")
+    return SeenFrom(near, far, sides)
 
 
 def _life(value: Any) -> Life:

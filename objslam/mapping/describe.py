@@ -2,12 +2,14 @@
 
 import importlib.metadata
 import platform
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from objslam.association.observations import extents
+from objslam.association.visibility import seen_from
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
@@ -105,16 +107,10 @@ def describe(
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
-                seen_from=_distances(estimate.positions[j], origins[kept]) if known else None,
+                seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
-
-
-def _distances(position: Floats, origins: Floats) -> tuple[float, float]:
-    """Return the least and the greatest distance (m) of a position (3,) from the origins (n, 3) of its rays."""
-    distance = np.linalg.norm(origins - position, axis=1)
-    return round(float(distance.min()), 3), round(float(distance.max()), 3)
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
@@ -143,7 +139,6 @@ def summarise(
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
-    packages = ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d")
     return {
         "log": name,
         "log_path": None if path is None else str(path),
@@ -173,9 +168,15 @@ def summarise(
         "cost_after": estimate.cost_after,
         "iterations": estimate.iterations,
         "seconds": seconds,
-        "versions": {
-            "python": platform.python_version(),
-            **{package: importlib.metadata.version(package) for package in packages},
-        },
+        "versions": _versions(),
         "warnings": list(ledger.warnings),
     }
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide a result, without those that are not installed."""
+    found = {"python": platform.python_version()}
+    for package in ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d"):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[package] = importlib.metadata.version(package)
+    return found

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 
@@ -34,6 +35,10 @@ from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
+from objslam.mapping.views import solved_views
+
+_LIBRARIES = ("cv2", "gtsam", "scipy.linalg", "scipy.sparse", "scipy.special")
+"""The libraries of every solve. They load in a stage of their own, because this takes longer than a small solve."""
 
 
 def run(
@@ -54,6 +59,9 @@ def run(
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
+    with _stage("load", seconds, progress):
+        for library in _LIBRARIES:
+            import_module(library)
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:
@@ -143,15 +151,8 @@ def run(
         surface=surface,
         surface_before=before,
         residual_before=residual_before,
-        views=_views(log, settings, path_after),
+        views=solved_views(log, settings, path_after),
     )
-
-
-def _views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
-    """Return all camera frames of a log without errors, at the poses of the solved path."""
-    frames = build_keyframes(log, settings, Ledger())
-    at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
-    return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -70,7 +70,7 @@ def reconstruct(
     try:
         return _fuse(shots, tuple(c.camera for c in log.cameras), settings, ledger, progress)
     except ImportError as error:
-        ledger.warn(f"no reconstruction: Open3D cannot be imported ({error}); tools/setup.sh names the libraries it needs")
+        ledger.warn(f'no reconstruction: Open3D cannot be imported ({error}); pip install "objslam[open3d]"')
     except RuntimeError as error:  # Open3D raises it, for example if a GPU is out of memory.
         reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # Without colour codes and signature.
         ledger.warn(f"no reconstruction: Open3D failed ({reason})")

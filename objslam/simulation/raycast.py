@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera, in_field, project, undistort
 from objslam.core.geometry import inverse
+from objslam.errors import ObjslamError
 from objslam.simulation.furniture import Room
 
 Reals = NDArray[np.floating]
@@ -182,15 +183,22 @@ def _unit(v: Reals) -> Reals:
     return np.asarray(v / np.sqrt(_dot(v, v) + np.float32(1e-12))[..., None])
 
 
-def _tensor(values: NDArray[Any]) -> Any:
-    import open3d as o3d
+def _open3d() -> Any:
+    try:
+        import open3d
+    except ImportError as error:
+        hint = 'pip install "objslam[open3d]", or render nothing: objslam demo --boxes'
+        raise ObjslamError(f"Open3D, which renders the drive, cannot be imported ({error})", hint=hint) from error
+    return open3d
 
+
+def _tensor(values: NDArray[Any]) -> Any:
+    o3d = _open3d()
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values))
 
 
 def _scene(room: Room, chosen: Any) -> Any:
-    import open3d as o3d
-
+    o3d = _open3d()
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     for p in chosen:
         part = room.parts[p]

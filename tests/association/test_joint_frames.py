@@ -71,3 +71,20 @@ def test_one_map_alone_stays_as_it_is():
     found = solve_frames(measured, frames, len(points))
     np.testing.assert_allclose(found.positions, measured.position[np.argsort(measured.object)])
     np.testing.assert_allclose(found.covariance, np.tile(SIGMA**2 * np.eye(3), (len(points), 1, 1)))
+
+
+def test_a_map_that_is_worse_than_it_says_counts_less():
+    rng = np.random.default_rng(4)
+    worse, even, factors = [], [], []
+    for _ in range(20):
+        points, frames, measured = scene(rng, maps=4, count=30)
+        bad = measured.map == 2
+        position = measured.position + bad[:, None] * rng.normal(0, 4 * SIGMA, measured.position.shape)
+        found = solve_frames(Measured(measured.map, measured.object, position, measured.covariance), frames, len(points))
+        factors.append(found.noise)
+        known = measured.covariance * np.where(bad, 17.0, 1.0)[:, None, None]  # What would be right to claim.
+        best = solve_frames(Measured(measured.map, measured.object, position, known), frames, len(points))
+        worse += np.linalg.norm(found.positions - points, axis=1).tolist()
+        even += np.linalg.norm(best.positions - points, axis=1).tolist()
+    assert (np.mean(factors, axis=0)[2] > 3 * np.mean(factors, axis=0)[[0, 1, 3]]).all()
+    assert np.mean(worse) < 1.15 * np.mean(even)

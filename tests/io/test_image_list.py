@@ -97,6 +97,15 @@ def test_a_folder_reached_through_a_link_is_itself_fine(folder, tmp_path):
     assert not ledger.lines()
 
 
+def test_images_behind_a_link_are_refused_with_the_remedy(folder, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.png").write_bytes(b"")
+    (folder / "linked").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(LogError, match="leads to an image") as caught:
+        _read(folder, "1 linked/a.png\n")
+    assert "cp -rl" in caught.value.hint
+
+
 @pytest.mark.parametrize("text", ["", "# nothing\n", "1 missing.png\n"])
 def test_no_image_left(folder, text):
     with pytest.raises(LogError, match=r"nothing in it|leads to an image") as caught:

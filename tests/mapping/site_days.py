@@ -3,7 +3,7 @@
 import numpy as np
 
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.session import Session
 
 LABELS = ("cup", "book", "chair", "plant", "bottle", "bag", "lamp", "box")
@@ -51,7 +51,7 @@ class Place:
 class Day(Session):
     """A session in which 60 frames have an object in view, but for one in ten objects, in place of cameras."""
 
-    def looks(self, objects, positions):
+    def looks(self, objects, positions, session_T_map):
         drawn = np.random.default_rng(int(self.when)).random(len(objects)) < 0.9
         return np.where(drawn, 60, 0)
 
@@ -69,6 +69,6 @@ def session(place, day, wrong_label=0.05, missed=0.05, phantoms=1.0):
         said = label if rng.random() > wrong_label else LABELS[rng.integers(len(LABELS))]
         share = {said: 0.9} | {name: 0.1 for name in share if name != said}
         begin, cov, size = day * DAY, SIGMA**2 * np.eye(3), (0.2, 0.3)
-        more = {"labels": share, "existence": 0.95, "seen_from": (0.5, 5.0)}
+        more = {"labels": share, "existence": 0.95, "seen_from": SeenFrom(0.5, 5.0, np.eye(3))}
         found.append(MapObject(len(found), said, noisy, cov, "ok", 30, 30, 60.0, 0.3, begin, begin + 600.0, size, **more))
     return Day(f"day {day}", ObjectMap(tuple(found))), own

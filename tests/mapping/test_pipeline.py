@@ -119,7 +119,7 @@ def test_progress_is_told_by_stage():
     told = []
     run(small_log(localization=None), "joint", progress=lambda *step: told.append(step))
     stages = [stage for stage, _, _ in told]
-    assert stages[0] == "rays"
+    assert stages[0] == "load"
     assert "solve" in stages
     assert all(0 <= done <= max(total, done) for _, done, total in told)
     assert any(total and done == total for _, done, total in told)

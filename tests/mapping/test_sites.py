@@ -55,7 +55,7 @@ def quiet(place, day):
 class Sees(Day):
     """A session that had every place in view."""
 
-    def looks(self, objects, positions):
+    def looks(self, objects, positions, session_T_map):
         return np.full(len(objects), 60)
 
 

@@ -4,9 +4,12 @@ Each map measures its objects in a frame of its own. A frame has x, y, z and yaw
 frame is the frame of the result. Gauss-Newton steps eliminate the objects first, each of which is a block of its own (Schur
 complement), so that a step costs as much as the measurements and the cube of the few frames. Cauchy's weights limit the
 influence of an object that a map has at another place.
+
+A map may be worse than it says. Where at least three maps overlap, the residuals tell: the noise of each map is estimated
+against that of the others (variance components; Helmert 1907, Foerstner 1979), and a worse map counts less.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +19,15 @@ from objslam.core.statistics import HALF_RAY
 
 _STEPS = 30
 """The most Gauss-Newton steps. More are slower. Fewer than ten are usual from a registration."""
+_ROUNDS = 10
+"""How often the noise of the maps is estimated, each time followed by a solve. More are slower, and change it less."""
+_SAME_NOISE = 0.02
+"""The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
+_FEWEST_MAPS = 3
+"""The least number of maps whose residuals tell which of them is worse. Two maps miss each other alike."""
+_POOLED = 10.0
+"""How many numbers of a map its claimed covariances count for, against its residuals. A larger value trusts the claims
+longer. At 10, a map of a few objects keeps its claims, and one of a few dozen is judged by its residuals."""
 _STILL = 1e-9
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
 
@@ -35,7 +47,8 @@ class JointFrames:
     """S frames and N objects in the frame of the first map.
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
-    (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1].
+    (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1]. noise: (S,) the factor on
+    the variance of each map against that of all maps, 1 where the residuals do not tell.
     """
 
     site_T_map: Floats
@@ -43,6 +56,7 @@ class JointFrames:
     positions: Floats
     covariance: Floats
     weight: Floats
+    noise: Floats
 
 
 def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFrames:
@@ -51,6 +65,36 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFra
     Each frame must share at least two objects with the others, directly or through other frames. Else its covariance is not
     finite.
     """
+    noise = np.ones(len(site_T_map))
+    found = _solve(measured, site_T_map, count, noise)
+    if len(site_T_map) < _FEWEST_MAPS:
+        return found
+    for _ in range(_ROUNDS):
+        noise = _noise(measured, found)
+        if np.abs(noise / found.noise - 1).max() < _SAME_NOISE:
+            break
+        found = _solve(measured, found.site_T_map, count, noise)
+    return found
+
+
+def _noise(measured: Measured, found: JointFrames) -> Floats:
+    """Return the factor (S,) on the variance of each map, from its residuals and its share in the objects (redundancy)."""
+    rotation = found.site_T_map[measured.map, :3, :3]
+    moved = (rotation @ measured.position[..., None])[..., 0] + found.site_T_map[measured.map, :3, 3]
+    claimed = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
+    counted = claimed * (found.weight / found.noise[measured.map])[:, None, None]
+    total = _sums(counted, measured.object, len(found.positions))
+    share = np.trace(counted @ np.linalg.inv(total)[measured.object], axis1=1, axis2=2)
+    miss = found.positions[measured.object] - moved
+    squares = found.weight * np.einsum("ri,rij,rj->r", miss, claimed, miss)
+    maps = len(found.noise)
+    free, own = np.bincount(measured.map, 3 - share, maps), np.bincount(measured.map, squares, maps)
+    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # What all maps claim too much or too little.
+    return np.asarray((own / level + _POOLED) / (free + _POOLED))
+
+
+def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats) -> JointFrames:
+    measured = replace(measured, covariance=measured.covariance * noise[measured.map, None, None])
     frames = len(site_T_map)
     x = np.column_stack([site_T_map[:, :3, 3], split_se2(site_T_map)[0][:, 2]])
     weight = np.ones(len(measured.object))
@@ -85,7 +129,7 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFra
     poses[:, 2, 3] = x[:, 2]
     blocks = np.array([spread[4 * s : 4 * s + 4, 4 * s : 4 * s + 4] for s in range(frames)])
     symmetric = np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
-    return JointFrames(poses, blocks, np.asarray(positions), symmetric, weight)
+    return JointFrames(poses, blocks, np.asarray(positions), symmetric, weight, noise)
 
 
 def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:

@@ -12,15 +12,16 @@ from typing import Self
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
 from objslam.core.geometry import exp_se3
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
+from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
-from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem, linearise
+from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
 from objslam.graph.optimizers import build_graph, gauss_newton
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
@@ -41,13 +42,15 @@ _LEAST_SIGNAL = 0.05
 _RIDGE = 1e-9
 """The share of the information about the clocks that is added to its diagonal. It prevents a division by zero if a log
 cannot tell two clocks apart. A larger share mixes such clocks more."""
-_MEMORY = 3
-"""The number of earlier steps that Anderson's acceleration uses. A larger number extrapolates farther, and less safely."""
 
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
+
+_SAME_SHARES = 0.5
+"""The relative change of the noise below which the shares of noise in the information stay as they were. These shares change
+slowly with the noise, and take two inner solves for each clock. A larger value measures them less often."""
 
 _LEAST_GROWTH = 0.5
 """If all scales grow by 1, the linearised map must grow at least by this, or the projection is not used. An exact map would
@@ -93,30 +96,45 @@ def calibrate(
     """
     fit = _Fit(errors, measure, trace)
     state = _State.of(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
-    theta, state, noisy, steps = fit.shared_errors(state, theta)
+    at = fit.shared_errors(state, theta)
+    state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
-        system = linearise(state, fit.errors, theta)
-        noise = estimate_noise(state, system, fit.errors, theta, fit.prior_residuals)
-        same = noise.like(fit.errors.noise, _SAME_NOISE)
+        noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
+        before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         fit = replace(fit, errors=fit.errors.with_noise(noise))
         state = fit.remeasured(state, theta).settled()
         if same:
             break
-        theta, state, noisy, more = fit.shared_errors(state, theta)
-        steps += more
+        at = fit.shared_errors(state, theta, at.noisy if noise.like(before, _SAME_SHARES) else None)
+        state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
     system = linearise(state, fit.errors, theta)
     reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
     prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
-    _, covariance = _curvature(reduced.information, noisy, prior, correlation_factors(state, system))
+    _, covariance = _curvature(reduced.information, at.noisy, prior, correlation_factors(state, system))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     by_landmark = (len(state.landmarks), 3, len(theta))
     sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
     return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The parameters theta (P,) that fit best, and the solution at them.
+
+    system: of the solution. noisy: (P, P) the shares of noise in the information that the search took. steps: how many it
+    took.
+    """
+
+    theta: Floats
+    state: _State
+    system: LinearSystem
+    noisy: Floats
+    steps: int
 
 
 @dataclass(frozen=True)
@@ -132,14 +150,13 @@ class _Fit:
         """The number of residuals for which the nominal noise counts."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: _State, theta: Floats) -> tuple[Floats, _State, Floats, int]:
-        """Return the best parameters (P,), the solution at them, the shares of noise (P, P), and the number of steps."""
+    def shared_errors(self, state: _State, theta: Floats, noisy: Floats | None = None) -> _Found:
+        """Return the parameters that fit best, from theta (P,) on. noisy: (P, P) the shares of noise, if they are known."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
-        noisy = np.zeros((len(theta), len(theta)))
-        if len(theta) == 0:
-            return theta, state, noisy, 0
         sigma = np.sqrt(np.diagonal(errors.prior))
+        if len(theta) == 0:
+            return _Found(theta, state, linearise(state, errors, theta), errors.prior, 0)
 
         def deviation(values: Floats) -> float:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
@@ -147,32 +164,38 @@ class _Fit:
 
         history: list[tuple[Floats, Floats]] = []
         steps = 0
-        while steps < _ROUNDS:
-            system = _without_shrinking(state, linearise(state, errors, theta).reduce(), errors, theta)
-            if steps == 0:
-                noisy = self.noise_shares(state, system, theta)
+        while True:
+            linear = linearise(state, errors, theta)
+            system = _without_shrinking(state, linear.reduce(), errors, theta)
+            noisy = self.noise_shares(state, system, theta) if noisy is None else noisy
+            if steps == _ROUNDS:
+                break
             curvature, covariance = _curvature(system.information, noisy, prior)
             step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
             pull = system.gradient - system.descent
-            if (np.abs(step) < _CONVERGED * np.sqrt(np.diagonal(covariance))).all():
+            deviations = np.sqrt(np.diagonal(covariance))
+            if (np.abs(step) < _CONVERGED * deviations).all():
                 break
-            history = [*history[-_MEMORY:], (theta, step)]
-            target = _accelerated(history, sigma)
-            begin, before = theta, state.cost + deviation(theta)
+            history = [*history[-MEMORY:], (theta, step)]
+            target = accelerated(history, sigma)
+            before, better = state.cost + deviation(theta), None
             for _ in range(_HALVINGS + 1):
                 other = np.clip(target, -errors.bounds, errors.bounds)
-                trial = state.moved(system, other - theta, self.measure(*errors.at(other)))
-                if trial.cost + deviation(other) - pull @ (other - begin) <= before:
+                trial = state.predicted(system, other - theta, self.measure(*errors.at(other))).solved()
+                if trial.cost + deviation(other) - pull @ (other - theta) <= before:
+                    better = trial
                     break
                 target, history = theta + (target - theta) / 2, []
-            else:
+                if (np.abs(target - theta) < _CONVERGED * deviations).all():
+                    break
+            if better is None:
                 break
-            theta, state, steps = other, trial.settled(), steps + 1
+            theta, state, steps = other, better.settled(), steps + 1
             if self.trace is not None:
                 self.trace.base_T_camera = state.measured.keyframes.base_T_camera
-                moved = Parameters(errors.names, theta, np.sqrt(np.diagonal(covariance)))
+                moved = Parameters(errors.names, theta, deviations)
                 self.trace.iteration("solve", state.cost, state.map_T_camera, state.positions, moved)
-        return theta, state, noisy, steps
+        return _Found(theta, state, linear, noisy, steps)
 
     def noise_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
         """Return the part of the information (P, P) that comes from noise, as shares of its diagonal.
@@ -202,15 +225,13 @@ class _Fit:
 
     def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
         """Return the gradient by some parameters at the optimum after a step (P,) of the parameters."""
-        side = state.moved(system, step, self.measure(*self.errors.at(theta + step)))
+        side = state.predicted(system, step, self.measure(*self.errors.at(theta + step))).solved()
         return linearise(side, self.errors, theta + step, which).reduce().gradient
 
     def remeasured(self, state: _State, theta: Floats) -> _State:
         """Return the optimum for the measurements with the present noise."""
         measured = self.measure(*self.errors.at(theta))
-        return _State.of(measured, state.association, state.map_T_camera, state.positions, state.used).solved(
-            state.landmarks
-        )
+        return _State.of(measured, state.association, state.map_T_camera, state.positions, state.used).solved()
 
 
 def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
@@ -264,19 +285,6 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
     return replace(system, gradient=project @ system.gradient, information=project @ system.information @ project.T)
 
 
-def _accelerated(history: list[tuple[Floats, Floats]], scale: Floats) -> Floats:
-    """Return the next parameters (P,) by Anderson's acceleration (Walker and Ni 2011, eq. 2.2) of the Gauss-Newton steps.
-
-    history: earlier parameters and their steps, the newest last. scale: (P,) the unit of each parameter.
-    """
-    theta, step = history[-1]
-    if len(history) < 2:
-        return theta + step
-    thetas, steps = (np.diff(np.array(part) / scale, axis=0).T for part in zip(*history, strict=True))
-    mix = np.linalg.lstsq(steps, step / scale, rcond=0.05)[0]
-    return np.asarray(theta + step - scale * ((thetas + steps) @ mix))
-
-
 @dataclass(frozen=True)
 class _State(Linearised):
     """A graph at its optimum for given parameters, and its cost."""
@@ -292,22 +300,22 @@ class _State(Linearised):
         values = make_values(map_T_camera, positions, landmarks)
         return cls(graph, values, measured, association, map_T_camera, positions, used, graph.error(values))
 
-    def moved(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
-        """Return the optimum for other measurements, predicted linearly for a step (P,) of the parameters."""
+    def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
+        """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
         landmarks = self.landmarks
         change = system.sensitivity @ step + system.newton
         positions = self.positions.copy()
         positions[landmarks] += change[: 3 * len(landmarks)].reshape(-1, 3)
         map_T_camera = self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6))
-        return type(self).of(measured, self.association, map_T_camera, positions, self.used).solved(landmarks)
+        return type(self).of(measured, self.association, map_T_camera, positions, self.used)
 
-    def solved(self, landmarks: Ints) -> Self:
-        """Return the state after a few iterations of the inner solve. landmarks: (m,) the landmarks in the graph."""
+    def solved(self) -> Self:
+        """Return the state after a few iterations of the inner solve."""
         optimum = gauss_newton(self.graph, self.values, _INNER, _TOLERANCE)
         return replace(
             self,
             map_T_camera=read_poses(optimum.values),
-            positions=with_points(self.positions, landmarks, optimum.values),
+            positions=with_points(self.positions, self.landmarks, optimum.values),
             values=optimum.values,
             cost=optimum.cost_after,
         )

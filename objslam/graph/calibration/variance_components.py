@@ -14,6 +14,7 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
@@ -77,17 +78,31 @@ def estimate_noise(
     jacobian, residual = system.jacobian.tocsr(), np.append(system.residual, root @ (theta - errors.mean))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), _PROBES))
     begin = errors.noise
-    noise = begin
+    noise, history = begin, list[tuple[Floats, Floats]]()
     for _ in range(_ITERATIONS):
         rescale = _rescaling(system, rows, begin, noise, len(system.residual))
         told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
         left = _left(sparse.csc_matrix(rescale @ jacobian), rescale @ system.sides, root, told)
         other = _updated(system, rows, noise, kinds, probes, left, prior_residuals)
-        done, noise = other.like(noise, _CONVERGED), other
-        if done:
+        if other.like(noise, _CONVERGED):
+            noise = other
             break
+        history = [*history[-MEMORY:], (_logarithms(noise), _logarithms(other) - _logarithms(noise))]
+        noise = _from_logarithms(accelerated(history, 1.0), other)
     force, curvature = shrinking_force(of)
     return replace(noise, shrinkage=min(force / curvature, _MOST_SHRINKAGE))
+
+
+def _logarithms(noise: NoiseFactors) -> Floats:
+    """The logarithms of the factors on noise, in which the iteration is close to linear."""
+    return np.log([factor for name, factor in noise.to_dict(None).items() if name != "shrinkage"])
+
+
+def _from_logarithms(logarithms: Floats, other: NoiseFactors) -> NoiseFactors:
+    """The noise with these logarithms of its factors, and the shrinkage of another."""
+    names = [name for name in other.to_dict(None) if name != "shrinkage"]
+    factors = np.clip(np.exp(logarithms), *_LIMITS)
+    return replace(other, **dict(zip(names, factors.tolist(), strict=True)))
 
 
 def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Rows:

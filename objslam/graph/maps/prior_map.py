@@ -6,8 +6,8 @@ of the drive does not know, such as the offsets of boxes. An object that the map
 P(j).
 
 The registration gives the start and the matches, and no factor, so that the map counts once. Its objects may share errors,
-and its file does not say which. The priors count as independent in the estimate. The covariance of the frame takes them as
-one shared error, so that many objects of a drifted map do not make the frame look sure.
+and its file does not say which. The priors count as independent in the estimate. The covariance of the frame also holds the
+largest error that all of them can share, so that many objects of a drifted map do not make the frame look sure.
 """
 
 from dataclasses import dataclass
@@ -99,7 +99,8 @@ def solve_in_map(
     frame = lift_se2(split_se2(found.atPose3(F0).matrix())[0])
     frame[2, 3] = found.atPose3(F0).matrix()[2, 3]
     pivot = anchor.mean(axis=0)
-    covariance, doubt, spread = _covariances(graph, found, there, index, weighted, frame, pivot)
+    covariance, spread = _covariances(graph, found, there, frame, pivot)
+    doubt = shared_at_most(anchor, prior, pivot)
     positions, seen, spreads = (
         np.full(a.shape, np.nan) for a in (estimate.positions, estimate.positions, estimate.covariance)
     )
@@ -110,7 +111,7 @@ def solve_in_map(
     positions[fixed] = seen[fixed]
     positions[there], spreads[there] = placed, _with_doubt(spread, placed, there, index, weighted, doubt, pivot)
     drive_T_base = estimate.map_T_base if measured is None else measured.map_T_base(read_poses(found))
-    return MappedDrive(frame, covariance, frame @ drive_T_base, seen, positions, spreads)
+    return MappedDrive(frame, covariance + doubt, frame @ drive_T_base, seen, positions, spreads)
 
 
 def _poses(estimate: Estimate, measured: Measurements | None) -> Floats:
@@ -148,39 +149,34 @@ def _unknown_to(
 
 
 def _covariances(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    there: Ints,
-    index: Ints,
-    prior: Floats,
-    frame: Floats,
-    pivot: Floats,
-) -> tuple[Floats, Floats, Floats]:
-    """Return the covariance (4, 4) of the frame at a pivot (3,) m, what shared errors add to it, and that of points P."""
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, there: Ints, frame: Floats, pivot: Floats
+) -> tuple[Floats, Floats]:
+    """Return the covariance (4, 4) of the frame at a pivot (3,) m, and that of the points P (n, 3, 3)."""
     try:
         marginals = gtsam.Marginals(graph, values)
         spread = np.array([marginals.marginalCovariance(P0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
-        joint = [marginals.jointMarginalCovariance([F0, P0 + j]) for j in index.tolist()]
         tangent = marginals.marginalCovariance(F0)
     except RuntimeError as error:
         raise indeterminate(error) from error
     to_pivot = np.zeros((4, 6))  # From the tangent of F, rotation first, to a shift of the pivot and a yaw.
     to_pivot[:3, 3:], to_pivot[3, 2] = values.atPose3(F0).rotation().matrix(), 1.0
     to_pivot[:3, 2] = _turned(pivot - frame[:3, 3])
-    gain = np.array([to_pivot @ j.at(F0, P0 + k) for j, k in zip(joint, index.tolist(), strict=True)]) @ np.linalg.inv(prior)
-    parts = gain @ prior @ np.swapaxes(gain, 1, 2)
-    doubt = shared_at_worst(parts) - parts.sum(axis=0)
-    return to_pivot @ tangent @ to_pivot.T + doubt, doubt, spread
+    return to_pivot @ tangent @ to_pivot.T, spread
 
 
-def shared_at_worst(parts: Floats) -> Floats:
-    """Return a bound (n, n) on the covariance of a sum of errors with covariances (M, n, n), however they are correlated.
+def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floats:
+    """Return the covariance (4, 4) of the largest error that all objects of a map can share: a shift (m) and a yaw (rad).
 
-    By Cauchy and Schwarz, it is the sum of parts / w for weights w that sum up to 1. Weights in proportion to the standard
-    deviations give the least trace. The bound is reached if one error moves all parts.
+    A shared error is part of the error of each object, so that no object can be known better. The shift has the covariance
+    of the object that is known best. The yaw turns about the pivot (3,) m, and moves no object by more than its deviation.
+    positions: (M, 3) m. covariance: (M, 3, 3) m^2.
     """
-    size = np.sqrt(np.maximum(np.trace(parts, axis1=1, axis2=2), 1e-300))
-    return np.asarray((parts * (size.sum() / size)[:, None, None]).sum(axis=0))
+    level = np.trace(covariance[:, :2, :2], axis1=1, axis2=2) / 2
+    lever = ((positions - pivot)[:, :2] ** 2).sum(axis=1)
+    shared = np.zeros((4, 4))
+    shared[:3, :3] = covariance[np.trace(covariance, axis1=1, axis2=2).argmin()]
+    shared[3, 3] = (level / np.maximum(lever, 1e-9)).min()
+    return shared
 
 
 def _with_doubt(

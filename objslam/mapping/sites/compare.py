@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from objslam.association.persistence import persistence
 from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import reason, register
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject
+from objslam.mapping.sites.lives import GONE, UNPROVEN
 from objslam.mapping.sites.merge import merge_sessions
 from objslam.mapping.sites.session import Session
 
 Outcome = Literal["confirmed", "moved", "gone", "new", "unseen"]
-"""What became of an object. `unseen`: the later session did not find it, and could not tell that it is gone."""
+"""What became of an object. `unseen`: only one of the two found it, and the other did not have its place in view."""
 OUTCOMES: tuple[Outcome, ...] = ("confirmed", "moved", "gone", "new", "unseen")
 """All outcomes, in the order in which they are told."""
 
@@ -52,21 +56,32 @@ def compare(a: Session, b: Session) -> Comparison:
     if not found.accepted:
         return Comparison(found, why, (), found.b_T_a)
     island = merge_sessions((a, b))[0]
-    changes = []
-    for item in (*island.objects, *island.objects.gone):
-        assert item.life is not None
-        changes.append(_change(item, island.seen_by[item.id]))
+    items = (*island.objects, *island.objects.gone)
+    before = _there_before(a, items)
+    changes = [
+        _change(item, island.seen_by[item.id], new=a.views is None or p < GONE)
+        for item, p in zip(items, before.tolist(), strict=True)
+    ]
     changes.sort(key=lambda one: (OUTCOMES.index(one.outcome), one.item.label, one.item.id))
     return Comparison(found, why, tuple(changes), island.site_T_session[island.sessions.index(1)])
 
 
-def _change(item: MapObject, seen_by: tuple[int, ...]) -> Change:
+def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
+    """Return the probability (N,) that each object was there in a session that did not find it, by what it had in view."""
+    looks = a.looks(items, np.array([o.position for o in items]).reshape(-1, 3), np.eye(4))
+    lives = np.array([(0, 0) if o.life is None else (o.life.looks, o.life.detections) for o in items]).reshape(-1, 2)
+    nobody = np.zeros(len(items), dtype=bool)
+    return persistence(np.full(len(items), UNPROVEN), np.zeros(len(items)), nobody, looks, lives[:, 0], lives[:, 1])
+
+
+def _change(item: MapObject, seen_by: tuple[int, ...], *, new: bool) -> Change:
+    """Return the change of one object. new: whether the earlier session would have found it, as far as that session says."""
     assert item.life is not None
     p = item.life.probability
     if item.life.state == "gone":
         return Change("gone", item, 1 - p)
     if item.life.state == "moved":
         return Change("moved", item, p)
-    if 1 not in seen_by:
-        return Change("unseen", item, p)
-    return Change("confirmed" if 0 in seen_by else "new", item, p)
+    if 1 in seen_by and 0 in seen_by:
+        return Change("confirmed", item, p)
+    return Change("new" if 1 in seen_by and new else "unseen", item, p)

@@ -14,7 +14,7 @@ GONE = 0.5
 """The probability below which an object counts as gone. A larger value gives objects up sooner."""
 FORGOTTEN = 0.01
 """The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
-_UNPROVEN = 0.9
+UNPROVEN = 0.9
 """The probability that an object of one session exists if the session does not say. A larger value trusts it more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
@@ -45,7 +45,7 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
     elsewhere. when: the time of the session, s. A track without a life begins here.
     """
     old = [t.life for t in tracks]
-    before = np.array([_UNPROVEN if life is None else life.probability for life in old])
+    before = np.array([UNPROVEN if life is None else life.probability for life in old])
     days = np.array([0.0 if life is None else max(when - life.updated, 0.0) / _DAY for life in old])
     past = np.array([(0, 0) if life is None else (life.looks, life.detections) for life in old]).reshape(-1, 2)
     probability = persistence(before, days, found, looks, past[:, 0], past[:, 1])
@@ -56,7 +56,7 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
         views = max(int(looks[k]), detections)
         if life is None:
             assert item is not None
-            exists = _UNPROVEN if item.existence is None else min(item.existence, _UNPROVEN)
+            exists = UNPROVEN if item.existence is None else min(item.existence, UNPROVEN)
             lives.append(Life("new", exists, 1, 1, views, detections, when))
             continue
         p = float(probability[k])

@@ -11,9 +11,10 @@ import numpy as np
 from objslam.association.registration.joint_frames import JointFrames, Measured, solve_frames
 from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import register
+from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, may_be_one
 from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
@@ -168,16 +169,28 @@ def _live(
         begun += fresh
         some = [at for at in begun if not (site and at in fresh and tracks[at].life is not None)]
         back = inverse(solved.site_T_map[number])
-        places = solved.positions[some] @ back[:3, :3].T + back[:3, 3]
-        looks = session.looks(tuple(tracks[at].item for at in some), places)
+        for at in fresh:
+            tracks[at].item = _in_site(here[at], None, solved.site_T_map[number])
+        looks = session.looks(tuple(tracks[at].item for at in some), solved.positions[some], back)
         for at, item in here.items():
-            tracks[at].item, tracks[at].met = replace(item, life=None), turn
+            tracks[at].item, tracks[at].met = _in_site(item, tracks[at].item, solved.site_T_map[number]), turn
         found = np.array([at in here for at in some], dtype=bool)
         lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
         for at, life in zip(some, lives, strict=True):
             tracks[at].life = life
         begun = _follow(tracks, begun, solved.positions)
     return begun
+
+
+def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) -> MapObject:
+    """Return an object of a session as the site has it: seen from the sides of this session, and of those before."""
+    seen = item.seen_from
+    if seen is not None:
+        seen = replace(seen, sides=seen.sides @ site_T_session[:3, :3].T)
+        if before is not None and (old := before.seen_from) is not None:
+            sides = thinned(np.concatenate([old.sides, seen.sides]))
+            seen = SeenFrom(min(old.near, seen.near), max(old.far, seen.far), sides)
+    return replace(item, life=None, seen_from=seen)
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats) -> list[int]:

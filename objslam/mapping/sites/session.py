@@ -49,28 +49,29 @@ class Session:
         seen = lives or [o.last_seen for o in self.objects if np.isfinite(o.last_seen)]
         return max(seen, default=0.0)
 
-    def looks(self, objects: tuple[MapObject, ...], positions: Floats) -> Ints:
+    def looks(self, objects: tuple[MapObject, ...], positions: Floats, session_T_map: Floats) -> Ints:
         """Return in how many frames (N,) each object should have been detected if it was at positions (N, 3), m.
 
-        Positions are in the frame of this session. Objects of which no distances are known have no look, and no object has
-        one if the session does not know its views.
+        Objects and positions are in a map in which session_T_map (4, 4) is the inverse of the pose of this session. Objects
+        of which nobody knows from where they were detected have no look. No object has one if the session does not know its
+        views.
         """
-        nothing = np.zeros(len(objects), dtype=np.int64)
-        if self.views is None or self.rays is None or not objects:
-            return nothing
-        known = np.array([o.seen_from is not None for o in objects]) & np.isfinite(positions).all(axis=1)
-        if not known.any():
-            return nothing
-        some = [o for o, there in zip(objects, known, strict=True) if there]
-        extent = np.array([(np.nan, np.nan) if o.extent is None else o.extent for o in some])
-        seen_from = np.array([o.seen_from for o in some])
+        looks = np.zeros(len(objects), dtype=np.int64)
+        known = np.array([o.seen_from is not None for o in objects], dtype=bool)
+        if self.views is None or self.rays is None or not known.any():
+            return looks
+        turn = session_T_map[:3, :3]
+        some = [(o, o.seen_from) for o in objects if o.seen_from is not None]
+        extent = np.array([(np.nan, np.nan) if o.extent is None else o.extent for o, _ in some])
+        seen = [replace(one, sides=one.sides @ turn.T) for _, one in some]
+        here = positions[known] @ turn.T + session_T_map[:3, 3]
         views = self.views
         frames = CameraFrames(
             views.stamps, views.cameras, views.camera, views.map_T_camera, views.margin, views.margin_share
         )
         obs, distance = _boxes(self.rays, self.objects, views)
-        nothing[known] = count_looks(positions[known], extent, seen_from, frames, obs, distance)
-        return nothing
+        looks[known] = count_looks(here, extent, seen, frames, obs, distance)
+        return looks
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:

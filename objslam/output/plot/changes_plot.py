@@ -13,8 +13,9 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
 from objslam.mapping.sites.compare import Comparison
 from objslam.output.plot.label_layout import place_labels
+from objslam.output.plot.style import frame_objects
 
-_COLOURS = {"confirmed": "#6b7280", "unseen": "#b9bec7", "new": "#1a7f37", "moved": "#0b63c5", "gone": "#c22f2f"}
+_COLOURS = {"confirmed": "#4b5563", "unseen": "#767676", "new": "#1a7f37", "moved": "#0b63c5", "gone": "#c22f2f"}
 """The colour of each outcome."""
 _MARKERS = {"confirmed": "o", "unseen": "o", "new": "P", "moved": "D", "gone": "X"}
 """The marker of each outcome, so that the picture is readable without colours."""
@@ -53,12 +54,14 @@ def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str, file: Path)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    points = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
-    before = np.array([_before(o)[:2] for _, o in items]).reshape(-1, 2)
-    shown = np.concatenate([points, before, np.zeros((0 if len(items) else 1, 2))])
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    side = max(float((high - low).max()), 1.0)
-    low, high = low - 0.08 * side, high + 0.08 * side
+    everything = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
+    inside, low, high = frame_objects(everything, np.zeros((0, 2)))
+    items = [item for item, there in zip(items, inside, strict=True) if there]
+    points, before = everything[inside], np.array([_before(o)[:2] for _, o in items]).reshape(-1, 2)
+    title += f", {int((~inside).sum())} far away not shown" if not inside.all() else ""
+    margin = 0.08 * max(float((high - low).max()), 1.0)
+    low, high = np.minimum(low, before.min(axis=0, initial=np.inf)), np.maximum(high, before.max(axis=0, initial=-np.inf))
+    low, high = low - margin, high + margin
     width, height = (high - low) / (high - low).max() * _LONG_SIDE
     size = max(width, _SHORT_SIDE) + 0.6, max(height, _SHORT_SIDE) + 1.2  # The added inches are for title and legend.
     figure = Figure(figsize=size, dpi=150, layout="constrained")
@@ -76,7 +79,9 @@ def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str, file: Path)
             for start, end in zip(before[mine], points[mine], strict=True):
                 axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.2})
         name = f"{outcome} ({int(mine.sum())})"
-        axes.plot(*points[mine].T, _MARKERS[outcome], color=colour, markersize=6, label=name, linestyle="", zorder=3)
+        face = "white" if outcome == "unseen" else colour
+        marks: dict[str, Any] = {"markersize": 6, "markerfacecolor": face, "linestyle": "", "zorder": 3}
+        axes.plot(*points[mine].T, _MARKERS[outcome], color=colour, label=name, **marks)
     axes.set_title(title, fontsize=10, loc="left")
     if items:
         figure.legend(loc="outside lower left", ncols=5, fontsize=_FONT, frameon=False)

@@ -19,7 +19,7 @@ from objslam.simulation import preset, simulate
 
 UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
 TAKEN, MOVED = 0, 4
-TO, ADDED = (0.44, 0.18, 0.7), (-1.0, 1.0, 0.5)
+TO, ADDED = (0.44, 0.18, 0.7), (2.0, -2.0, 0.6)
 
 
 @pytest.fixture(scope="module")

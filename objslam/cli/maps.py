@@ -1,4 +1,4 @@
-"""The commands `objslam merge` and `objslam diff`, for the maps of several sessions."""
+"""The commands `objslam register`, `merge` and `diff`, which take the maps of several sessions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,33 @@ from objslam.cli.console import say
 from objslam.cli.options import Json, Out
 
 NOT_REGISTERED = 1
-"""The exit code of a comparison of two maps that do not show one place, as far as their objects tell."""
+"""The exit code for two maps that do not show one place, as far as their objects tell."""
+
+
+def register_results(
+    a: Annotated[Path, typer.Argument(metavar="A", help="A result folder, or an objects.json.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The other map.")],
+) -> None:
+    """Find the transform from map A to map B by the relative positions of their objects. Exit code 1: it is not certain."""
+    import numpy as np
+
+    from objslam.association.registration.object_maps import reason, register
+    from objslam.results.object_map import ObjectMap
+
+    one, other = ObjectMap.load(a), ObjectMap.load(b)
+    found = register(one, other)
+    if np.isfinite(found.b_T_a).all():
+        x, y, z = found.b_T_a[:3, 3]
+        yaw = np.degrees(np.arctan2(found.b_T_a[1, 0], found.b_T_a[0, 0]))
+        sigma = np.sqrt(np.diag(found.covariance)) * [1, 1, 1, np.degrees(1)]
+        say(f"B_T_A: x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw:.2f} deg")
+        say("sigma: x {:.3f} y {:.3f} z {:.3f} m, yaw {:.2f} deg".format(*sigma))
+    for i, k in found.matches.tolist():
+        say(f"  {one[i].label} #{one[i].id} is #{other[k].id}")
+    why = reason(found, one, other, (str(a), str(b)))
+    say(f"registered: {why}" if found.accepted else f"not registered: {why}")
+    if not found.accepted:
+        raise typer.Exit(NOT_REGISTERED)
 
 
 def merge_results(

@@ -1,0 +1,18 @@
+"""What the cameras of a drive had in view: all their frames, at the solved poses."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
+from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.frontend.keyframes import build_keyframes
+
+
+def solved_views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
+    """Return all camera frames of a log without errors, at the poses of the solved path."""
+    frames = build_keyframes(log, settings, Ledger())
+    at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
+    return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])
