@@ -139,7 +139,9 @@ _NEXT_EVERY = 3
 """After every how many faults the command is started again. A larger number costs less time."""
 _PRELOADED = (
     "cv2",
+    "encodings.unicode_escape",
     "encodings.utf_8_sig",
+    "importlib.readers",
     "objslam.api.mapping",
     "objslam.live.session.session",
     "objslam.mapping.pipeline",
