@@ -4,8 +4,8 @@
     python tools/licences.py --sbom sbom.json # also a CycloneDX 1.5 file
 
 All of it comes from the metadata of what is installed; nothing is fetched. The packages are those that pyproject.toml names
-without an extra, those that they need, and so on; then those of the extra dds. Run it in the environment that tools/setup.sh
-made. Where the metadata name no licence, the page says so.
+without an extra or in the extras open3d, torch and dds, and those that they need, and so on. Run it in the environment that
+tools/setup.sh made. Where the metadata name no licence, the page says so.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ class Package:
 
 
 def requirements(project: Path) -> list[str]:
-    """What pyproject.toml requires to run: its dependencies, and those of the extra dds."""
+    """What pyproject.toml requires to run: its dependencies, and those of the extras that a user may add."""
     data = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
-    return [*data["dependencies"], *data["optional-dependencies"]["dds"]]
+    extras = data["optional-dependencies"]
+    return [*data["dependencies"], *extras["open3d"], *extras["torch"], *extras["dds"]]
 
 
 def packages(required: Iterable[str]) -> list[Package]:

@@ -36,6 +36,9 @@ some programs do not normalise theirs."""
 _ASYMMETRY = 1e-6
 """How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share
 accepts files with more rounded numbers."""
+_NOTHING = 1e-200
+"""The variance, in the square of any unit, up to which it counts as 0. Products of smaller numbers have few digits left. A
+larger value leaves more correlations unjudged."""
 _NEGATIVE = 1e-6
 """How far below zero the least eigenvalue of a correlation matrix may be. A larger value accepts covariances with more
 rounded numbers."""
@@ -96,7 +99,7 @@ def covariance_fault(covariance: Floats) -> str | None:
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     if (variance < 0).any():
         return "has a negative variance"
-    sigma = np.sqrt(np.where(variance > 0, variance, 1.0))
+    sigma = np.sqrt(np.where(variance > _NOTHING, variance, 1.0))
     with np.errstate(over="ignore", under="ignore"):
         correlation = covariance / sigma[..., :, None] / sigma[..., None, :]
     mirrored = np.swapaxes(correlation, -1, -2)

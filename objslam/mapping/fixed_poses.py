@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 _ROUNDS = 8
 """The most rounds of association and calibration. Two or three are usual. More rounds are slower."""
-_SAME = 0.1
-"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. A tenth of
-the noise moves hardly a ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared errors
+_SAME = 0.05
+"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. So small
+a change moves hardly a ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared errors
 does not work: with precise errors, the association can swing between two states for ever."""
 _EXPLAINED = 0.5
 """An association explains too few rays below this share. A larger share tries another association more often."""

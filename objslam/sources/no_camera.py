@@ -25,3 +25,7 @@ class NoCamera(LogError):
     ) -> None:
         super().__init__(message, where=where, hint=hint)
         self.odometry, self.localization, self.mounts = odometry, localization, mounts
+
+    def with_hint(self, hint: str) -> NoCamera:
+        """Return the same error with another hint."""
+        return NoCamera(self.message, self.where or "", hint, self.odometry, self.localization, self.mounts)

@@ -74,7 +74,7 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
         first = assembly.problems[0]
         hint = "; ".join(filter(None, [first.hint, *assembly.survey.damage()]))
         if isinstance(first, NoCamera):
-            raise first
+            raise first.with_hint(hint)
         raise LogError(first.message, where=first.where, hint=hint)
     for error in assembly.left_out:
         ledger.warn(f"{error}: left out")
