@@ -1,34 +1,16 @@
 """Parts of MRCLAM logs: short ones, whose camera's clock is 0.2 s off, and halves, which must tell the same errors."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from parts import part
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
-from objslam.core.types import Log, Trajectory
+from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
-
-
-def part(log: Log, begin: float, end: float) -> Log:
-    """The log between two times after its start, s."""
-    (camera,), path = log.cameras, log.odometry
-    assert path is not None
-    assert camera.detections is not None
-
-    def inside(stamps):
-        return (stamps >= path.stamps[0] + begin) & (stamps <= path.stamps[0] + end)
-
-    found, kept = camera.detections, inside(camera.detections.frame_stamps)
-    number, rows = np.cumsum(kept) - 1, kept[found.frame]
-    seen = replace(found.take(rows), frame_stamps=found.frame_stamps[kept], frame=number[found.frame[rows]])
-    there = inside(path.stamps)
-    odometry = Trajectory(path.stamps[there], path.poses[there])
-    return replace(log, odometry=odometry, cameras=(replace(camera, detections=seen),))
 
 
 def mapped(log: Log) -> RunResult:
