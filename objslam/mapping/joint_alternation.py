@@ -37,8 +37,8 @@ _NOISIER = 1.5
 A larger factor explores fewer logs twice."""
 _CLEAR = 0.95
 """The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
-twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: that of a
-real robot in a forest is explored twice for nothing."""
+twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: a
+real robot in a forest has its log explored twice for nothing."""
 _LOOSE = 3.0
 """The factor on the noise of the odometry in this exploration if the solve found only the rays to be noisy. A larger factor
 suits worse odometry, and loses more objects of good odometry."""
