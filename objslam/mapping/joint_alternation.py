@@ -43,6 +43,10 @@ _LOOSE = 3.0
 """The factor on the noise of the odometry in this exploration if the solve found only the rays to be noisy. A larger factor
 suits worse odometry, and loses more objects of good odometry."""
 
+_VIEW = 1.0
+"""The solid angle (sr) in which a stray ray may lie, about that of a camera. A larger value lets more rays outweigh noisier
+ones."""
+
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
@@ -181,10 +185,15 @@ class JointState:
         return np.asarray((self.estimate.weight > 0) & (self.association.object >= 0))
 
     @property
-    def explained(self) -> int:
-        """The number of rays that agree with their object, beyond the least number of rays of an object."""
+    def explained(self) -> float:
+        """The log odds of the agreeing rays against stray rays, beyond those of the least number of rays of an object.
+
+        A ray agrees with density 1 / (2 pi e sigma^2) on average, and is stray with density 1 / `_VIEW`. So a map in which
+        more rays agree, because the solve found them to be noisier, is no better map.
+        """
         assert self.association is not None
-        return int(self.agree.sum()) - self.settings.association.min_rays * self.association.count
+        gain = np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2))
+        return float(gain[self.agree].sum() - self.settings.association.min_rays * self.association.count * gain.mean())
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, drifting: bool) -> Association:
         from objslam.association.global_association import associate_globally

@@ -1,13 +1,14 @@
 """Association and joint solve in turns: what allows for drift, and what the rays decide."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.types import Keyframes, Trajectory
+from objslam.core.types import Association, Keyframes, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -64,8 +65,27 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     plain = cut.alternated(cut.estimate.map_T_base, (cut.association, cut.estimate.positions))
     followed = cut.drift_followed()
     assert followed.association.count == 8
-    assert followed.explained == len(rays) - 8 * settings.association.min_rays  # every ray
-    assert plain.explained < 0.9 * followed.explained
+    assert followed.agree.all()
+    assert plain.agree.mean() < 0.95
+
+
+def test_more_rays_that_are_noisier_are_no_better_map():
+    rays = SimpleNamespace(sigma=np.full(100, 0.005))
+    settings = load_settings(None)
+
+    def state(agreeing, noise):
+        association = Association(np.where(np.arange(100) < agreeing, 0, -1), np.zeros(1, dtype=np.int64))
+        solved = SimpleNamespace(weight=np.ones(100))
+        noisy = SimpleNamespace(sigma=rays.sigma * noise)
+        return JointState(
+            None, None, None, noisy, (), settings, Ledger(), None, None, None, association=association, estimate=solved
+        )
+
+    quiet = state(80, 0.5)
+    assert quiet.better(state(95, 4.0)) is quiet
+    more = state(95, 0.5)
+    assert quiet.better(more).agree.sum() == 95
+    assert more.better(quiet) is more
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():
