@@ -54,13 +54,16 @@ def merge_results(
     """
     from objslam.api.sites import load_session, warnings_of
     from objslam.mapping.sites.merge import merge_sessions
-    from objslam.output.site_folder import summarise_site, write_site
+    from objslam.output.result_folder import prepare_output
+    from objslam.output.site_folder import islands_of_earlier_merges, summarise_site, write_site
 
+    prepare_output(out)
     sessions = [load_session(path) for path in results]
     islands = merge_sessions(sessions)
     names = [session.name for session in sessions]
     warnings = warnings_of(sessions, islands)
     folders = write_site(islands, names, out, warnings)
+    warnings += [f"{old} is of an earlier merge" for old in islands_of_earlier_merges(out, len(islands))]
     for line in warnings:
         say(f"warning: {line}", stderr=True)
     for folder, island in zip(folders, islands, strict=True):
@@ -88,15 +91,14 @@ def diff_results(
     The exit code is 1 if the maps cannot be registered to each other.
     """
     from objslam.api.sites import diff
-    from objslam.io.atomic_files import disk_errors
+    from objslam.io.atomic_files import write_file
     from objslam.mapping.sites.compare import OUTCOMES
 
     found = diff(a, b)
     if picture is not None and found.registration.accepted:
         from objslam.output.plot.changes_plot import draw_comparison
 
-        with disk_errors(picture):
-            draw_comparison(found, picture)
+        write_file(picture, draw_comparison(found))
     if json:
         _say_json(found)
     elif not found.registration.accepted:

@@ -151,10 +151,10 @@ class JointState:
         return replace(state, settled=False)
 
     def drift_followed(self) -> Self:
-        """Return the state after rounds that allow for the drift of keyframes without an assigned ray, if they explain more.
+        """Return the state after rounds that allow for the drift of keyframes without an assigned ray, if it is `better`.
 
         These keyframes follow the odometry alone. If it has drifted by more than the noise of a ray, no association at their
-        poses finds their objects. Wider gates can also lose objects, so the number of agreeing rays decides.
+        poses finds their objects. Wider gates can also lose objects, so `better` decides.
         """
         assert self.association is not None
         assert self.estimate is not None
@@ -169,7 +169,7 @@ class JointState:
         return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
 
     def better(self, attempt: Self) -> Self:
-        """Return the result of an attempt if it explains more rays than this state, else this state."""
+        """Return the result of an attempt if its rays are better `explained` than those of this state, else this state."""
         if attempt.explained <= self.explained:
             return self
         self.ledger.add(attempt.ledger)
@@ -189,10 +189,11 @@ class JointState:
         """The log odds of the agreeing rays against stray rays, beyond those of the least number of rays of an object.
 
         A ray agrees with density 1 / (2 pi e sigma^2) on average, and is stray with density 1 / `_VIEW`. So a map in which
-        more rays agree, because the solve found them to be noisier, is no better map.
+        more rays agree, because the solve found them to be noisier, is no better map. A ray that is noisier than a view
+        tells nothing.
         """
         assert self.association is not None
-        gain = np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2))
+        gain = np.maximum(np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2)), 0.0)
         return float(gain[self.agree].sum() - self.settings.association.min_rays * self.association.count * gain.mean())
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, drifting: bool) -> Association:

@@ -18,6 +18,9 @@ from objslam.output.result_folder import RESULT_FILES, prepare_output
 from objslam.results import files
 from objslam.results.files import dump_json
 
+_MOST_ISLANDS = 100
+"""The most islands of an earlier merge that are looked for. A larger number finds those of larger merges."""
+
 
 def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:
     """Write the largest island into the folder `out`, the others into `out`/island_2 and so on. Return their folders.
@@ -32,12 +35,18 @@ def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warni
             folder,
             RESULT_FILES,
             {
-                files.OBJECTS: partial(_write, dump_objects(island.objects)),
-                files.PICTURE: partial(draw_site, island.objects),
-                files.SUMMARY: partial(_write, dump_json(summary)),
+                files.OBJECTS: partial(_write, encode(dump_objects(island.objects))),
+                files.PICTURE: partial(_write, draw_site(island.objects)),
+                files.SUMMARY: partial(_write, encode(dump_json(summary))),
             },
         )
     return folders
+
+
+def islands_of_earlier_merges(out: Path, count: int) -> list[Path]:
+    """Return the folders of islands in `out` that a merge with this `count` of islands does not replace."""
+    names = (f"island_{number + 1}" for number in range(count, _MOST_ISLANDS))
+    return [out / name for name in names if (out / name / files.SUMMARY).is_file()]
 
 
 def summarise_site(island: Island, names: Sequence[str]) -> dict[str, Any]:
@@ -64,5 +73,5 @@ def summarise_site(island: Island, names: Sequence[str]) -> dict[str, Any]:
     return {"map_frame": "site", "counts": counts, "sessions": sessions}
 
 
-def _write(text: str, file: Path) -> None:
-    file.write_bytes(encode(text))
+def _write(data: bytes, file: Path) -> None:
+    file.write_bytes(data)

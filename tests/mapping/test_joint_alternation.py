@@ -86,6 +86,7 @@ def test_more_rays_that_are_noisier_are_no_better_map():
     more = state(95, 0.5)
     assert quiet.better(more).agree.sum() == 95
     assert more.better(quiet) is more
+    assert state(80, 100.0).explained == 0  # 0.5 rad, more than a view
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():

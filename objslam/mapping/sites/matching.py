@@ -1,9 +1,9 @@
 """Which objects of two maps in one frame are the same: by place, and by label as far as labels can be trusted."""
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from objslam.association.gating import pair_up
 from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject
 from objslam.core.statistics import SAME_POINT
@@ -35,10 +35,9 @@ def same_objects(
     squared = np.einsum("pi,pi->p", apart, np.linalg.solve(spread, apart[..., None])[..., 0])
     labels = np.array([label_agreement(ours[a], theirs[b]) for a, b in zip(i.tolist(), k.tolist(), strict=True)])
     cost = squared - 2 * np.log(labels.reshape(-1))
-    gain = np.zeros((len(ours), len(theirs)))
-    gain[i, k] = np.maximum(SAME_POINT - cost, 0.0)
-    pairs = np.column_stack(linear_sum_assignment(-gain))
-    return np.asarray(pairs[gain[pairs[:, 0], pairs[:, 1]] > 0], dtype=np.int64)
+    may = cost < SAME_POINT
+    pairs = pair_up(i[may], k[may], SAME_POINT - cost[may], (len(ours), len(theirs)))
+    return np.column_stack(pairs).astype(np.int64)
 
 
 def label_agreement(a: MapObject, b: MapObject) -> float:

@@ -13,9 +13,8 @@ from objslam.core.arrays import Floats
 from objslam.output.plot.figure import Colour
 
 _SHIFT = 4  # OpenCV takes coordinates as integers, here in 1 / 2^4 of a px. A larger number is finer, and overflows earlier.
-_FAR = (
-    1e6  # Points farther from the image than this, px, are moved to this distance, because OpenCV's integers have 32 bits.
-)
+_FAR = 1e6
+"""The distance, px, to which farther points are moved, because OpenCV's integers have 32 bits. A larger one overflows."""
 _NEAR = 3.0  # The least way, px, between two drawn points of a line. A larger one cuts its curves.
 _BATCH = 4_000_000  # The pixels of segments that are drawn at once. A larger number takes more memory.
 _HALO = 0.85  # The opacity of the white around a text, in [0, 1].

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,30 +27,30 @@ _LETTERS = 24
 """The most letters of a label. A larger number cuts fewer labels."""
 
 
-def draw_site(objects: ObjectMap, file: Path) -> None:
-    """Draw the map of a site as a PNG, with what became of each object. OSError if the file cannot be written."""
+def draw_site(objects: ObjectMap) -> bytes:
+    """Return a PNG of the map of a site, with what became of each object."""
     items = [(_outcome(o), o) for o in (*objects.objects, *objects.gone)]
-    _draw(items, f"{len(objects)} objects", file)
+    return _draw(items, f"{len(objects)} objects")
 
 
-def draw_comparison(found: Comparison, file: Path) -> None:
-    """Draw the comparison of two maps as a PNG, in the frame of the first. OSError if the file cannot be written."""
-    _draw([(one.outcome, one.item) for one in found.changes], "changes since the first map", file)
+def draw_comparison(found: Comparison) -> bytes:
+    """Return a PNG of the comparison of two maps, in the frame of the first."""
+    return _draw([(one.outcome, one.item) for one in found.changes], "changes since the first map")
 
 
 def _outcome(o: MapObject) -> str:
     return "confirmed" if o.life is None else o.life.state
 
 
-def _draw(items: Sequence[tuple[str, MapObject]], title: str, file: Path) -> None:
+def _draw(items: Sequence[tuple[str, MapObject]], title: str) -> bytes:
     import matplotlib
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # The user's own style may use TeX or white text.
-        _draw_figure(items, title, file)
+        return _draw_figure(items, title)
 
 
-def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str, file: Path) -> None:
+def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -88,8 +88,9 @@ def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str, file: Path)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # Labels are placed by pixels, so the layout is frozen.
     _draw_labels(axes, canvas.get_renderer(), items, points)
-    with file.open("wb") as stream:
-        figure.savefig(stream, format="png")
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
 
 
 def _before(o: MapObject) -> Floats:
