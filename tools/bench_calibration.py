@@ -50,7 +50,7 @@ def main() -> None:
             rmse, promised, own = (np.sqrt(np.mean(of)) for of in (errors**2, variance, aligned**2))
             inside, middle = np.mean(squared < CHI2_95), np.median(squared)
             print(
-                f"{kind:28s} RMSE {rmse:.3f} m (its covariances promise {promised:.3f}; after SE(2) alignment {own:.3f}), "
+                f"{kind:29s} RMSE {rmse:.3f} m (its covariances promise {promised:.3f}; after SE(2) alignment {own:.3f}), "
                 f"median {np.median(errors):.3f} m; inside the 95 % ellipsoid {inside:.3f}, "
                 f"squared Mahalanobis median {middle:.2f} (honest: 2.37); {np.mean(seconds):.2f} s of CPU"
             )
