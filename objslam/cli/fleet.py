@@ -15,8 +15,8 @@ from objslam.sources import SourceOptions
 
 if TYPE_CHECKING:
     from objslam.fleet.driver import FleetResult, Tell
-    from objslam.fleet.engines import Engine
-    from objslam.fleet.ray_engine import Cluster
+    from objslam.fleet.engines.local_engine import Engine
+    from objslam.fleet.engines.ray_engine import Cluster
 
 _GB = 1e9
 _RAY_MEMORY = 4.0
@@ -91,12 +91,12 @@ def fleet(
     names each. The recording for the viewer is left out unless --set output.recording=true.
     """
     from objslam.fleet.driver import run_fleet
-    from objslam.fleet.engines import cores, local_engine, memory_of_machine
+    from objslam.fleet.engines.local_engine import cores, local_engine, memory_of_machine
+    from objslam.fleet.engines.worker import Limits
     from objslam.fleet.job import make_job
     from objslam.fleet.logs import Layout, find_logs
     from objslam.fleet.page import PAGE, fleet_page
-    from objslam.fleet.stores import open_store
-    from objslam.fleet.worker import Limits
+    from objslam.fleet.stores.open_store import open_store
 
     begin = time.monotonic()
     settings = settings_of(mode, config, ["output.recording=false", *(set_ or ())], calibration)
@@ -130,8 +130,8 @@ def fleet(
 
 def _ray_engines(memory: float | None, seconds: float, retries: int, jobs: int | None, gpus: float) -> tuple[Engine, Engine]:
     """Return the engines of the mapping and of the merges. A memory that the user gave is also reserved on a node."""
-    from objslam.fleet.ray_engine import ray_engine
-    from objslam.fleet.worker import Limits
+    from objslam.fleet.engines.ray_engine import ray_engine
+    from objslam.fleet.engines.worker import Limits
 
     limits = Limits(int((_RAY_MEMORY if memory is None else memory) * _GB), seconds, retries)
     reserved = int((memory or 0) * _GB)
@@ -141,7 +141,7 @@ def _ray_engines(memory: float | None, seconds: float, retries: int, jobs: int |
 
 @contextmanager
 def _joined(address: str, quiet: bool) -> Iterator[Cluster]:
-    from objslam.fleet.ray_engine import join_cluster, leave_cluster
+    from objslam.fleet.engines.ray_engine import join_cluster, leave_cluster
 
     cluster = join_cluster(address)
     try:

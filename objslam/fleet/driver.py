@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from objslam.fleet import map_task, merge_task, site_task
-from objslam.fleet.engines import Answer, Engine
+from objslam.fleet.engines.local_engine import Answer, Engine
 from objslam.fleet.keys import key_of
 from objslam.fleet.logs import LogPlace
-from objslam.fleet.map_task import Job, MapTask
-from objslam.fleet.merge_task import MergeTask
 from objslam.fleet.record import SEEN, Parameter, Record, parse_seen, record_name
-from objslam.fleet.site_task import Member, SiteResult, SiteTask
-from objslam.fleet.store import Store
-from objslam.fleet.stores import open_store
+from objslam.fleet.stores.open_store import open_store
+from objslam.fleet.stores.store import Store
+from objslam.fleet.tasks import map_task, merge_task, site_task
+from objslam.fleet.tasks.map_task import Job, MapTask
+from objslam.fleet.tasks.merge_task import MergeTask
+from objslam.fleet.tasks.site_task import Member, SiteResult, SiteTask
 from objslam.fleet.tree import MERGES, tree_of
 
 UNDATED = "undated"

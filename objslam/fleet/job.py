@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from objslam.config import is_file
 from objslam.fleet.keys import file_content, hash_settings, key_of
-from objslam.fleet.map_task import Job
-from objslam.fleet.stores import is_remote, open_store
+from objslam.fleet.stores.open_store import is_remote, open_store
+from objslam.fleet.tasks.map_task import Job
 
 if TYPE_CHECKING:
     from objslam.config import Settings

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from hashlib import sha256
 
 from objslam.errors import ConfigError, LogError
-from objslam.fleet.store import FileState
-from objslam.fleet.stores import open_source
+from objslam.fleet.stores.open_store import open_source
+from objslam.fleet.stores.store import FileState
 
 DEFAULT_LAYOUT = "{site}/{log}"
 """The layout of logs that nobody described: the folder that holds a log is its site."""

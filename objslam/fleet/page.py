@@ -15,7 +15,7 @@ from objslam.errors import printable
 from objslam.fleet.drift import drifts
 from objslam.fleet.driver import FleetResult, Mapped
 from objslam.fleet.record import result_name
-from objslam.fleet.site_task import SITES, folder_of
+from objslam.fleet.tasks.site_task import SITES, folder_of
 from objslam.results.files import OBJECTS, PICTURE, REPORT, SUMMARY
 
 PAGE = "fleet.html"

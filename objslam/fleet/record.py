@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
-from objslam.fleet.store import StoreError
+from objslam.fleet.stores.store import StoreError
 from objslam.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"

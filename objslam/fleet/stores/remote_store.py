@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from objslam.errors import ObjslamError, first_line
-from objslam.fleet.store import FileState, StoreError
+from objslam.fleet.stores.store import FileState, StoreError
 
 _TRIES = 5
 """How often a call to a store is tried. A larger number survives longer faults, and reports a store that is gone later."""

@@ -18,8 +18,8 @@ from objslam import __version__
 from objslam.errors import ObjslamError
 from objslam.fleet.keys import hash_log, key_of
 from objslam.fleet.record import Parameter, Record, record_name, result_name, seen_name
-from objslam.fleet.store import StoreError
-from objslam.fleet.stores import is_remote, open_source, open_store
+from objslam.fleet.stores.open_store import is_remote, open_source, open_store
+from objslam.fleet.stores.store import StoreError
 from objslam.io.atomic_files import write_file
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.sources import SourceOptions
 
-WORK = "objslam.fleet.map_task:map_one"
+WORK = "objslam.fleet.tasks.map_task:map_one"
 """The name of the function of this task, for an engine."""
 
 

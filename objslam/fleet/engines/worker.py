@@ -117,9 +117,9 @@ class Worker:
     def _started(self) -> Connection:
         if self._pipe is None:
             ours, theirs = socket.socketpair()
-            package = str(Path(__file__).parents[2])
+            package = str(Path(__file__).parents[3])
             paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-            start = f"from objslam.fleet.worker import serve; serve({theirs.fileno()}, {os.getpid()})"
+            start = f"from objslam.fleet.engines.worker import serve; serve({theirs.fileno()}, {os.getpid()})"
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", start],
                 stdin=subprocess.DEVNULL,

@@ -12,8 +12,8 @@ from itertools import islice
 from typing import Any
 
 from objslam.errors import ConfigError, ObjslamError, first_line
-from objslam.fleet.engines import Answer, Engine, attempt
-from objslam.fleet.worker import Limits, Worker
+from objslam.fleet.engines.local_engine import Answer, Engine, attempt
+from objslam.fleet.engines.worker import Limits, Worker
 
 _QUEUED = 2
 """How many tasks are submitted for each CPU of the cluster. A larger number keeps more tasks ready, and loses none."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from objslam.fleet.local_store import LocalSource, LocalStore, local_path
-from objslam.fleet.remote_store import RemoteSource, RemoteStore
-from objslam.fleet.store import Source, Store
+from objslam.fleet.stores.local_store import LocalSource, LocalStore, local_path
+from objslam.fleet.stores.remote_store import RemoteSource, RemoteStore
+from objslam.fleet.stores.store import Source, Store
 
 
 def is_remote(url: str) -> bool:

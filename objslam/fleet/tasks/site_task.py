@@ -14,16 +14,16 @@ import numpy as np
 
 from objslam.errors import OutputError
 from objslam.fleet.keys import key_of
-from objslam.fleet.merge_task import Placed, SiteMap, load_node
 from objslam.fleet.record import Record, record_name, result_name
-from objslam.fleet.store import Store, StoreError
-from objslam.fleet.stores import open_store
+from objslam.fleet.stores.open_store import open_store
+from objslam.fleet.stores.store import Store, StoreError
+from objslam.fleet.tasks.merge_task import Placed, SiteMap, load_node
 from objslam.results.files import OBJECTS, SUMMARY, dump_json
 
 if TYPE_CHECKING:
     from objslam.mapping.sites.merge import Island
 
-WORK = "objslam.fleet.site_task:finish_site"
+WORK = "objslam.fleet.tasks.site_task:finish_site"
 """The name of the function of this task, for an engine."""
 SITES = "sites"
 """The folder of the sites in the store."""

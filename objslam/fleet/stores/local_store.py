@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from objslam.fleet.store import FileState, StoreError
+from objslam.fleet.stores.store import FileState, StoreError
 from objslam.io.atomic_files import write_file
 
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.fleet.local_store import LocalStore
 from objslam.fleet.record import result_name
-from objslam.fleet.store import Store, StoreError
-from objslam.fleet.stores import open_store
+from objslam.fleet.stores.local_store import LocalStore
+from objslam.fleet.stores.open_store import open_store
+from objslam.fleet.stores.store import Store, StoreError
 from objslam.fleet.tree import Node, node_name
 from objslam.results import files
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from objslam.mapping.sites.merge import Island
     from objslam.mapping.sites.session import Session, Visit
 
-WORK = "objslam.fleet.merge_task:merge_one"
+WORK = "objslam.fleet.tasks.merge_task:merge_one"
 """The name of the function of this task, for an engine."""
 _SESSION_FILES = (files.OBJECTS, files.VIEWS, files.RAYS)
 """The files of a result that a merge reads."""

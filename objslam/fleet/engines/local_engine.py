@@ -16,8 +16,8 @@ from itertools import islice
 from typing import Any
 
 from objslam.errors import ObjslamError, one_line
-from objslam.fleet.store import StoreError
-from objslam.fleet.worker import LimitError, Limits, LostError, Worker
+from objslam.fleet.engines.worker import LimitError, Limits, LostError, Worker
+from objslam.fleet.stores.store import StoreError
 
 
 @dataclass(frozen=True, slots=True)
