@@ -88,8 +88,8 @@ class Layout:
 def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
     """Return the logs that paths, glob patterns and URLs name, each once, in order.
 
-    A folder that is no log is searched. A path that is named itself, or by a pattern, and that holds no log, counts as one:
-    its run says what is wrong with it. LogError if a source names nothing.
+    A folder that is no log is searched. A path that is named and holds no log counts as one: its run says what is wrong with
+    it. Of the files that a pattern names, only bags count. LogError if a source names nothing.
     """
     found: dict[str, LogPlace] = {}
     for source in sources:
@@ -99,6 +99,8 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
             raise LogError("nothing is there", where=source)
         for path in paths:
             files = tree.files(path)
+            if "" in files and not _is_bag(path) and any(mark in source for mark in "*?["):
+                continue
             for inner, own in _split(files):
                 at = f"{path.rstrip('/')}/{inner}" if inner else path.rstrip("/")
                 found.setdefault(at, _place(at, own, layout))

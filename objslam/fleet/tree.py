@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from objslam import __version__
 from objslam.fleet.keys import key_of
 
-LEAF = 8
+LEAF = 4
 """The most sessions that are merged at once. A larger number makes fewer tasks, and each of them longer: all pairs of its
 sessions are registered."""
 MERGES = "merges"
