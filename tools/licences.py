@@ -4,8 +4,8 @@
     python tools/licences.py --sbom sbom.json # also a CycloneDX 1.5 file
 
 All of it comes from the metadata of what is installed; nothing is fetched. The packages are those that pyproject.toml names
-without an extra or in the extras open3d, torch and dds, and those that they need, and so on. Run it in the environment that
-tools/setup.sh made. Where the metadata name no licence, the page says so.
+without an extra or in the extras open3d, torch, dds and fleet, and those that they need, and so on. Run it in an environment
+with all of them. tools/setup.sh dev makes one. Where the metadata name no licence, the page says so.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def requirements(project: Path) -> list[str]:
     """What pyproject.toml requires to run: its dependencies, and those of the extras that a user may add."""
     data = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     extras = data["optional-dependencies"]
-    return [*data["dependencies"], *extras["open3d"], *extras["torch"], *extras["dds"]]
+    return [*data["dependencies"], *extras["open3d"], *extras["torch"], *extras["dds"], *extras["fleet"]]
 
 
 def packages(required: Iterable[str]) -> list[Package]:

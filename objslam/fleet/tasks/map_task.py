@@ -25,6 +25,9 @@ from objslam.io.atomic_files import write_file
 if TYPE_CHECKING:
     from objslam.api.result import Result
     from objslam.config import Settings
+    from objslam.core.diagnostics import Ledger
+    from objslam.core.types import Log
+    from objslam.detection.detector import Detector
     from objslam.sources import SourceOptions
 
 WORK = "objslam.fleet.tasks.map_task:map_one"
@@ -95,16 +98,19 @@ def map_one(given: MapTask) -> Record:
 
 def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
     """Map a log into the folder `out`, and return its record with what the summary says."""
-    from objslam.api.inputs import Log
-    from objslam.api.mapping import run
+    from objslam.api.mapping import map_log
+    from objslam.api.result import Result
     from objslam.core.diagnostics import Ledger
     from objslam.sources import read
 
     settings, detector = _settings(given.job)
     ledger = Ledger()
     found = read(log, ledger, given.job.options)
+    if detector is not None:
+        found = _with_boxes(found, detector, settings, ledger)
     path = found.robot_path
-    result = run(Log(**{**vars(found), "reading": ledger}), settings, detector=detector)
+    mapped, found = map_log(found, settings, ledger, None, lambda stage, done, total: None)
+    result = Result.of(mapped, found, detected=detector is not None)
     result.summary["log_path"] = given.path  # The copy of a log of a store is deleted.
     result.save(out)
     if given.job.report:
@@ -114,6 +120,21 @@ def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
     size = sum(file.stat().st_size for file in out.iterdir())
     begin, end = (0.0, 0.0) if path is None else (float(path.stamps[0]), float(path.stamps[-1]))
     return replace(record, begin=begin, end=end, size=size, **_said(result))
+
+
+def _with_boxes(log: Log, detector: Path, settings: Settings, ledger: Ledger) -> Log:
+    """Return a log with the boxes of a detector. A process loads a model once, and keeps it for its next logs."""
+    from objslam.detection import default_cache, detect_log
+
+    return detect_log(log, _network(detector, settings.detector.model_dump_json()), settings, ledger, cache=default_cache())
+
+
+@lru_cache(maxsize=1)
+def _network(detector: Path, settings: str) -> Detector:
+    from objslam import config
+    from objslam.detection import load_detector
+
+    return load_detector(detector, config.Detector.model_validate_json(settings))
 
 
 def _said(result: Result) -> dict[str, Any]:

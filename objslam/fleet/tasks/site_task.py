@@ -64,7 +64,6 @@ class SiteResult:
     sessions: int
     objects: int
     gone: int
-    alone: int
     changed: bool
 
 
@@ -88,9 +87,8 @@ def finish_site(given: SiteTask) -> SiteResult:
         said = {"made_of": wanted, "price": str(given.price), "islands": len(islands), "days": days}
         store.write(f"{at}/{_STATE}", dump_json(said).encode())
     first = islands[0]
-    alone = sum(len(one.sessions) == 1 for one in islands[1:])
     sessions = sum(len(one.sessions) for one in islands)
-    return SiteResult(given.site, len(islands), sessions, len(first.objects), len(first.objects.gone), alone, changed)
+    return SiteResult(given.site, len(islands), sessions, len(first.objects), len(first.objects.gone), changed)
 
 
 def _state(store: Store, name: str) -> dict[str, Any]:
