@@ -199,11 +199,15 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
         tasks = {MergeTask(job.store, node): site for site, node in nodes if node.key not in there}
         for answer in run(merge_task.WORK, tasks):
             there.add(answer.argument.node.key)
-    last = {
-        SiteTask(job.store, site, trees[site][-1][0].key, tuple(members.values()), price): site
-        for site, members in sites.items()
-        if site not in wrong
-    }
+    last: dict[SiteTask, str] = {}
+    states = store.read_many(site_task.state_name(site) for site in sites)
+    for site, members in sites.items():
+        task = SiteTask(job.store, site, trees[site][-1][0].key, tuple(members.values()), price)
+        if (before := site_task.as_before(task, states.get(site_task.state_name(site)))) is not None:
+            found.sites.append(before)
+        elif site not in wrong:
+            last[task] = site
+    total += len(last) - len(sites)
     found.sites.extend(answer.value for answer in run(site_task.WORK, last) if answer.value is not None)
     found.sites.sort(key=lambda one: one.site)
     found.failures.extend(Failure(site, "site", message) for site, message in sorted(wrong.items()))

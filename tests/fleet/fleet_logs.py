@@ -26,7 +26,7 @@ HOUR = 3600.0
 
 def write_logs(folder: Path, numbers: range, sites: int = 2, robots: int = 2) -> list[Path]:
     """Write small logs of sites that differ, each in a frame and at a time of its own."""
-    return [_write(folder, k, k % sites, f"robot_{k % robots}", "2026-11-20" if k < 4 else "2026-11-21") for k in numbers]
+    return [_write(folder, k, k % sites, f"robot_{k % robots}", "2026-11-20" if k < 2 else "2026-11-21") for k in numbers]
 
 
 def _write(folder: Path, number: int, site: int, robot: str, day: str) -> Path:

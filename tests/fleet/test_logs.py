@@ -1,6 +1,7 @@
 """Finding the logs of a fleet, and the fields that their folders name."""
 
 import pytest
+from fleet import fleet_logs  # noqa: F401 - It registers the store that throws.
 
 from objslam.errors import ConfigError, LogError
 from objslam.fleet.logs import Layout, find_logs
@@ -55,3 +56,15 @@ def test_folders_name_site_robot_and_day(tmp_path):
         Layout("{site}/{log}", "robot")
     with pytest.raises(ConfigError, match="each field once"):
         Layout("{a}/{a}", "a")
+
+
+def test_a_store_that_throws_now_and_then_hides_no_log(tmp_path):
+    for k in range(40):
+        touch(tmp_path, f"site_{k % 4}/log_{k}/camera.yaml", f"site_{k % 4}/log_{k}/cameras/a/rgb/1.png")
+    here = [one.path for one in found(tmp_path)]
+    assert len(here) == 40
+    assert [one.path.removeprefix("flaky://") for one in found(f"flaky://{tmp_path}")] == here
+    assert [one.path.removeprefix("flaky://") for one in found(f"flaky://{tmp_path}/*/log_*")] == here
+    assert len(found(f"flaky://{tmp_path}/site_[12]/log_1?")) == 5
+    with pytest.raises(LogError, match="nothing is there"):
+        found(f"flaky://{tmp_path}/nothing")

@@ -13,7 +13,7 @@ from waiting import LIMIT, wait_for
 
 ray = pytest.importorskip("ray", reason="pip install objslam[fleet]")
 CLUSTER = ("--head", "--num-cpus=2", "--port=0", "--object-store-memory=80000000", "--include-dashboard=false")
-COUNT = 4
+COUNT = 2
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ _PAUSE = 0.1
 """The pause after the first failure, s; it doubles after each further one. A larger value gives a busy store more rest."""
 _STAMPS = ("ETag", "etag", "md5Hash", "crc32c", "generation", "content_settings", "mtime", "LastModified", "created")
 """The keys under which file systems of fsspec say what changes with the content of a file, the best first."""
+_MAGIC = re.compile(r"[*?\[]")  # The marks of a pattern.
 _SAFE = re.compile(r"(?!(.*/)?\.\.?(/|$))[^\0]*")
 """The names of files that stay below their folder: none of their parts is . or .. ."""
 
@@ -137,14 +139,25 @@ class RemoteSource:
     def expand(self, pattern: str) -> list[str]:
         """Return the URLs that a URL or a glob pattern names, in order; none if nothing is there."""
         path = self._path(pattern)
-        if any(mark in path for mark in "*?["):
-            return [self._url(one) for one in sorted(self._try(pattern, lambda: self._fs.glob(path)))]
-        return [self._url(path)] if self._try(pattern, lambda: self._fs.exists(path)) else []
+        if "**" in path:
+            return [self._url(one) for one in sorted(self._try(pattern, lambda: self._fs.glob(path, on_error="raise")))]
+        found, first = [path], next((n for n, part in enumerate(path.split("/")) if _MAGIC.search(part)), None)
+        if first is not None:
+            parts = path.split("/")
+            found = ["/".join(parts[:first])]
+            for part in parts[first:]:
+                found = [
+                    one for folder in found for one in self._inside(folder) if fnmatchcase(one.rpartition("/")[2], part)
+                ]
+        return [self._url(one) for one in sorted(found) if first is not None or self._exists(one)]
 
     def files(self, path: str) -> Mapping[str, FileState]:
         """Return every file below a URL, by its relative name. A URL of a file gives this file, named ""."""
         root = self._path(path)
-        found = self._try(path, lambda: self._fs.find(root, detail=True))
+        try:
+            found = dict(self._fs.find(root, detail=True, on_error="raise"))  # By default a folder that fails is left out.
+        except OSError:
+            found = self._walk(root)
         return {str(name)[len(root) :].lstrip("/"): _state(info) for name, info in sorted(found.items())}
 
     def fetch(self, path: str, to: Path) -> Path:
@@ -160,6 +173,34 @@ class RemoteSource:
         there = [f"{root}/{name}" if name else root for name in names]
         self._try(path, lambda: self._fs.get(there, [str(file) for file in here]))
         return copy
+
+    def _walk(self, root: str) -> dict[str, Any]:
+        """Return every file below a path, folder by folder, so that a call that fails is tried again alone."""
+        found, left = {}, [root]
+        while left:
+            for name, info in self._inside(left.pop()).items():
+                if info["type"] == "directory":
+                    left.append(name)
+                else:
+                    found[name] = info
+        return found
+
+    def _inside(self, folder: str) -> dict[str, Any]:
+        """Return what is directly in a folder, by its path, and a file itself. Nothing if the folder is not there."""
+        try:
+            entries = self._try(folder, lambda: self._fs.ls(folder, detail=True))
+        except FileNotFoundError:
+            return {}
+        named = {str(one["name"]).rstrip("/"): one for one in entries}
+        return {name: one for name, one in named.items() if name != folder or one["type"] == "file"}
+
+    def _exists(self, path: str) -> bool:
+        """Return whether something is at a path. The store's own `exists` also says no when it does not answer."""
+        try:
+            self._try(path, lambda: self._fs.info(path))
+        except FileNotFoundError:
+            return False
+        return True
 
     def _path(self, url: str) -> str:
         return str(self._fs._strip_protocol(url)).rstrip("/")

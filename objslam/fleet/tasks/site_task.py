@@ -57,7 +57,7 @@ class SiteTask:
 
 @dataclass(frozen=True, slots=True)
 class SiteResult:
-    """What a site is: the sessions and objects of its largest island, and of all. changed: whether anything was written."""
+    """What a site is: the sessions and objects of its largest island, and of all. changed: whether this run wrote it."""
 
     site: str
     islands: int
@@ -74,27 +74,49 @@ def folder_of(name: str) -> str:
 
 
 def finish_site(given: SiteTask) -> SiteResult:
-    """Write the folder and the tables of a site, as far as they are not there. The errors are those of the store."""
+    """Write the folder and the tables of a site, as far as they changed. The errors are those of the store."""
     store = open_store(given.store)
     islands = load_node(store, given.root)
     at = f"{SITES}/{folder_of(given.site)}"
-    state = _state(store, f"{at}/{_STATE}")
-    wanted = key_of("site", given.root, *(f"{one.key} {one.path} {one.robot} {one.day}" for one in given.members))
-    changed = state.get("made_of") != wanted or state.get("price") != str(given.price)
-    if changed:
-        _write_folder(store, given, islands, at, int(state.get("islands", 0)))
-        days = _write_tables(store, given, islands, state.get("days", {}))
-        said = {"made_of": wanted, "price": str(given.price), "islands": len(islands), "days": days}
-        store.write(f"{at}/{_STATE}", dump_json(said).encode())
+    state = _parse_state(store.read_many([state_name(given.site)]).get(state_name(given.site)))
+    _write_folder(store, given, islands, at, int(state.get("islands", 0)))
+    days = _write_tables(store, given, islands, state.get("days", {}))
     first = islands[0]
     sessions = sum(len(one.sessions) for one in islands)
-    return SiteResult(given.site, len(islands), sessions, len(first.objects), len(first.objects.gone), changed)
+    said = {
+        **{"made_of": _made_of(given), "days": days, "islands": len(islands), "sessions": sessions},
+        **{"objects": len(first.objects), "gone": len(first.objects.gone)},
+    }
+    store.write(state_name(given.site), dump_json(said).encode())
+    return _result(given.site, said, changed=True)
 
 
-def _state(store: Store, name: str) -> dict[str, Any]:
+def state_name(site: str) -> str:
+    """Return the name of the file that says what a site was made of."""
+    return f"{SITES}/{folder_of(site)}/{_STATE}"
+
+
+def as_before(given: SiteTask, state: bytes | None) -> SiteResult | None:
+    """Return the site if it was made of the same before, by the content of its `state_name`. None if its task must run."""
+    said = _parse_state(state)
+    return _result(given.site, said, changed=False) if said.get("made_of") == _made_of(given) else None
+
+
+def _made_of(given: SiteTask) -> str:
+    members = (f"{one.key} {one.path} {one.robot} {one.day}" for one in given.members)
+    return key_of("site", given.root, str(given.price), *members)
+
+
+def _result(site: str, said: Mapping[str, Any], *, changed: bool) -> SiteResult:
+    counts = {name: int(said[name]) for name in ("islands", "sessions", "objects", "gone")}
+    return SiteResult(site=site, changed=changed, **counts)
+
+
+def _parse_state(data: bytes | None) -> dict[str, Any]:
+    """Return what the file of a site says, nothing if it is missing or damaged."""
     try:
-        said = json.loads(store.read(name))
-    except (FileNotFoundError, ValueError):
+        said = json.loads(data or b"{}")
+    except ValueError:
         return {}
     return said if isinstance(said, dict) else {}
 
