@@ -61,10 +61,10 @@ def test_folders_name_site_robot_and_day(tmp_path):
 def test_a_store_that_throws_now_and_then_hides_no_log(tmp_path):
     for k in range(40):
         touch(tmp_path, f"site_{k % 4}/log_{k}/camera.yaml", f"site_{k % 4}/log_{k}/cameras/a/rgb/1.png")
-    here = [one.path for one in found(tmp_path)]
+    here = [(one.path, one.size) for one in found(tmp_path)]
     assert len(here) == 40
-    assert [one.path.removeprefix("flaky://") for one in found(f"flaky://{tmp_path}")] == here
-    assert [one.path.removeprefix("flaky://") for one in found(f"flaky://{tmp_path}/*/log_*")] == here
+    for source in (tmp_path, f"{tmp_path}/*/log_*"):  # fsspec's own listing leaves out a folder that fails.
+        assert [(one.path.removeprefix("flaky://"), one.size) for one in found(f"flaky://{source}")] == here
     assert len(found(f"flaky://{tmp_path}/site_[12]/log_1?")) == 5
     with pytest.raises(LogError, match="nothing is there"):
         found(f"flaky://{tmp_path}/nothing")

@@ -6,6 +6,7 @@ Ray places the tasks and runs them again when a node is lost. Results go to the 
 from __future__ import annotations
 
 import atexit
+import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -17,6 +18,8 @@ from objslam.fleet.engines.worker import Limits, Worker
 
 _QUEUED = 2
 """How many tasks are submitted for each CPU of the cluster. A larger number keeps more tasks ready, and loses none."""
+_PATIENT = 10.0
+"""How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
 _GB = 1e9
 
 _worker = Worker()
@@ -43,9 +46,12 @@ def join_cluster(address: str) -> Cluster:
     except ModuleNotFoundError as error:
         raise ObjslamError("Ray is not installed", hint="pip install objslam[fleet]") from error
     hint = "start one with ray start, or leave --ray out to use the processes of this machine"
+    host, mark, port = address.removeprefix("ray://").rpartition(":")
     try:
+        if mark and port.isdigit():  # Ray itself waits for minutes where nobody listens.
+            socket.create_connection((host.strip("[]"), int(port)), _PATIENT).close()
         context = ray.init(address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
         raise ObjslamError(f"no Ray cluster answers: {first_line(error)}", where=address, hint=hint) from error
     found = ray.cluster_resources()
     return Cluster(found.get("CPU", 0.0), found.get("GPU", 0.0), str(getattr(context, "dashboard_url", "") or ""))

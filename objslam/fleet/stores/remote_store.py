@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar
 
-from objslam.errors import ObjslamError, first_line
+from objslam.errors import ConfigError, ObjslamError, first_line
 from objslam.fleet.stores.store import FileState, StoreError
 
 _TRIES = 5
@@ -140,7 +140,7 @@ class RemoteSource:
         """Return the URLs that a URL or a glob pattern names, in order; none if nothing is there."""
         path = self._path(pattern)
         if "**" in path:
-            return [self._url(one) for one in sorted(self._try(pattern, lambda: self._fs.glob(path, on_error="raise")))]
+            raise ConfigError(f"** is not known in URLs: {pattern}", hint="name a folder, which is searched for logs")
         found, first = [path], next((n for n, part in enumerate(path.split("/")) if _MAGIC.search(part)), None)
         if first is not None:
             parts = path.split("/")
@@ -154,10 +154,7 @@ class RemoteSource:
     def files(self, path: str) -> Mapping[str, FileState]:
         """Return every file below a URL, by its relative name. A URL of a file gives this file, named ""."""
         root = self._path(path)
-        try:
-            found = dict(self._fs.find(root, detail=True, on_error="raise"))  # By default a folder that fails is left out.
-        except OSError:
-            found = self._walk(root)
+        found = self._try(path, lambda: self._fs.find(root, detail=True)) if self._is_flat() else self._walk(root)
         return {str(name)[len(root) :].lstrip("/"): _state(info) for name, info in sorted(found.items())}
 
     def fetch(self, path: str, to: Path) -> Path:
@@ -173,6 +170,15 @@ class RemoteSource:
         there = [f"{root}/{name}" if name else root for name in names]
         self._try(path, lambda: self._fs.get(there, [str(file) for file in here]))
         return copy
+
+    def _is_flat(self) -> bool:
+        """Return whether the file system lists all below a path in few calls, as object stores do.
+
+        It then has a `find` of its own. That of fsspec goes from folder to folder, and leaves out a folder that fails.
+        """
+        from fsspec.asyn import AsyncFileSystem
+
+        return isinstance(self._fs, AsyncFileSystem) and type(self._fs)._find is not AsyncFileSystem._find
 
     def _walk(self, root: str) -> dict[str, Any]:
         """Return every file below a path, folder by folder, so that a call that fails is tried again alone."""
