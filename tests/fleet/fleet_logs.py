@@ -1,10 +1,8 @@
-"""Small logs of a fleet, a store that fails now and then, and tasks for the engines."""
+"""Small logs of a fleet, and a store that fails now and then."""
 
 from __future__ import annotations
 
 import itertools
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ from fsspec.implementations.local import LocalFileSystem
 
 from objslam.core.geometry import lift_se2
 from objslam.core.types import Log
-from objslam.errors import LogError
 from objslam.mapping.localization import moved_log
 from objslam.simulation import preset, simulate
 from objslam.sources.log_folder import write_log_folder
@@ -78,36 +75,3 @@ class Flaky(LocalFileSystem):
 
 
 fsspec.register_implementation("flaky", Flaky, clobber=True)
-
-
-def process(argument: int) -> tuple[int, int]:
-    """The number of the process, and the argument."""
-    return os.getpid(), argument
-
-
-def die(file: str) -> str:
-    """End the process by a signal the first time, as the system does when it is out of memory."""
-    if not Path(file).exists():
-        Path(file).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return "alive"
-
-
-def crash(_: object) -> None:
-    """End the process as a fault in native code does."""
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
-def fill(size: int) -> int:
-    """Take as many bytes of memory."""
-    return int(np.ones(size, dtype=np.uint8).sum())
-
-
-def hang(_: object) -> None:
-    """Never return."""
-    signal.pause()
-
-
-def refuse(argument: str) -> None:
-    """Fail as a run fails."""
-    raise LogError("no camera", where=argument, hint="add one")

@@ -1,13 +1,13 @@
 """The processes of a fleet: tasks, limits, and processes that die."""
 
 import pytest
-from fleet import fleet_logs
+from fleet import works
 
 from objslam.errors import LogError
 from objslam.fleet.engines.local_engine import local_engine
 from objslam.fleet.engines.worker import LimitError, Limits, LostError, Worker
 
-WORK = f"{fleet_logs.__name__}:"
+WORK = f"{works.__name__}:"
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_an_engine_that_is_left_ends_its_processes():
     first, _ = next(answers).value
     answers.close()
     with pytest.raises(ProcessLookupError):
-        fleet_logs.os.kill(first, 0)
+        works.os.kill(first, 0)
 
 
 def test_an_engine_takes_arguments_as_it_needs_them():

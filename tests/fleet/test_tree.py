@@ -30,14 +30,14 @@ def merged(sessions, visits):
 
 def test_pairs_of_pairs_give_the_map_of_one_merge():
     place, days = Place(np.random.default_rng(1), count=24), []
-    for day in range(12):
-        if day in (5, 9):
+    for day in range(8):
+        if day in (3, 6):
             place.change(0.15, day)
         days.append(session(place, day)[0])
     once = merge_sessions(days)[0].objects
     nodes = []
-    for k in range(0, 12, 4):
-        group = days[k : k + 4]
+    for k in range(0, 8, 2):
+        group = days[k : k + 2]
         nodes.append(merged(group, [(Visit(one, np.eye(4)),) for one in group])[0])
     for _ in range(2):
         pairs = [nodes[k : k + 2] for k in range(0, len(nodes), 2)]
