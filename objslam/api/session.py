@@ -11,7 +11,7 @@ from typing import Any, Self
 from numpy.typing import ArrayLike
 
 from objslam.api.array_input import as_pose
-from objslam.api.mapping import Given, settings_of
+from objslam.api.mapping import Given, prior_map, settings_of
 from objslam.api.result import Result
 from objslam.core.arrays import Floats
 from objslam.core.snapshot import Snapshot
@@ -35,7 +35,9 @@ class Session(LiveSession):
 
     settings: as in `objslam.run`; the mode is always joint. journal: a file that keeps every accepted message, so that a
     killed program loses nothing. resume: whether to continue an existing journal. patient: whether old frames are accepted
-    too. It is for a program that waits for the session (`wait`) now and then, such as a replay.
+    too. It is for a program that waits for the session (`wait`) now and then, such as a replay. map: the map of another day,
+    or its file or result folder. Once the session is found in it, `snapshot().in_map` says so, and snapshots and result are
+    in its frame.
     """
 
     def __init__(
@@ -46,10 +48,12 @@ class Session(LiveSession):
         resume: bool = False,
         name: str = "live",
         patient: bool = False,
+        map: ObjectMap | str | PathLike[str] | None = None,
         **changes: Any,
     ) -> None:
         chosen = settings_of(settings, {**changes, "mode": "joint"})
-        super().__init__(chosen, None if journal is None else Path(journal), resume, name, patient)
+        known = None if map is None else prior_map(map)
+        super().__init__(chosen, None if journal is None else Path(journal), resume, name, patient, known)
 
     def __enter__(self) -> Self:
         return self.start()

@@ -32,6 +32,18 @@ class CameraFrame:
 
 
 @dataclass(frozen=True)
+class InPriorMap:
+    """What a session knows about its place in a prior map.
+
+    objects: how many of its objects were found there, 0 while the place is unknown. line: the same and the evidence, as a
+    sentence.
+    """
+
+    objects: int
+    line: str
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """The state of a session at one moment.
 
@@ -42,7 +54,8 @@ class Snapshot:
     were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
     image. calibration: the shared errors that the session corrects in its measurements, None if it corrects none.
     map_T_odom: (4, 4) the pose of the odometry's frame in the map at the newest keyframe (REP 105), for the odometry as
-    received. None if the odometry does not cover this keyframe.
+    received. None if the odometry does not cover this keyframe. in_map: the place in a prior map, None without such a map or
+    before the first search for it. Once the place is known, everything is in the frame of the prior map.
     """
 
     stamp: float
@@ -57,3 +70,4 @@ class Snapshot:
     frames: tuple[CameraFrame, ...] = ()
     calibration: Calibration | None = None
     map_T_odom: Floats | None = None
+    in_map: InPriorMap | None = None

@@ -16,6 +16,7 @@ from objslam.cli.live_command.status import status_line, times
 from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:
+    from objslam.core.result import RunResult
     from objslam.core.snapshot import Snapshot
     from objslam.core.types import Truth
     from objslam.live.adapters import Feed
@@ -66,7 +67,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
     from objslam.live.session import low_latency
 
     low_latency.configure()
-    stop, ended, broken = threading.Event(), list[Exception](), None
+    stop, ended, broken, localised = threading.Event(), list[Exception](), None, False
 
     def bring() -> None:
         try:
@@ -91,6 +92,10 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
                 if time.monotonic() >= due:
                     due = time.monotonic() + interval
                     snapshot = session.snapshot()
+                    found = snapshot.in_map is not None and snapshot.in_map.objects > 0
+                    if snapshot.in_map is not None and found and not localised:
+                        say(snapshot.in_map.line, stderr=True)
+                    localised = found
                     latest.try_write(snapshot)
                     for view in feed.views:
                         view(snapshot)
@@ -106,9 +111,12 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 
 def finish(
     session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
-) -> None:
-    """End the session, write its result, and print a summary. Then raise the error of the session or `broken`, if any.
-    An error of the session becomes an ObjslamError. If there is no result, the last snapshot is written to objects.json."""
+) -> RunResult:
+    """End the session, write its result, print a summary, and return the result.
+
+    Then the error of the session or `broken`, if any, is raised. An error of the session becomes an ObjslamError. If there
+    is no result, the last snapshot is written to objects.json.
+    """
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
 
@@ -133,6 +141,7 @@ def finish(
         raise _ended_early(session.failure, out, "the map holds the messages until then") from session.failure
     if broken is not None:
         raise broken
+    return result
 
 
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:

@@ -84,8 +84,12 @@ class Track:
             )
         ]
         self.drift = drift
+        self.realign(graph)
+
+    def realign(self, graph: IncrementalGraph) -> None:
+        """Place its rays at the current camera poses of the graph, after these poses have moved."""
         obs = self.sight(graph)
-        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, ranges, range_sigmas])
+        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, obs.range, obs.range_sigma])
         self._lines = list(lines[-_RECENT:])
 
     def move(self, new_T_old: Floats) -> None:
