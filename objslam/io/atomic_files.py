@@ -89,7 +89,8 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
 
 @contextmanager
 def _replaced(file: Path) -> Iterator[BinaryIO]:
-    """Yield a stream to a temporary file, and rename that to `file` at the end. After an error, it is deleted."""
+    """Yield a stream to a temporary file, which is renamed to `file` at the end. After an error, the temporary file is
+    deleted."""
     temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
         remove_leftovers(file)

@@ -17,7 +17,7 @@ from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
 _READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
-_UNIT = 1e-3  # The largest difference of the length of a direction from 1. A larger value accepts worse directions.
+_UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
 _T = TypeVar("_T")
 
 
@@ -26,7 +26,8 @@ class _Malformed(OutputError):
 
 
 def dump_objects(objects: ObjectMap) -> str:
-    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. NaN becomes null."""
+    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. Other numbers become
+    null."""
     return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone])
 
 

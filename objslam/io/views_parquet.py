@@ -21,7 +21,7 @@ _BETWEEN = "\n---\n"  # The line between the texts of two cameras.
 
 @dataclass(frozen=True)
 class Views:
-    """F camera frames in the order of time. margin, margin_share: as `rays.border` and `rays.border_share` of the run.
+    """F camera frames in the order of time. margin (px), margin_share: `rays.border` and `rays.border_share` of the run.
 
     stamps: (F,) s. camera: (F,) index into cameras. map_T_camera: (F, 4, 4).
     """
