@@ -77,7 +77,8 @@ def _reach(settings: DriveSettings, size: Floats) -> Floats:
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """Make boxes of visible objects, with noise and misses. label: (N,) of each object. first_id: the id of object 0."""
+    """Make boxes of visible objects, with noise and misses. label: (N,) the label of each object, as an index into the
+    classes. first_id: the id of object 0."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))
