@@ -95,7 +95,7 @@ class AssociationSettings(Section):
     method: Literal["auto", "global", "by_label"] = "auto"
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
-    joint mode, if many rays miss, they are judged again with the noise of the log instead of that in the settings."""
+    joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects more slowly."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
@@ -111,7 +111,7 @@ class AssociationSettings(Section):
     """Minimum log odds that the current landmarks are landmarks of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
     """Minimum lead in log odds of the best place over the second-best place. A smaller lead closes no loop. A larger value
-    separates similar places."""
+    confuses fewer similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 
@@ -193,7 +193,7 @@ class Live(Section):
     """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
     of less than 50 times this size, it is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
-    """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
+    """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200
     """Number of keyframes at which the session first estimates the shared errors. It estimates them again whenever the
     number of keyframes has grown by half. 0 estimates them only at the end of the session."""

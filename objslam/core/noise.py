@@ -29,7 +29,8 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the noise of the odometry multiplied. `rays_with_noise` does this for rays and ranges."""
+        """Return the settings with the odometry noise multiplied by its factors. The noise of rays and ranges stays, because
+        `rays_with_noise` multiplies it."""
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -43,7 +44,7 @@ class NoiseFactors:
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with the noise of their directions and of their ranges multiplied."""
+        """Return rays with the noise of their directions and of their ranges multiplied by its factors."""
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,

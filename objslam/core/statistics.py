@@ -18,7 +18,7 @@ SAME_POINT_WIDE = 16.266
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-The share 99.73 % is that of a Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
+99.73 % of a Gaussian is within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
 """The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
 cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""

@@ -112,7 +112,7 @@ class Images:
 class CameraLog:
     """The data of one camera.
 
-    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds all the time.
+    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera is valid all the time.
     """
 
     camera: Camera

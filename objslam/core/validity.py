@@ -37,8 +37,8 @@ _ASYMMETRY = 1e-6
 """The largest difference of two mirrored entries of a covariance, as a share of the product of the two standard deviations.
 A larger share accepts numbers that were rounded to fewer digits."""
 _NOTHING = 1e-200
-"""The variance, in the square of any unit, up to which it counts as 0. Products of smaller numbers have few digits left. A
-larger value leaves more correlations unjudged."""
+"""The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few digits left. A
+larger value leaves more correlations unchecked."""
 _NEGATIVE = 1e-6
 """How far below zero the least eigenvalue of a correlation matrix may be, and how far beyond 1 a correlation. A larger value
 accepts numbers that were rounded to fewer digits."""
@@ -116,7 +116,7 @@ def covariance_fault(covariance: Floats) -> str | None:
 def camera_fault(camera: Camera) -> str | None:
     """Return what is wrong with a camera whose fields have the right types, in words that follow "camera"; None if valid.
 
-    The pose of the camera must be rigid already, because `rigid_pose` returns the exact one.
+    The pose of the camera is only checked. `rigid_pose` returns the exact pose.
     """
     matrix = camera.matrix
     if matrix.shape != (3, 3) or not (np.abs(matrix) < MAX_PIXEL).all():
@@ -149,7 +149,7 @@ def is_name(value: object) -> bool:
 
 
 def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
-    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop the others.
+    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop a box that does not.
 
     scores: (M,). names: (M,) whether the label of each box `is_name`.
     """

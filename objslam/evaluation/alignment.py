@@ -149,7 +149,7 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
     chosen = np.flatnonzero(likely)
     if len(chosen) > _MAX_STARTS:
         chosen = np.sort(np.random.default_rng(0).choice(chosen, _MAX_STARTS, replace=False))
-    if len(chosen) == 0:  # without a consistent pair, only positions are aligned
+    if len(chosen) == 0:  # Without a consistent pair, each start aligns one object.
         return [Transform(*align(source[[i[c]]], target[[k[c]]], kind)) for c in range(min(len(i), _MAX_REFINED))]
     first, second, a, b = first[chosen], second[chosen], a[chosen], b[chosen]
     yaw = np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[:, 1], a[:, 0])

@@ -155,7 +155,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
 
 
 def _swap(staging: Path, folder: Path, files: FileSet) -> tuple[str, ...]:
-    """Replace the old files by the staged files. In this order, a killed process never leaves a mix of two sets."""
+    """Replace the old files by the staged files, in an order in which a killed process never leaves a mix of two sets."""
     old = files.names(folder)
     removed = tuple(name for name in old if (folder / name).exists() and not (staging / name).exists())
     _write(staging / _SWAPPING, b"")

@@ -102,7 +102,7 @@ def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Float
     scale = np.sqrt(np.diagonal(matrix))
     matrix = (matrix + matrix.T) / 2
     try:
-        np.linalg.cholesky(matrix / np.outer(scale, scale))  # of the correlation, because the units differ
+        np.linalg.cholesky(matrix / np.outer(scale, scale))  # The correlation is tested, because the units differ.
     except np.linalg.LinAlgError:
         raise ValueError(f"{key} is not positive definite") from None
     return matrix

@@ -147,7 +147,7 @@ def _fault(rays: RaysTable) -> str | None:
         (angles[0] & angles[1], "a residual that is not an angle"),
         ((rays.weight >= 0) & (rays.weight <= 1), "a weight outside 0 to 1"),
         (valid_depths(rays.sigma), "a sigma that is not above zero"),
-        ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that cannot be"),
+        ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that is not valid"),
         *boxes,
     )
     return next((fault for fine, fault in rules if not fine.all()), None)

@@ -32,7 +32,11 @@ class Views:
 
 @dataclass(frozen=True)
 class Boxes:
-    """M boxes of one camera in any order. object: (M,) the id of the object in each box, -1 for a false box."""
+    """M boxes of one camera in any order.
+
+    frame: (M,) the index of the image. object: (M,) the id of the object in each box, -1 for a false box. label: (M,) index
+    into the classes. box: (M, 4) x1, y1, x2, y2, px. score: (M,). depth: (M,) z, m, NaN without a depth.
+    """
 
     frame: Ints
     object: Ints
