@@ -95,7 +95,7 @@ def _walk(file: BinaryIO, at: int, end: int, reading: _Reading) -> Messages:
 
 
 def _records(data: bytes, reading: _Reading) -> Messages:
-    """Yield the messages of an unpacked chunk, up to the last whole record."""
+    """Yield the wanted messages of an unpacked chunk, up to the last whole record."""
     at, end = 0, len(data)
     while at + _RECORD.size <= end:
         op, size = _RECORD.unpack_from(data, at)
@@ -118,7 +118,7 @@ def _records(data: bytes, reading: _Reading) -> Messages:
 
 
 def _record(op: int, data: bytes, reading: _Reading) -> Messages:
-    """Store a schema or channel, or yield a message that is outside of all chunks."""
+    """Store a schema or channel, or yield a wanted message that is outside of all chunks."""
     try:
         if op == _SCHEMA:
             (key,) = _U16.unpack_from(data)
@@ -150,7 +150,7 @@ def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
 
 
 def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
-    """Return the records of a chunk, or with `cut` the readable part of the records."""
+    """Return the unpacked records of a chunk. With `cut`, return the part of them that can be unpacked."""
     try:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)
