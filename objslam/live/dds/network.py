@@ -98,7 +98,7 @@ def _settings(interface: str | None) -> tuple[str, str]:
     if interface is None and os.environ.get(_URI):
         return _URI, os.environ[_URI]
     if interface in (None, LOOPBACK):
-        # a loopback interface may lack multicast, so participants are found at the ports of their index
+        # A loopback interface may lack multicast. So participants look for each other at the ports of all indices.
         peers = '<Peers><Peer address="127.0.0.1"/></Peers>'
         index = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
         chosen = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces><AllowMulticast>false</AllowMulticast>'
@@ -154,7 +154,7 @@ def _listen(reading: int, unread: Counter[str]) -> None:
 
 
 def receive_buffer() -> int | None:
-    """Return the largest socket buffer that the system allows, bytes; None if unknown."""
+    """Return the largest socket buffer that the system allows, bytes, None if unknown."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):

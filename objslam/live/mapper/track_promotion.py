@@ -62,7 +62,7 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:
-    """Return the position of a track's object if `fit_if_observable` finds one. A track is tried again only after growth."""
+    """Return the position of a track's object if `fit_if_observable` finds one. After a failure, it must grow first."""
     live, rays = settings.live, len(track.rays)
     unchanged = rays < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread
     if rays < live.min_rays or unchanged:
@@ -99,7 +99,8 @@ def fit_if_observable(
 def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
-    Labels with most tracks lose tracks first. Within a label, short tracks go first, then the longest unseen ones.
+    Labels with most tracks lose tracks first. Within a label, tracks with fewer than live.min_rays rays go first, and among
+    equals the longest unseen ones.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return
