@@ -14,7 +14,7 @@ from objslam.core.types import CameraLog, Images, Log, Trajectory
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 """The errors of odometry."""
 AXES = ("roll", "tilt", "yaw")
-"""The rotations of a camera on the base, about x, y and z."""
+"""The rotations of a camera on the robot, about the axes x, y and z of base."""
 _SQUEEZED = 1e-3
 """A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2

@@ -56,7 +56,10 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements."""
+        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements.
+
+        The set is empty in fixed mode, and if odometry is not used.
+        """
         of, default = self.settings, Settings()
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()

@@ -7,7 +7,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
 _STEEP = 60.0  # The elevation, degrees, from which a camera looks up or down in the text. With a larger value, fewer do.
 _LEVEL = 5.0  # The elevation and tilt, degrees, up to which the text omits them. A larger value omits more of them.
-_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is above this. Real lenses stay below 1.1.
+_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is above this. Real lenses stay below 1.1. More reports fewer.
 
 
 def view_of(camera: Camera) -> str:
@@ -26,7 +26,7 @@ def view_of(camera: Camera) -> str:
 
 
 def doubts_of(camera: Camera) -> list[str]:
-    """Return a line for each property of a calibration that few cameras have."""
+    """Return a line for each unusual property of a camera's calibration."""
     doubts = []
     if np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6):
         doubts.append(

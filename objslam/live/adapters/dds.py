@@ -18,7 +18,7 @@ _LONELY = 5.0  # The time without a matching publisher, s, after which the user 
 _TAKE = 200  # The most messages of one call to a reader. A larger number makes fewer calls, and takes more memory.
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
 _MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images bring a warning. A larger value warns more often.
-_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether it is transient-local, so that old messages are kept.
+_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
 
 @dataclass
@@ -115,7 +115,7 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # transforms and calibrations first
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Transforms and calibrations first.
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 

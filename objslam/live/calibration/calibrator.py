@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""The growth factor of keyframes between two calibrations. A larger factor calibrates more rarely. With any factor above 1,
-the work of all calibrations together grows linearly with the session."""
+"""The growth factor of the number of keyframes between two calibrations. A larger factor calibrates more rarely. With any
+factor above 1, the work of all calibrations together grows linearly with the session."""
 _DELAY = 0.15
 """The keyframes between the start of a calibration and the correction of the map, as a share of the keyframes at the start.
 With a larger share, the correction comes later, but its keyframe depends less on the speed of the machine."""

@@ -125,7 +125,7 @@ def _shift_times(m: MapState, times: Floats) -> None:
 
 
 def _move_start(m: MapState, before: Floats) -> None:
-    """Move the whole map with the first keyframe. `before` is the pose (4, 4) at which this keyframe was fixed."""
+    """Move the whole map with the first keyframe, and fix it there. before: (4, 4) its camera pose before the correction."""
     now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
     m.graph.drop_absolute()
     m.move(now @ inverse(before))
@@ -151,7 +151,7 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 def _solve(m: MapState) -> None:
     """Move the estimate to the corrected measurements, at once or over the next keyframes.
 
-    The next full solve tests the rays again. Until then, the rays of one object may look like the rays of two.
+    The next full solve tests the rays again. Before that, they may still look like the rays of two objects.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

@@ -1,4 +1,4 @@
-"""Estimate shared errors in a separate process. While GTSAM solves, no other thread of its process runs."""
+"""Estimate shared errors in a separate process, because GTSAM stops all other threads of its process while it solves."""
 
 from __future__ import annotations
 

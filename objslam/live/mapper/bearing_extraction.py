@@ -14,7 +14,7 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The newest mounts that are kept of a camera. With more, its frames may come later. More cost memory.
+_MOUNTS = 4096  # How many mounts of a camera are kept. With more, its frames may arrive later. More cost memory.
 
 
 @dataclass(frozen=True)

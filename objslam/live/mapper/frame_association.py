@@ -17,9 +17,9 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, over the largest observed distance. A larger factor costs time.
-_NEAR = 10.0  # The distance (m) up to which no landmark is too far to be a candidate. A larger distance costs time.
-_ROUGH = 3.0  # The image area above which a prediction is rough, over that of a ray's noise. More removes fewer matches.
+_BEYOND = 1.5  # The largest distance to a candidate, as a multiple of the largest observed distance. More costs time.
+_NEAR = 10.0  # Up to this distance (m), a landmark is never too far to be a candidate. A larger distance costs time.
+_ROUGH = 3.0  # A prediction is rough if its image area is this many times that of a ray's noise. More removes fewer matches.
 _CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value trusts more single boxes.
 _BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.

@@ -20,8 +20,8 @@ from objslam.live.mapper.state import MapState
 _ANCHORS = 3  # The past keyframes that are tried as the start of the loop. More keyframes take longer.
 _NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value leaves more to iSAM2.
 _TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. More leaves more to iSAM2.
-_AROUND = 6.0  # The radius (m) around recognised landmarks in which other ones match again: about the view in a hall.
-_ERA = 15.0  # The most time (s) between the last sight of recognised landmarks and of those _AROUND. With more, more match.
+_AROUND = 6.0  # Other landmarks within this radius (m) of recognised ones match again. Cameras see about as far in a hall.
+_ERA = 15.0  # The most time (s) between the last sights of recognised landmarks and of those _AROUND. With more, more match.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.

@@ -21,13 +21,13 @@ from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
-_GROWING = 3  # The keyframe in each period that bounds growth. It differs from _CLOSING to spread the delay.
-_CLOSING = 6  # The keyframe in each period that merges and removes landmarks.
+_GROWING = 3  # The keyframe of each period after which growth is bounded. It differs from _CLOSING to spread the delay.
+_CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed.
 _BREATH = 2  # The period of early relinearisations, in keyframes. With a larger period, the map settles later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
-_GROWTH = 1.5  # The growth factor of keyframes between full solves. A larger factor keeps errors of first estimates longer.
+_GROWTH = 1.5  # The growth of the number of keyframes between full solves. A larger factor keeps first errors for longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
-_LARGE = 400  # The keyframes above which relinearisation in slices replaces the full solve, because frames cannot wait.
+_LARGE = 400  # The number of keyframes above which a rebuild in slices replaces the full solve. More delay the next frame.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
@@ -60,7 +60,7 @@ def maintain(m: MapState) -> None:
 
 
 def _coming(m: MapState) -> Ints:
-    """Return the landmarks (n,) that the camera of the newest keyframe sees, or may see soon."""
+    """Return the ids (n,) of the landmarks that the camera of the newest keyframe sees, or may see soon."""
     landmarks, keyframes = m.landmarks, m.keyframes
     if not len(landmarks.id):
         return landmarks.id

@@ -26,8 +26,8 @@ TrackRay = tuple[int, int, Floats, float, float, float]
 class Track:
     """The rays of one object that is not a landmark yet.
 
-    label: its number. by_label: whether its rays were grouped by label alone. It then stays however long it is unseen.
-    first, last: stamps, s, of its first and last observation. drift: (6, 6) odometry drift at the last observation.
+    label: its number. by_label: whether its rays were grouped by label alone. Such a track is not dropped when it is long
+    unseen. first, last: stamps, s, of its first and last observation. drift: (6, 6) odometry drift at the last observation.
     position, covariance: (3,) m and (3, 3) m^2 in map, from the camera poses at the time of each ray. spread: rad, the
     widest angle between a ray and the first ray. tried, tried_spread: the number of rays and the spread at the last attempt
     to make a landmark.

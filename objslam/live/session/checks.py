@@ -150,7 +150,7 @@ def sound_frame(
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array. None if they form no array, or are not numbers (truth values are none)."""
+    """Copy values into an array. None if they form no array of numbers. Truth values are not numbers here."""
     if not _is_short(values, scalar=True):
         return None
     try:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The consecutive older poses that show that the clock was set back. A larger number is surer, but slower.
+_SURE = 5  # The number of older poses in a row that shows that the clock was set back. A larger one is surer, but slower.
 _BACK = 0.5  # The least step back of a clock that is set back, s. A pose that is back by less counts as late.
 _LEAP = 60.0  # The least step ahead that a second pose must confirm, s. With a larger one, a wrong stamp does more harm.
 _KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
@@ -56,7 +56,10 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return any other stamp in session time. The newest shift that puts it between `oldest` and `latest` is used."""
+        """Return a stamp that does not set the clock, in session time. oldest, latest: session time, s.
+
+        The newest shift that puts the stamp between the two is used. If no shift does, the newest is used.
+        """
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:
                 return stamp + shift

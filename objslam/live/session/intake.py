@@ -56,7 +56,7 @@ class Intake:
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
-        self._stamps: dict[str, dict[float, None]] = {}  # by camera, in the order of arrival
+        self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
         self._start_T_odom = np.eye(4)
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)

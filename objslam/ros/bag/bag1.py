@@ -1,7 +1,7 @@
 """Read ROS 1 bags (format 2.0) record by record from the front, so that damage affects only the records that it hits.
 
 The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes give only the connections, and how many
-messages should be there.
+messages the bag should have.
 """
 
 import io
@@ -71,7 +71,7 @@ def _walk(stream: BinaryIO, at: int, end: int, reading: _Reading, chunks: bool =
             connection = reading.connections.get(_number(fields, b"conn"))
             reading.chunk_read += 1
             if connection is None or size > MAX_RECORD:
-                why = "an undescribed connection" if connection is None else f"more than {MAX_RECORD >> 20} MiB"
+                why = "a connection without a description" if connection is None else f"more than {MAX_RECORD >> 20} MiB"
                 report.damage(f"messages of {why}", 1)
                 continue
             report.messages += 1

@@ -35,9 +35,10 @@ class _Reading(Reading):
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of an MCAP file in file order. It may be damaged or unclosed. `report` lists missing parts.
+    """Yield the wanted messages of an MCAP file in file order. `report` lists missing parts.
 
-    A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC is skipped.
+    The file may be damaged or unclosed. A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC
+    is skipped.
     """
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
@@ -108,7 +109,7 @@ def _records(data: bytes, reading: _Reading) -> Messages:
             channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(data, start)
             connection = reading.connections.get(channel)
             if connection is None:
-                reading.report.damage("messages of an undescribed channel", 1)
+                reading.report.damage("messages of a channel without a description", 1)
                 continue
             reading.report.messages += 1
             if reading.wanted(connection):

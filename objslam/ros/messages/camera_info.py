@@ -19,7 +19,7 @@ _MODELS = {
     "plumb bob": "plumb_bob",
     "rational polynomial": "rational_polynomial",
 }  # The distortion models by the alternative names that drivers use.
-_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # With D zero, they have no distortion.
+_UNDISTORTED = ("", "none", "plumb_bob", "rational_polynomial", "equidistant")  # Models without distortion if D is zero.
 _HINT = "--camera-info FILE can give the calibration"
 
 
@@ -32,7 +32,7 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
     the message, for errors. Raises LogError if the camera is not calibrated or its distortion is invalid.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
-    if rectified and not values.any() and not _values(info, "D").any():  # P is unset, and without distortion K holds.
+    if rectified and not values.any() and not _values(info, "D").any():  # P is unset. Without distortion, K is right.
         values = _values(info, "K")
     across, down = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     region = info.roi  # K and P are for the full image before region of interest and binning.

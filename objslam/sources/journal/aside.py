@@ -15,7 +15,7 @@ from objslam.sources.journal.segments import holds_messages
 def set_aside(file: Path) -> Path | None:
     """Rename the journal `file` so that a new one can be written, and return its new path.
 
-    The new name has the first free number, as journal.1.objslam. If there is no journal, or one without messages, nothing is
+    The new name has the first free number: journal.1.objslam. If there is no journal, or one without messages, nothing is
     renamed and None is returned.
     Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
     """
@@ -52,7 +52,7 @@ def put_back(aside: Path, file: Path) -> bool:
 
 
 def restore_after_kill(file: Path) -> Path | None:
-    """Put the newest journal that was set aside back, if `file` is the empty journal of a session that was killed.
+    """Put back the newest journal that was set aside, if `file` is the empty journal of a session that was killed.
 
     A session sets the earlier journal aside before its own first message. If it is killed between the two, it leaves an
     empty journal, and a resumed session would start from nothing. Returns the path from which the journal came, None if
@@ -81,7 +81,7 @@ def restore_after_kill(file: Path) -> Path | None:
 
 @contextmanager
 def refusals(action: str, file: Path) -> Iterator[None]:
-    """Convert OSError to OutputError, "cannot ACTION: REASON", at `file`."""
+    """Turn an OSError in the block into the OutputError "cannot ACTION: REASON" at `file`."""
     try:
         yield
     except OSError as error:

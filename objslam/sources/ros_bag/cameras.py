@@ -125,7 +125,7 @@ def _gather(
 
     Its other images are those with the frame_id `frame`. If this is the only camera (`alone`), images with another frame_id
     belong to it too, if the user chose them or the camera has no frame_id. Its CameraInfo has the same frame_id. Without
-    such a CameraInfo, one with a similar name is taken, and without that any.
+    such a CameraInfo, one with a similar name is taken, or any if no name is similar.
     """
 
     def mine(role: str) -> list[Topic]:
