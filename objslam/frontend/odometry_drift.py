@@ -41,7 +41,7 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
 class DriftPath:
     """The steps of an odometry, from which its drift is computed quickly, for any noise and stamps.
 
-    On a planar path, this takes ten times fewer numbers.
+    On a planar path, ten times fewer numbers are computed.
     """
 
     def __init__(self, odometry: Trajectory) -> None:

@@ -19,9 +19,10 @@ _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0)
 
 
 def up_axis(keyframes: Keyframes) -> Up:
-    """Return the axis of the map that points up: z, or that nearest to the cameras' mean up in a map that lies on its side.
+    """Return the axis of the map that points up. It is z, unless the map lies on its side.
 
-    The map of visual SLAM is often in the first camera's frame, where y points down. If the path is planar, up is z.
+    Then it is the axis that is nearest to the mean of the cameras' up vectors. The map of visual SLAM is often in the first
+    camera's frame, where y points down. If the path is planar, up is z.
     """
     if not len(keyframes) or is_planar(keyframes.map_T_base):
         return "z"
