@@ -27,8 +27,8 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""How far a parameter may be from its prior mean, in standard deviations of its prior. Clocks have another bound. A larger
-value lets a parameter move farther."""
+"""A parameter may be as large as its absolute prior mean plus this many standard deviations of its prior. MOST_SCALE bounds
+scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its prior."""
 
 
 _KEPT = 9
