@@ -44,9 +44,9 @@ def fuse_ranges(
 
     It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
     range gets NaN. All ranges of an object share an error with the standard deviation range_bias (R,) m. It moves the point
-    along the rays and enters the covariance. The loss is squared across the rays, because their outliers are already
-    removed. It is Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is
-    robust in both directions and gives no covariance.
+    along the rays, and the covariance includes it. The loss is squared across the rays, because `use` has no outliers. It is
+    Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is robust in both
+    directions and gives no covariance.
     """
     xp = module_of(ranges)
     rays, count = bundle.select(use), len(bundle.number)
@@ -122,7 +122,8 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-    For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
+    Of more than `_EVERY_PAIR` rays, only the ones nearest to 64 evenly spread axes are compared. The angle is then exact to
+    1 %."""
     xp = module_of(bundle.direction)
     rays = bundle.select(use)
     widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
@@ -168,8 +169,9 @@ def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation. miss: (R,)
-    normalised residuals. Their mean is used, because it is robust. The fit takes `taken` of the 2 n degrees of freedom of n
-    rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain.
+    normalised residuals. Their mean is used, because it is more robust than their mean square. The fit takes `taken` of the
+    2 n degrees of freedom of n rays. `rest` is what is left. The excess over 1 is enlarged, because an estimate from few
+    degrees of freedom is uncertain.
     The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
     exact to 3 % from 4 rays on."""
     number = as_type(rays.number, miss)
