@@ -101,7 +101,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
     A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
-    process is killed in between, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
+    process is killed meanwhile, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
     """
     return replace_files(out, _ALL_BUT_OBJECTS, {})
 
