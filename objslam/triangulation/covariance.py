@@ -16,11 +16,11 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
     & Ronchetti, Robust Statistics, ch. 6). The offset of ray i is Gaussian with standard deviation s_i along both axes
-    across the ray. Then its direction u has E[u u^T] = P / 2, where P projects across the ray. Its length d is independent
-    of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i
-    widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not reduce: rays miss a nearer
-    object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, where r_i is the
-    length of the ray. The result includes the square of this bias.
+    across the ray. Then the direction u of the offset has E[u u^T] = P / 2, where P projects across the ray. The length d of
+    the offset is independent of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2
+    to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not
+    reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2
+    r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
     """
     xp = module_of(point)
     rays = bundle.select(use)

@@ -88,10 +88,10 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
     """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return what `newton` does.
 
-    First, the point on this line with the least sum of distances from the other lines is found. Across the line, these
-    distances have a gradient there. If its norm is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
-    1973), and the returned norm is that of the smallest subgradient. If it is larger, the optimum lies beside the line, and
-    Newton steps start there.
+    First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
+    has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
+    1973), and the returned norm is that of the smallest subgradient. If the gradient is larger, the optimum lies beside the
+    line, and Newton steps start there.
     """
     xp = module_of(start)
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))

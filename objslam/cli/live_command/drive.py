@@ -131,7 +131,7 @@ def finish(
     for view in feed.views if broken is None else ():
         view(last)
     if session.failure is not None:
-        raise _ended_early(session.failure, out, "the map holds the messages until then") from session.failure
+        raise _ended_early(session.failure, out, "the map covers the messages until then") from session.failure
     if broken is not None:
         raise broken
 
