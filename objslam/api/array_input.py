@@ -1,4 +1,4 @@
-"""Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names its row."""
+"""Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names the row."""
 
 from collections.abc import Sequence
 from dataclasses import replace

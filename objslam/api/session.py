@@ -68,7 +68,7 @@ class Session(LiveSession):
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot, as `push_odometry` takes a pose."""
+        """Push base_T_camera of a camera that moves on the robot, from a stamp, s, on, as `push_odometry` takes a pose."""
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:

@@ -35,7 +35,7 @@ from objslam.sources.log_folder import resembles_log
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
 """The files that a new result replaces or deletes. They include the exports of the older result."""
 _ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
-"""The files of an older result that a live session deletes."""
+"""The files of an older result that a live session deletes. objects.json is not among them, because it is replaced."""
 
 
 def prepare_output(out: Path) -> None:

@@ -108,7 +108,7 @@ def _rays(result: RunResult, plane: list[int]) -> list[Shape]:
     for mask, colour, most, name in ((used, _USED, _MAX_RAYS, "rays"), (out, _REJECTED, _MAX_REJECTED, many)):
         index = sample(mask, most)
         if len(index):
-            opacity = float(np.clip(125 / len(index), 0.2, 0.75))  # Many lines are fainter, so that objects stay visible.
+            opacity = float(np.clip(125 / len(index), 0.2, 0.75))  # The more lines, the fainter they are, so that objects stay visible.
             shapes.append(
                 Segments(np.stack([result.origins[index][:, plane], ends[index][:, plane]], axis=1), colour, opacity, name)
             )
