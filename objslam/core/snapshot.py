@@ -54,8 +54,8 @@ class Snapshot:
     how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image. calibration: the
     shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom: (4, 4) the pose of the
     odometry's frame in the map at the newest keyframe (REP 105), for the odometry as received. None if the odometry does not
-    cover this keyframe. in_map: the place in a prior map, None without such a map or before the first search for it. Once the
-    place is known, everything is in the frame of the prior map.
+    cover this keyframe. in_map: the place in a prior map, None without such a map or before the first search for it. Once
+    the place is known, everything is in the frame of the prior map.
     """
 
     stamp: float

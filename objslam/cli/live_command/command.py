@@ -152,7 +152,7 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
 
 
 def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:
-    """Read a recording to replay. A detector finds its boxes first. LogError if the recording has no boxes then."""
+    """Read a recording to replay. If the options name a detector, it finds the boxes. LogError if there are no boxes."""
     from objslam.api.mapping import find_boxes
     from objslam.core.diagnostics import Ledger
     from objslam.errors import LogError
@@ -172,7 +172,8 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """With `resume`, check that a journal exists. Else rename it, and restore it if the new session gets no message.
+    """With `resume`, check that a journal exists. Without it, rename an existing journal, and restore this journal at the
+    end if the new session got no message.
 
     If the last session was killed before its first message, the journal that it renamed is restored first.
     """

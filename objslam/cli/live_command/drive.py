@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from objslam.live.session.session import Session
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
-_POLL = 0.1  # The time in s between two checks for the end of the source.
+_POLL = 0.1  # The time in s between two checks for the end of the source, and between two ticks of the feed.
 
 
 class LatestObjects:
@@ -33,7 +33,7 @@ class LatestObjects:
         self._out, self._begun, self._refused = out, False, False
 
     def try_write(self, snapshot: Snapshot) -> None:
-        """Write as `write` does, but let an error of the disk cost no map: warn of the first one, and of its end."""
+        """Write as `write` does, but do not raise an OutputError: warn of the first one, and say when it is over."""
         refused = None
         try:
             self.write(snapshot)
@@ -62,8 +62,9 @@ class LatestObjects:
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
     """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
-    the views and the status line. An error of a view also ends the loop. It is returned instead of raised,
-    so that `finish` can write the map first."""
+    the views and the status line. Ten times a second, call the ticks of the feed and print new warnings. An error of a view
+    or a tick also ends the loop. It is returned instead of raised, so that `finish` can write the map first. An error of the
+    adapter is only a warning."""
     from objslam.live.session import low_latency
 
     low_latency.configure()
@@ -138,7 +139,7 @@ def finish(
     for view in feed.views if broken is None else ():
         view(last)
     if session.failure is not None:
-        raise _ended_early(session.failure, out, "the map holds the messages until then") from session.failure
+        raise _ended_early(session.failure, out, "the map covers the messages until then") from session.failure
     if broken is not None:
         raise broken
     return result
@@ -156,7 +157,7 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
     """Set `stop` at Ctrl-C, SIGTERM, or when the terminal closes (SIGHUP). A second signal interrupts immediately.
 
-    A signal that is ignored, as nohup ignores SIGHUP, stays so.
+    A signal that is ignored, as nohup ignores SIGHUP, stays ignored.
     """
 
     def end(number: int, frame: object) -> None:
