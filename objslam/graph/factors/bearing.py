@@ -1,4 +1,7 @@
-"""Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray (Eq. 1)."""
+"""Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray.
+
+The distance is that of Eq. 1 of Staszak & Belter.
+"""
 
 import gtsam
 import numpy as np
@@ -62,7 +65,7 @@ def point_to_line(
 
 
 def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each fixed ray on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray with a known origin on the distance (m, Eq. 1) of L(landmark) from the ray.
 
     Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
     """
