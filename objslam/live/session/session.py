@@ -253,7 +253,7 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now: no frame came for a while, the last one was quick, or the caller waits long.
+        """Return whether to make a snapshot now: no frame came for a while, the last one was quick, or the wait is long.
 
         worked: whether a frame was just processed. begin: when this began, s (`time.perf_counter`).
         """
