@@ -3,17 +3,18 @@
 The shared errors are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse, log_se3
-from objslam.core.types import Association
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.least_squares.joint_rows import JointGraph, JointRows, from_origins
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
@@ -138,48 +139,84 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
 
     The robust weights are kept fixed.
     """
-    measured, map_T_camera, graph = of.measured, of.map_T_camera, of.graph
+    parts = _parts(of)
+    result = np.zeros((len(of.rows.residual), len(which)))
+    for column, k in enumerate(which):
+        step = errors.steps[k] * np.eye(len(theta))[k]
+        sides = []
+        for moved in (theta + step, theta - step):
+            images, rays, settings = errors.at(moved, drift=False)
+            joined = of.measured.multiframes
+            sides.append((joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings))
+        for part in parts:
+            ahead, behind = (part.measured(*side) for side in sides)
+            if any(not np.array_equal(one, other) for one, other in zip(ahead, behind, strict=True)):
+                change = (part.residuals(*ahead) - part.residuals(*behind)).ravel()
+                result[part.first : part.first + len(change), column] = change / (2 * errors.steps[k])
+    return result
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The rows of one kind of measurement, from the row `first` on.
+
+    measured: the measured values in these rows, of keyframes and rays. Parameters that do not change them have no derivative
+    here, and most parameters change only one kind. residuals: the whitened residuals of these values.
+    """
+
+    first: int
+    measured: Callable[[Keyframes, Rays, Settings], tuple[Floats, ...]]
+    residuals: Callable[..., Floats]
+
+
+def _parts(of: Linearised) -> tuple[_Part, ...]:
+    """Return the kinds of measurements that shared errors may change."""
+    graph, map_T_camera = of.graph, of.map_T_camera
     steps, ranged = graph.steps, graph.ranged
     seen = graph.seen(map_T_camera, of.positions[of.landmarks])
-    axes = graph.bearing_axes(seen)
-    bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays, seen, axes))
+    to_landmark = from_origins(graph.rays, seen)
+    axes = graph.bearing_axes(to_landmark)
+    bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
     range_ = graph.rays.range[ranged]
-    range_root, _ = graph.range_roots(np.linalg.norm(from_origins(graph.rays, seen)[ranged], axis=1))
+    range_root, _ = graph.range_roots(np.linalg.norm(to_landmark[ranged], axis=1))
     moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[steps]
+    floor = of.measured.settings.odometry.floor_xy
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
     absolute = map_T_camera[: len(absolute_root)]
 
-    def residuals(parameters: Floats) -> tuple[Floats, Floats, Floats]:
-        images, other_rays, settings = errors.at(parameters, drift=False)
-        other, other_rays = (
-            measured.multiframes.keyframes(images),
-            measured.multiframes.rays(images, other_rays.take(of.which)),
-        )
-        bearings = (bearing_root * graph.bearing_residuals(other_rays, seen, axes)).ravel()
-        longer = other_rays.range[ranged] / range_
-        distance = np.linalg.norm(from_origins(other_rays, seen)[ranged], axis=1)
-        distances = range_root * (distance - longer * range_) / longer
-        parts = []
-        if len(steps) and other.odom_T_base is not None:
-            odom_T_camera = other.odom_T_base @ other.base_T_camera
-            said = inverse(odom_T_camera[:-1]) @ odom_T_camera[1:]
-            way = settings.odometry.floor_xy / measured.settings.odometry.floor_xy
-            off = log_se3(inverse(said[steps]) @ moved) / np.repeat([1.0, way], 3)
-            parts.append(np.einsum("kij,kj->ki", graph.motion_roots, off).ravel())
-        off = log_se3(inverse(other.map_T_camera[: len(absolute)]) @ absolute)
-        parts.append(np.einsum("kij,kj->ki", absolute_root, off).ravel())
-        return bearings, distances, np.concatenate(parts)
+    def bearings(direction: Floats, to_landmark: Floats) -> Floats:
+        return bearing_root * graph.bearing_residuals(direction, to_landmark, axes)
 
-    first_range, first_motion = graph.first_range, graph.first_motion
-    result = np.zeros((len(of.rows.residual), len(which)))
-    for column, k in enumerate(which):
-        step = errors.steps[k]
-        up, down = (residuals(theta + sign * step * np.eye(len(theta))[k]) for sign in (1, -1))
-        bearings, distances, others = ((more - less) / (2 * step) for more, less in zip(up, down, strict=True))
-        result[:first_range, column] = bearings
-        result[first_range : first_range + len(ranged), column] = distances
-        result[first_motion:, column] = others
-    return result
+    def distances(measured: Floats, to_landmark: Floats) -> Floats:
+        return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
+
+    def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
+        if not len(steps) or keyframes.odom_T_base is None:
+            return ()
+        odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
+        return (inverse(odom_T_camera[:-1]) @ odom_T_camera[1:])[steps], np.array(settings.odometry.floor_xy / floor)
+
+    def motions(motion: Floats, way: Floats) -> Floats:
+        off = log_se3(inverse(motion) @ moved) / np.repeat([1.0, float(way)], 3)
+        return np.einsum("kij,kj->ki", graph.motion_roots, off)
+
+    def poses(measured: Floats) -> Floats:
+        return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
+
+    return (
+        _Part(0, lambda _, rays, settings: (rays.direction, from_origins(rays, seen)), bearings),
+        _Part(
+            graph.first_range,
+            lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),
+            distances,
+        ),
+        _Part(graph.first_motion, said, motions),
+        _Part(
+            graph.first_motion + 6 * len(steps),
+            lambda keyframes, rays, settings: (keyframes.map_T_camera[: len(absolute)],),
+            poses,
+        ),
+    )
 
 
 def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: slice) -> Floats:

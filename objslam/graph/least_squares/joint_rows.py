@@ -125,13 +125,13 @@ class JointGraph:
         poses = map_T_camera[self.rays.keyframe]
         return np.asarray(np.einsum("nji,nj->ni", poses[:, :3, :3], landmarks[self.landmark] - poses[:, :3, 3]))
 
-    def bearing_axes(self, seen: Floats) -> Floats:
-        """Return the axes (n, 3, 2) of the residuals of rays whose landmarks are at `seen` (n, 3)."""
-        return residual_axes(self.rays.direction, from_origins(self.rays, seen), self.rays.offset, self._metric)
+    def bearing_axes(self, to_landmark: Floats) -> Floats:
+        """Return the axes (n, 3, 2) of the residuals of rays with landmarks at `to_landmark` (n, 3) from their origins."""
+        return residual_axes(self.rays.direction, to_landmark, self.rays.offset, self._metric)
 
-    def bearing_residuals(self, rays: Rays, seen: Floats, axes: Floats) -> Floats:
-        """Return the residuals (n, 2) of rays with other directions or origins, rad or m."""
-        return ray_residuals(rays.direction, from_origins(rays, seen), axes, self._metric)
+    def bearing_residuals(self, directions: Floats, to_landmark: Floats, axes: Floats) -> Floats:
+        """Return the residuals (n, 2), rad or m, of rays with directions (n, 3)."""
+        return ray_residuals(directions, to_landmark, axes, self._metric)
 
     def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
         """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of Huber's loss, and their costs (n,)."""
@@ -163,8 +163,8 @@ class JointGraph:
         rays, ranged = self.rays, self.ranged
         seen = self.seen(map_T_camera, landmarks)
         to_landmark = from_origins(rays, seen)
-        axes = self.bearing_axes(seen)
-        off = self.bearing_residuals(rays, seen, axes)
+        axes = self.bearing_axes(to_landmark)
+        off = self.bearing_residuals(rays.direction, to_landmark, axes)
         roots, ray_cost = self.bearing_roots(off)
         by_seen = roots[:, :, None] * ray_jacobians(rays.direction, to_landmark, axes, rays.offset, self._metric)
         distance = np.linalg.norm(to_landmark[ranged], axis=1)
