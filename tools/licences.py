@@ -4,8 +4,8 @@
     python tools/licences.py --sbom sbom.json # also a CycloneDX 1.5 file
 
 All data come from the metadata of the installed packages, and nothing is downloaded. The packages are the dependencies of
-objslam and of its extras open3d, torch, dds and fleet in pyproject.toml, and all packages that these need. Run the tool in an
-environment with all of them, as `tools/setup.sh dev` makes it. If the metadata name no licence, the page says so.
+objslam and of its extras open3d, torch, dds and fleet in pyproject.toml, and all packages that these need. Run the tool in
+an environment with all of them, as `tools/setup.sh dev` makes it. If the metadata name no licence, the page says so.
 """
 
 from __future__ import annotations
