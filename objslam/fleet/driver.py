@@ -173,11 +173,17 @@ def _day(stamp: float) -> str:
 
 def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: FleetResult, tell: Tell) -> None:
     """Merge the tree of each site level by level, all sites at once, and write the sites. Add them to `found`."""
-    sites: dict[str, dict[str, Member]] = {}
+    here: dict[str, dict[str, Member]] = {}
     for one in found.mapped:
-        members = sites.setdefault(one.place.site, {})
-        members.setdefault(one.key, Member(one.key, one.place.path, one.place.robot, one.day))
-    found.copies = len(found.mapped) - sum(map(len, sites.values()))
+        member = Member(one.key, one.place.path, one.place.robot, one.day, one.begin, job.digest)
+        here.setdefault(one.place.site, {}).setdefault(one.key, member)
+    found.copies = len(found.mapped) - sum(map(len, here.values()))
+    states = store.read_many(site_task.state_name(site) for site in here)
+    paths = {one.place.path for one in found.mapped} | {one.name for one in found.failures}
+    sites = {
+        site: _with_earlier(members, states.get(site_task.state_name(site)), job.digest, paths)
+        for site, members in here.items()
+    }
     trees = {site: tree_of(list(members)) for site, members in sites.items()}
     there = {name.removesuffix(".json") for name in store.names(MERGES)}
     wrong: dict[str, str] = {}
@@ -200,7 +206,6 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
         for answer in run(merge_task.WORK, tasks):
             there.add(answer.argument.node.key)
     last: dict[SiteTask, str] = {}
-    states = store.read_many(site_task.state_name(site) for site in sites)
     for site, members in sites.items():
         task = SiteTask(job.store, site, trees[site][-1][0].key, tuple(members.values()), price)
         if (before := site_task.as_before(task, states.get(site_task.state_name(site)))) is not None:
@@ -211,6 +216,15 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
     found.sites.extend(answer.value for answer in run(site_task.WORK, last) if answer.value is not None)
     found.sites.sort(key=lambda one: one.site)
     found.failures.extend(Failure(site, "site", message) for site, message in sorted(wrong.items()))
+
+
+def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, paths: set[str]) -> dict[str, Member]:
+    """Return the sessions of a site by key, in the order of time, with those of earlier runs that had other logs.
+
+    paths: of the logs of this run. What an earlier run found at one of them has been mapped again, or has failed.
+    """
+    before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
+    return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))
 
 
 def _write_failures(store: Store, failures: list[Failure]) -> None:

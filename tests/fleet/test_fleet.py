@@ -96,12 +96,11 @@ def test_a_second_run_does_nothing_and_a_day_later_only_what_is_new(fleet, logs,
     assert (code, said["new"], said["logs"]) == (0, 0, COUNT)
     assert not any(one["changed"] for one in said["sites"])
     assert content(tmp_path / "out") == before
-    shutil.copytree(logs, tmp_path / "logs")
-    write_logs(tmp_path / "logs", range(COUNT, COUNT + 2))
-    code, said, _ = call(tmp_path / "logs", "-o", tmp_path / "out")
-    assert (code, said["new"], said["logs"]) == (0, COUNT + 2, COUNT + 2)  # The paths are new, and nothing is mapped again:
-    assert len(records(tmp_path / "out")) == COUNT + 2
-    assert all(one["changed"] for one in said["sites"])
+    write_logs(tmp_path / "next", range(COUNT, COUNT + 2))
+    code, said, _ = call(tmp_path / "next", "-o", tmp_path / "out", "--price", "0.05")
+    assert (code, said["new"], said["logs"]) == (0, 2, 2)
+    assert [(one["sessions"], one["changed"]) for one in said["sites"]] == [(COUNT // 2 + 1, True)] * 2
+    assert len(records(tmp_path / "out")) == len(pq.read_table(tmp_path / "out" / "sessions.parquet")) == COUNT + 2
     for site in ("site_0", "site_1"):
         in_time = sorted((one.begin, one.key) for one in records(tmp_path / "out") if f"/{site}/" in one.source)
         (once,) = objslam.merge([tmp_path / "out" / "results" / key for _, key in in_time])
@@ -116,7 +115,7 @@ def test_other_settings_and_copies(fleet, logs, tmp_path):
     shutil.copytree(one, tmp_path / "logs" / "site_0" / "r" / "d" / "copy")
     shutil.copytree(one, tmp_path / "logs" / "site_0" / "r" / "d" / "other_copy")
     code, said, _ = call(tmp_path / "logs", "-o", tmp_path / "out")
-    assert (code, said["copies"], said["sites"][0]["sessions"]) == (0, 1, 1)
+    assert (code, said["copies"], said["sites"][0]["sessions"]) == (0, 1, 2)
     assert len(records(tmp_path / "out")) == COUNT
     code, said, _ = call(tmp_path / "logs", "-o", tmp_path / "out", "--set", "seed=1")
     assert (code, said["new"], len(records(tmp_path / "out"))) == (0, 2, COUNT + 1)

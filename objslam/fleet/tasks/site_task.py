@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -36,12 +36,14 @@ _FILE = "part-0.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A session of a site. path: of its log."""
+    """A session of a site. path: of its log. begin: of the log, s. digest: of the job that mapped it."""
 
     key: str
     path: str
     robot: str
     day: str
+    begin: float
+    digest: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,7 @@ def finish_site(given: SiteTask) -> SiteResult:
     said = {
         **{"made_of": _made_of(given), "days": days, "islands": len(islands), "sessions": sessions},
         **{"objects": len(first.objects), "gone": len(first.objects.gone)},
+        "members": [asdict(one) for one in given.members],
     }
     store.write(state_name(given.site), dump_json(said).encode())
     return _result(given.site, said, changed=True)
@@ -94,6 +97,15 @@ def finish_site(given: SiteTask) -> SiteResult:
 def state_name(site: str) -> str:
     """Return the name of the file that says what a site was made of."""
     return f"{SITES}/{folder_of(site)}/{_STATE}"
+
+
+def earlier_members(state: bytes | None, digest: str) -> list[Member]:
+    """Return the sessions that a site has from earlier runs of a job, by the content of its `state_name`."""
+    try:
+        members = [Member(**one) for one in _parse_state(state).get("members", [])]
+    except TypeError:  # Another version wrote the file.
+        return []
+    return [one for one in members if one.digest == digest]
 
 
 def as_before(given: SiteTask, state: bytes | None) -> SiteResult | None:
