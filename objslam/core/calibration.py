@@ -173,6 +173,9 @@ class CalibratedMeasurements(Protocol):
         """The scales of the measured lengths, if each length has one. Then the log cannot tell a factor common to all
         lengths. Else empty."""
 
+    def take(self, keyframes: Keyframes, rays: Rays) -> Self:
+        """Return the same errors for other keyframes and rays of the log."""
+
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
 

@@ -64,6 +64,29 @@ class Life:
 
 
 @dataclass(frozen=True)
+class TagPose:
+    """The rotation and the size of one fiducial. Its position is that of its object.
+
+    rotation: (3, 3) map_R_tag: x from the first corner to the second, z from the tag to the viewer. covariance: (3, 3) rad^2
+    of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size from the settings. other:
+    (3, 3) the second rotation that a flat square leaves open, None if the views rule it out. other_probability: of this
+    second rotation, 0 without one.
+    """
+
+    rotation: Floats
+    covariance: Floats
+    size: float
+    size_sigma: float
+    other: Floats | None = None
+    other_probability: float = 0.0
+
+    @property
+    def sigma_deg(self) -> float:
+        """The standard deviation of the rotation about its least certain axis, degrees."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
+
+
+@dataclass(frozen=True)
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
@@ -71,7 +94,8 @@ class MapObject:
     the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
     rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
     existence are None if the run took all boxes of a label as one object. seen_from: from where it was detected, None if
-    unknown. life: what several sessions say of it, None if there was one.
+    unknown. life: what several sessions say of it, None if there was one. tag: the rotation and size of a fiducial, None for
+    another object.
     """
 
     id: int
@@ -91,6 +115,7 @@ class MapObject:
     existence: float | None = None
     seen_from: SeenFrom | None = None
     life: Life | None = None
+    tag: TagPose | None = None
 
     @property
     def sigma(self) -> float | None:

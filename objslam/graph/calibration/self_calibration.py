@@ -23,9 +23,9 @@ from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
-from objslam.graph.optimizers import build_graph, gauss_newton
+from objslam.graph.optimizers import gauss_newton
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.variables import read_poses, with_points
 
 _ROUNDS = 8
 """The most outer steps. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6. A larger number is slower."""
@@ -278,7 +278,9 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
     around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
     moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
+    scaled = state.measured.tags is not None and bool(np.isfinite(state.measured.tags.side).any())
+    unknown = frozenset() if scaled else errors.unknown_scales  # Fiducials of known size tell the scale.
+    growing = np.where([name in unknown for name in errors.names], 1 + theta, 0.0)
     if not growing @ size > _LEAST_GROWTH:
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
     project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
@@ -295,9 +297,7 @@ class _State(Linearised):
     def of(
         cls, measured: Measurements, association: Association, map_T_camera: Floats, positions: Floats, used: Bools
     ) -> Self:
-        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
-        graph = build_graph(measured.factors(association.object, np.flatnonzero(used), landmarks, positions))
-        values = make_values(map_T_camera, positions, landmarks)
+        graph, values = measured.whole(association.object, used, map_T_camera, positions)
         return cls(graph, values, measured, association, map_T_camera, positions, used, graph.error(values))
 
     def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
@@ -306,7 +306,8 @@ class _State(Linearised):
         change = system.sensitivity @ step + system.newton
         positions = self.positions.copy()
         positions[landmarks] += change[: 3 * len(landmarks)].reshape(-1, 3)
-        map_T_camera = self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6))
+        poses = slice(3 * len(landmarks), 3 * len(landmarks) + 6 * len(self.map_T_camera))
+        map_T_camera = self.map_T_camera @ exp_se3(change[poses].reshape(-1, 6))
         return type(self).of(measured, self.association, map_T_camera, positions, self.used)
 
     def solved(self) -> Self:

@@ -20,7 +20,9 @@ from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.bearing import EQ1_SIGMA, ray_residuals, residual_axes
 from objslam.graph.factors.localization import localization_covariance
+from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
+from objslam.graph.factors.tags import ROWS_FREE, ROWS_KNOWN
 
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
@@ -32,7 +34,7 @@ choice itself then depends on the noise. With 30, a stereo rig that often stands
 
 @dataclass(frozen=True)
 class Linearised:
-    """A graph by `Measurements.factors`, with its variables at the values of its last solve.
+    """A graph by `Measurements.whole`, with its variables at the values of its last solve.
 
     map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark outside the graph. used: (R,) the rays in the graph.
     """
@@ -60,11 +62,11 @@ class Linearised:
 class LinearSystem:
     """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
 
-    The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
-    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. sides: (M, P) by the
-    shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions. instruments:
-    (M, P). At the optimum, the residuals do not correlate with these columns. They equal the sides, except for the scales of
-    the odometry: their sides contain the noise of the odometry, and so do the residuals.
+    The rows are in the order of `Measurements.whole`: bearings, ranges, landmark priors, motions, absolute poses, and ties
+    of fiducials. jacobian: (M, D) by the landmarks, three columns each, by the poses, six columns each, then by fiducials.
+    sides: (M, P) by the shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the
+    motions. instruments: (M, P). At the optimum, the residuals do not correlate with these columns. They equal the sides,
+    except for the scales of the odometry: their sides contain the noise of the odometry, and so do the residuals.
     """
 
     jacobian: sparse.csc_matrix
@@ -93,7 +95,7 @@ class ReducedSystem:
     information: (P, P). gradient: (P,) the residuals against the instruments, zero at the optimum. descent: (P,) the
     negative gradient of the cost. signal: (P,) the share of the information's diagonal that is not noise. sensitivity: (D,
     P) the derivatives of all variables at their optimum by the parameters: first the landmarks, three rows each, then the
-    poses, six rows each. newton: (D,) the remaining Newton step of the variables.
+    poses, six rows each, then fiducials. newton: (D,) the remaining Newton step of the variables.
     """
 
     information: Floats
@@ -120,7 +122,11 @@ def linearise(
     ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
     first_range = 2 * len(of.which)
     first_motion = first_range + ranged + 3 * len(of.landmarks)
-    jacobian, residual = _whitened(of.graph, of.values, first_motion + motions + absolute, columns)
+    tied = np.zeros(0) if of.measured.tags is None else of.measured.tags.side[of.measured.tags.tied(of.landmarks)]
+    known = np.isfinite(tied)
+    columns += int(np.where(known, 6, 7).sum())
+    ties = int(np.where(known, ROWS_KNOWN, ROWS_FREE).sum())
+    jacobian, residual = _whitened(of.graph, of.values, first_motion + motions + absolute + ties, columns)
     sides = _parameter_columns(of, errors, theta, which, (len(residual), first_range, first_motion))
     instruments = _instruments(of, names, sides, slice(first_motion, first_motion + motions))
     return LinearSystem(jacobian, sides, instruments, residual, first_range, first_motion)
@@ -172,6 +178,8 @@ def _parameter_columns(
     has_odometry = measured.motion is not None and len(steps) > 0
     motion_root = whitening(measured.odometry()[1][steps]) if has_odometry else np.zeros((0, 6, 6))
     moved = inverse(map_T_camera[:-1]) @ map_T_camera[1:]
+    if has_odometry:
+        motion_root = motion_root * _motion_weights(measured, moved, motion_root, steps)[:, None, None]
     absolute = map_T_camera if keyframes.localized_every else map_T_camera[:1]
     absolute_root = _absolute_roots(measured, absolute)
 
@@ -204,7 +212,7 @@ def _parameter_columns(
         bearings, distances, others = ((more - less) / (2 * step) for more, less in zip(up, down, strict=True))
         result[:first_range, column] = bearings
         result[first_range : first_range + len(ranged), column] = distances
-        result[first_motion:, column] = others
+        result[first_motion : first_motion + len(others), column] = others
     return result
 
 
@@ -265,6 +273,16 @@ def _bearing_roots(rays: Rays, residuals: Floats, metric: bool) -> Floats:
     sigma = np.full(len(rays), EQ1_SIGMA) if metric else rays.sigma
     off = np.linalg.norm(residuals, axis=1) / sigma
     return np.asarray((np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12))) / sigma)[:, None])
+
+
+def _motion_weights(measured: Measurements, moved: Floats, roots: Floats, steps: Ints) -> Floats:
+    """Return the square roots (n,) of the weights that the loss of motions gives them, 1 without a loss.
+
+    moved: (P-1, 4, 4) the solved motions. roots: (n, 6, 6) that whiten the motions `steps` (n,).
+    """
+    off = log_se3(inverse(measured.odometry()[0][steps]) @ moved[steps])
+    squared = (np.einsum("kij,kj->ki", roots, off) ** 2).sum(axis=1)
+    return np.where(measured.seen_twice[steps], 1 / np.sqrt(1 + squared / JUMP**2), 1.0)
 
 
 def whitening(covariance: Floats) -> Floats:
