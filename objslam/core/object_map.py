@@ -85,6 +85,16 @@ class TagPose:
         """The standard deviation of the rotation about its least certain axis, degrees."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
 
+    def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
+        """Return the fiducial in a frame in which its map has a rotation (3, 3), whose yaw has a sigma, rad."""
+        up = (rotation @ self.rotation)[2]
+        return replace(
+            self,
+            rotation=rotation @ self.rotation,
+            covariance=self.covariance + yaw_sigma**2 * np.outer(up, up),
+            other=None if self.other is None else rotation @ self.other,
+        )
+
 
 @dataclass(frozen=True)
 class MapObject:

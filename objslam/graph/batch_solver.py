@@ -25,6 +25,7 @@ from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rej
 from objslam.graph.robust_cost import ray_information
 from objslam.graph.tags.corner_rays import TagCorners
 from objslam.graph.tags.estimate import with_objects
+from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
@@ -87,6 +88,7 @@ def solve_fixed(
         cost_before=optimum.cost_before,
         cost_after=optimum.cost_after,
         iterations=optimum.iterations,
+        tags=tags_at_poses(keyframes, rays, association, settings),
     )
 
 

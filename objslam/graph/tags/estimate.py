@@ -17,7 +17,7 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.shapes import squares_of
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
-_LEAST_PROBABILITY = 0.01
+LEAST_PROBABILITY = 0.01
 """The least probability of the second rotation of a flat square at which it is told. With a larger value, fewer are told."""
 
 
@@ -66,7 +66,7 @@ def with_objects(
         of_place = rotation @ spread[:, 3:6, 3:6] @ np.swapaxes(rotation, 1, 2)
         covariance[object_[which]] = of_place + share * apart[:, :, None] * apart[:, None, :]
         positions[object_[which]], solved[object_[which]] = centre, True
-        told = probability >= _LEAST_PROBABILITY
+        told = probability >= LEAST_PROBABILITY
         for i, j in enumerate(object_[which].tolist()):
             known = np.isfinite(tags.side[which[i]])
             found[j] = TagPose(

@@ -120,8 +120,32 @@ def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
     return np.asarray(np.bincount(seen.square, each.sum(axis=1), count), dtype=np.float64)
 
 
+def scatter(seen: Corners, squares: Squares, free: Bools) -> Floats:
+    """Return the sums (H, 7, 7) of the squared gradients of the views of each square: the errors of one view may be common.
+
+    Between two inverses of the information, this is the covariance of a fit (cluster-robust; Liang and Zeger 1986).
+    """
+    _, weighted, residual, _ = _jacobians(seen, squares, free)
+    gradient = np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8))
+    result = np.zeros((len(squares.side), 7, 7))
+    np.add.at(result, seen.square, gradient[:, :, None] * gradient[:, None, :])
+    return result
+
+
 def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats]:
     """Return the costs (H,), the information (H, 7, 7), and half the gradients (H, 7), with the weights of Cauchy's loss."""
+    count = len(squares.side)
+    flat, weighted, residual, ahead = _jacobians(seen, squares, free)
+    information, gradient = np.zeros((count, 7, 7)), np.zeros((count, 7))
+    np.add.at(information, seen.square, np.swapaxes(weighted, 1, 2) @ flat)
+    np.add.at(gradient, seen.square, np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8)))
+    information[:, 6, 6] += ~free
+    return _cost(residual, ahead, seen, count), information, gradient
+
+
+def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats, Bools]:
+    """Return the derivatives (V, 8, 7) of the residuals of views by their squares, the same times the weights of Cauchy's
+    loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead."""
     count, rotation = len(squares.side), squares.pose[:, :3, :3]
     residual, by_point, ahead = _residuals(seen, squares.corners)
     local = squares.shape * squares.side[:, None, None]
@@ -131,12 +155,8 @@ def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, F
     turned = np.einsum("hij,hcjk->hcik", rotation, by_square)
     jacobian = np.einsum("vcai,vcik->vcak", by_point, turned[seen.square])
     weight = np.where(ahead, 1 / (1 + (residual**2).sum(axis=2) / CAUCHY_K**2), 0.0)[..., None]
-    flat, weighted = jacobian.reshape(len(seen), 8, 7), (jacobian * weight[..., None]).reshape(len(seen), 8, 7)
-    information, gradient = np.zeros((count, 7, 7)), np.zeros((count, 7))
-    np.add.at(information, seen.square, np.swapaxes(weighted, 1, 2) @ flat)
-    np.add.at(gradient, seen.square, np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8)))
-    information[:, 6, 6] += ~free
-    return _cost(residual, ahead, seen, count), information, gradient
+    weighted = jacobian * weight[..., None]
+    return jacobian.reshape(len(seen), 8, 7), weighted.reshape(len(seen), 8, 7), residual, ahead
 
 
 def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
