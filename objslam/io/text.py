@@ -16,8 +16,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
-_PLACES = 3  # How many places (file:line) a ledger keeps per drop reason.
-_MAX_UNPACKED = 1 << 30  # The size limit of an unpacked file, bytes, enough for a day of poses at 200 Hz.
+_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason. The ledger keeps no more.
+_MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,13 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_lines(path: Path, ledger: Ledger) -> list[tuple[int, str]]:
-    """Return number, from 1, and stripped text of each line of a UTF-8 file. Empty lines and '#' comments are left out."""
+    """Return number (from 1) and stripped text of each line of a UTF-8 file, without empty lines and '#' comments."""
     return split_lines(read_bytes(path), str(path), ledger)
 
 
 def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]]:
-    """Split bytes as `read_lines` does. Lines that are not UTF-8 are dropped and counted. `place` is the file name."""
+    """Split the bytes of a file as `read_lines` does. Lines that are not UTF-8 are dropped and counted. place: the file name
+    in the ledger."""
     damaged = False
     try:
         text = data.decode("utf-8-sig")
@@ -92,8 +93,8 @@ def to_table(
 ) -> Table:
     """Return the table of lines from `read_lines` that have `columns` numbers each. Raises LogError if none is valid.
 
-    Lines with another number of columns or a value that is not finite are dropped and counted. `what` is the name of such a
-    line in the drop reason, such as "pose". `form` is the names of the columns for the error.
+    Lines with another number of columns or a value that is not finite are dropped and counted. what: the name of a line in
+    messages, such as "pose". form: what a line contains, for the error. If it is empty, the error says `columns` numbers.
     """
     values, places = [], []
     for row, (line, text) in enumerate(numbered):

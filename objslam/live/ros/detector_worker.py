@@ -17,7 +17,7 @@ from objslam.ros.messages.images import colour_image
 if TYPE_CHECKING:
     from objslam.detection import Detector
 
-_MAX_TOPICS = 64  # The most topics with a waiting image. It bounds the memory.
+_MAX_TOPICS = 64  # The most topics with a waiting image. A larger number costs memory.
 _IN_A_ROW = 5  # The number of consecutive failed images of a topic before a warning. A larger number warns later.
 _FAILED, _ENDED = "image that the detector failed on", "image that arrived after the detector had ended"
 
