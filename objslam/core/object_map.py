@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -68,18 +69,28 @@ class Life:
 class TagPose:
     """The rotation and the size of one fiducial. Its position is that of its object.
 
-    rotation: (3, 3) map_R_tag: x from the first corner to the second, z from the tag to the viewer. covariance: (3, 3) rad^2
-    of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size from the settings. other:
-    (3, 3) the second rotation that a flat square leaves open, None if the views rule it out. other_probability: of this
-    second rotation, 0 without one.
+    xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
+    covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
+    from the settings. other_xyzw: (4,) the second rotation that a flat square leaves open, None if the views rule it out.
+    other_probability: of this second rotation, 0 without one.
     """
 
-    rotation: Floats
+    xyzw: Floats
     covariance: Floats
     size: float
     size_sigma: float
-    other: Floats | None = None
+    other_xyzw: Floats | None = None
     other_probability: float = 0.0
+
+    @property
+    def rotation(self) -> Floats:
+        """(3, 3) map_R_tag."""
+        return rotation_from_quaternion(self.xyzw[None])[0]
+
+    @property
+    def other(self) -> Floats | None:
+        """(3, 3) the second rotation, None without one."""
+        return None if self.other_xyzw is None else rotation_from_quaternion(self.other_xyzw[None])[0]
 
     @property
     def sigma_deg(self) -> float:
@@ -91,9 +102,9 @@ class TagPose:
         up = (rotation @ self.rotation)[2]
         return replace(
             self,
-            rotation=rotation @ self.rotation,
+            xyzw=_quaternion(rotation @ self.rotation),
             covariance=self.covariance + yaw_sigma**2 * np.outer(up, up),
-            other=None if self.other is None else rotation @ self.other,
+            other_xyzw=None if self.other is None else _quaternion(rotation @ self.other),
         )
 
 
@@ -256,6 +267,10 @@ class ObjectMap:
         objects, positions = self._placed(label)
         distance = np.linalg.norm(positions[:, : len(at)] - at, axis=1)
         return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
+
+
+def _quaternion(rotation: Floats) -> Floats:
+    return quaternion_from_rotation(rotation[None])[0]
 
 
 def _point(values: ArrayLike) -> Floats:

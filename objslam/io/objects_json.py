@@ -11,7 +11,6 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom, TagPose
-from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
@@ -117,13 +116,13 @@ def _entry(o: MapObject) -> dict[str, Any]:
 
 def _tag_entry(tag: TagPose) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "rotation_xyzw": quaternion_from_rotation(tag.rotation[None])[0].tolist(),
+        "rotation_xyzw": tag.xyzw.tolist(),
         "rotation_covariance": tag.covariance.tolist(),
         "size": tag.size,
         "size_sigma": tag.size_sigma,
     }
-    if tag.other is not None:
-        entry["other_rotation_xyzw"] = quaternion_from_rotation(tag.other[None])[0].tolist()
+    if tag.other_xyzw is not None:
+        entry["other_rotation_xyzw"] = tag.other_xyzw.tolist()
         entry["other_probability"] = tag.other_probability
     return entry
 
@@ -254,20 +253,20 @@ def _tag(value: Any) -> TagPose:
     size, sigma = (_number(value.get(name), f"tag.{name}") for name in ("size", "size_sigma"))
     if not (0 < size < MAX_POSITION and 0 <= sigma < MAX_POSITION):
         raise _Malformed("tag.size must be above 0 m, and tag.size_sigma not below")
-    rotation, other, probability = _rotation(value.get("rotation_xyzw"), "tag.rotation_xyzw"), None, 0.0
+    rotation, other, probability = _quaternion(value.get("rotation_xyzw"), "tag.rotation_xyzw"), None, 0.0
     if value.get("other_rotation_xyzw") is not None:
-        other = _rotation(value["other_rotation_xyzw"], "tag.other_rotation_xyzw")
+        other = _quaternion(value["other_rotation_xyzw"], "tag.other_rotation_xyzw")
         probability = _number(value.get("other_probability"), "tag.other_probability")
         if not 0 <= probability <= 1:
             raise _Malformed("tag.other_probability must be from 0 to 1")
     return TagPose(rotation, covariance, size, sigma, other, probability)
 
 
-def _rotation(value: Any, name: str) -> Floats:
+def _quaternion(value: Any, name: str) -> Floats:
     xyzw = _vector(value, name, 4)
     if not abs(float(np.linalg.norm(xyzw)) - 1) < _UNIT:
         raise _Malformed(f"{name} must have the length 1")
-    return rotation_from_quaternion(xyzw[None])[0]
+    return xyzw
 
 
 def _life(value: Any) -> Life:

@@ -9,7 +9,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.object_map import TagPose
-from objslam.core.rotation import rotation_vector, skew
+from objslam.core.rotation import quaternion_from_rotation, rotation_vector, skew
 from objslam.core.types import Rays
 from objslam.graph.optimizers import indeterminate
 from objslam.graph.tags.corner_rays import TagCorners
@@ -66,15 +66,16 @@ def with_objects(
         of_place = rotation @ spread[:, 3:6, 3:6] @ np.swapaxes(rotation, 1, 2)
         covariance[object_[which]] = of_place + share * apart[:, :, None] * apart[:, None, :]
         positions[object_[which]], solved[object_[which]] = centre, True
+        xyzw, other_xyzw = quaternion_from_rotation(rotation), quaternion_from_rotation(other)
         told = probability >= LEAST_PROBABILITY
         for i, j in enumerate(object_[which].tolist()):
             known = np.isfinite(tags.side[which[i]])
             found[j] = TagPose(
-                rotation=rotation[i],
+                xyzw=xyzw[i],
                 covariance=(spread[i, :3, :3] + spread[i, :3, :3].T) / 2,
                 size=float(tags.side[which[i]] if known else side[i]),
                 size_sigma=0.0 if known else float(side[i] * np.sqrt(spread[i, 6, 6])),
-                other=other[i] if told[i] else None,
+                other_xyzw=other_xyzw[i] if told[i] else None,
                 other_probability=float(probability[i]) if told[i] else 0.0,
             )
     number = np.bincount(tags.source)

@@ -4,6 +4,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.object_map import TagPose
+from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.tags.corner_rays import TagCorners
@@ -47,13 +48,14 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
     covariance = share * nominal + (1 - share) * between
     gain = np.where(np.isfinite(found.other_cost), other_cost - cost, np.inf)
     probability = 1 / (1 + np.exp(np.clip(gain / 2, -50.0, 50.0)))
+    xyzw, other_xyzw = (quaternion_from_rotation(one.pose[:, :3, :3]) for one in (best, other))
     return {
         int(tags.object[t]): TagPose(
-            rotation=best.pose[t, :3, :3],
+            xyzw=xyzw[t],
             covariance=(covariance[i, :3, :3] + covariance[i, :3, :3].T) / 2,
             size=float(tags.side[t] if known[t] else best.side[t]),
             size_sigma=0.0 if known[t] else float(best.side[t] * np.sqrt(covariance[i, 6, 6])),
-            other=other.pose[t, :3, :3] if probability[t] >= LEAST_PROBABILITY else None,
+            other_xyzw=other_xyzw[t] if probability[t] >= LEAST_PROBABILITY else None,
             other_probability=float(probability[t]) if probability[t] >= LEAST_PROBABILITY else 0.0,
         )
         for i, t in enumerate(told.tolist())
