@@ -11,6 +11,7 @@ from tag_drives import SQUARE, TagDrive, make_tag_drive, scale_of
 from objslam.config import Settings, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, make_pose
+from objslam.core.object_map import TagPose
 from objslam.core.result import RunResult
 from objslam.graph.factors.tags import tag_ties
 from objslam.graph.tags.placement import place
@@ -230,6 +231,65 @@ def test_an_unknown_size_is_estimated_in_the_scale_of_the_odometry() -> None:
     assert np.median(np.abs(size / true - 1)) < 0.03
     assert (np.abs(size - true) < 3 * sigma).all()
     assert (sigma > 0).all()
+
+
+def test_odometry_that_jumps_gives_way_where_tags_are_seen() -> None:
+    """One step of the odometry is 0.3 m off, as if visual odometry corrected itself. The tags see that nothing jumped."""
+    for seed in (0, 1):
+        drive = make_tag_drive(seed, tags=14)
+        odometry, detections = drive.log.odometry, drive.log.cameras[0].detections
+        assert odometry is not None
+        assert detections is not None
+        seen = np.bincount(detections.frame, minlength=len(odometry))
+        k = 20 + int(np.argmax(np.minimum(seen[20:100], seen[21:101]))) + 1
+        shift, poses = np.eye(4), odometry.poses.copy()
+        shift[:3, 3] = [0.2, 0.2, 0.1]
+        poses[k:] = poses[k] @ shift @ np.linalg.inv(poses[k]) @ poses[k:]
+        jumped = replace(drive, log=replace(drive.log, odometry=replace(odometry, poses=poses)))
+        plain = ("calibration.use=false", "noise.rays=false", "noise.odometry=false")
+        result = mapped(jumped, settings_for(drive, *plain))
+        true = drive.map_T_base[np.round(result.keyframes.stamps / 0.1).astype(int)]
+        off = np.linalg.norm((result.map_T_base - true)[:, :3, 3], axis=1)
+        assert off.max() < 0.13  # About 0.2 m if the jump has the weight of other steps.
+
+
+def test_at_fixed_poses_a_tag_has_a_rotation_and_a_size() -> None:
+    drive = make_tag_drive(4)
+    odometry = drive.log.odometry
+    assert odometry is not None
+    rng = np.random.default_rng(4)
+    off = np.zeros((len(odometry), 6))
+    off[:, 2], off[:, 3:5] = 0.005 * rng.normal(size=len(off)), 0.02 * rng.normal(size=(len(off), 2))
+    log = replace(drive.log, odometry=None, localization=replace(odometry, poses=drive.map_T_base @ exp_se3(off)))
+    result = mapped(replace(drive, log=log), settings_for(drive, "mode=fixed", "calibration.use=false", known=False))
+    _, turn = errors(drive, result)
+    assert len(turn) == len(drive.map_T_tag)
+    assert (turn < 7.815).mean() > 0.8
+    sizes = [(o.tag.size, o.tag.size_sigma, drive.side[o.label]) for o in result.map.resolved() if o.tag is not None]
+    size, sigma, true = np.array(sizes).T
+    assert np.median(np.abs(size / true - 1)) < 0.05
+    assert (np.abs(size - true) < 3 * sigma).all()
+
+
+def test_a_recording_shows_objects_and_not_their_corners() -> None:
+    drive = make_tag_drive(5, frames=60)
+    result = mapped(drive, settings_for(drive, "output.recording=true", "calibration.use=false"))
+    assert result.trace
+    for done in result.trace:
+        assert all(len(step.positions) == done.association.count for step in done.iterations)
+
+
+def test_a_tag_turns_with_the_frame_of_its_map() -> None:
+    turn = Rotation.from_euler("z", 0.7)
+    own = Rotation.from_rotvec([0.3, 1.0, -0.2])
+    tag = TagPose(own.as_quat(), 1e-4 * np.eye(3), 0.2, 0.0, own.inv().as_quat(), 0.1)
+    turned = tag.turned(turn.as_matrix(), 0.05)
+    np.testing.assert_allclose(turned.rotation, (turn * own).as_matrix(), atol=1e-12)
+    assert turned.other is not None
+    np.testing.assert_allclose(turned.other, (turn * own.inv()).as_matrix(), atol=1e-12)
+    in_map = turned.rotation @ turned.covariance @ turned.rotation.T
+    np.testing.assert_allclose(in_map, np.diag([1e-4, 1e-4, 1e-4 + 0.05**2]), atol=1e-12)
+    assert turned.sigma_deg == pytest.approx(np.degrees(np.sqrt(1e-4 + 0.05**2)))
 
 
 def test_a_tag_with_one_size_of_its_own() -> None:
