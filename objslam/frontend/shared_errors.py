@@ -234,7 +234,9 @@ class SharedErrors:
         """Poses (Q, 4, 4) of the corrected odometry at stamps (Q,), s. Only the poses around the stamps are computed."""
         odometry = self._correctable().odometry
         after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, max(len(odometry) - 1, 1))
-        around = np.unique(np.concatenate([after - 1, np.minimum(after, len(odometry) - 1)]))
+        needed = np.zeros(len(odometry), dtype=bool)
+        needed[after - 1] = needed[np.minimum(after, len(odometry) - 1)] = True
+        around = np.flatnonzero(needed)
         path = Trajectory(odometry.stamps[around], self._corrected(error, around))
         return _at_stamps(path, stamps, self.settings.poses.max_gap)
 

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from objslam.association.registration.map_registration import Registration
-from objslam.association.registration.object_maps import placed, reason, register
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
@@ -21,6 +19,7 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.solution import Solution
 
 if TYPE_CHECKING:
+    from objslam.association.registration.map_registration import Registration
     from objslam.graph.maps.prior_map import MappedDrive
 
 
@@ -62,6 +61,9 @@ def localize(
     objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
     the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
     """
+    # They import scipy.optimize, which takes longer than the map of a small log.
+    from objslam.association.registration.object_maps import placed, reason, register
+
     found = register(objects, known.objects)
     why = reason(found, objects, known.objects, ("the drive", "the map"))
     told: dict[str, Any] = {

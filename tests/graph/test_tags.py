@@ -14,6 +14,7 @@ from objslam.core.geometry import exp_se3, make_pose
 from objslam.core.object_map import TagPose
 from objslam.core.result import RunResult
 from objslam.graph.factors.tags import tag_ties
+from objslam.graph.least_squares.square_rows import SquareRows
 from objslam.graph.tags.placement import place
 from objslam.graph.tags.shapes import CLOCKWISE, COUNTER_CLOCKWISE, goes_clockwise, squares_of
 from objslam.graph.tags.square_fit import Corners, Squares, costs, fit, poses_of_views
@@ -161,6 +162,35 @@ def test_ties_hold_a_square_of_known_or_free_size_and_nothing_else(known: bool) 
     if not known:
         values.insert(TAG_SIZE0 + 3, 0.0)
     assert sum(factor.error(values) for factor in made) > 100
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_rows_of_squares_are_the_ties_without_the_pose(known: bool) -> None:
+    """Against GTSAM's ties: the same cost after their pose and size are solved. And the derivatives, numerically."""
+    truth, rng = squares(3, seed=8), np.random.default_rng(8)
+    sides = truth.side if known else np.full(3, np.nan)
+    rows = SquareRows(np.arange(12).reshape(3, 4), truth.shape, sides)
+    assert np.abs(rows.rows(truth.corners.reshape(-1, 3))[0]).max() < 1e-6
+    bent = truth.corners.reshape(-1, 3) + 1e-4 * rng.normal(size=(12, 3))
+    residual, derivative = rows.rows(bent)
+    for t in range(3):
+        made = tag_ties(np.array([t]), rows.corner[t : t + 1], truth.shape[:1], sides[t : t + 1], truth.side[t : t + 1], 1e3)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in made:
+            graph.push_back(factor)
+        values.insert(TAG0 + t, gtsam.Pose3(truth.pose[t]))
+        for j in rows.corner[t].tolist():
+            values.insert(L0 + j, bent[j])
+            graph.push_back(gtsam.PriorFactorPoint3(L0 + j, bent[j], gtsam.noiseModel.Isotropic.Sigma(3, 1e-9)))
+        if not known:
+            values.insert(TAG_SIZE0 + t, 0.0)
+        cost = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        assert graph.error(cost) == pytest.approx((residual[t] ** 2).sum() / 2, rel=0.02)
+        for c in range(12):
+            step = np.zeros((12, 3))
+            step.reshape(3, 12)[t, c] = 1e-7
+            change = (rows.rows(bent + step)[0] - rows.rows(bent - step)[0])[t] / 2e-7
+            np.testing.assert_allclose(change, derivative[t][:, c], atol=2e-2 * np.abs(derivative[t]).max())
 
 
 def settings_for(drive: TagDrive, *overrides: str, known: bool = True) -> Settings:

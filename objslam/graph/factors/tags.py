@@ -10,8 +10,6 @@ TIE = 1e-3
 """The standard deviation of the tie between a corner and the pose of its tag, as a share of their distance. A larger share
 lets a square bend. A smaller share conditions the linear system worse. The noise of corners is at least a hundred times
 larger, and printed tags are no better."""
-ROWS_KNOWN, ROWS_FREE = 12, 13
-"""The number of residuals of the ties of a tag with a known size, and with a free size."""
 
 
 def tag_ties(

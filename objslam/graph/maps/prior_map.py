@@ -187,7 +187,11 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances (n, 3, 3) of points (n, 3) with the doubt about the frame. A prior holds a point against it."""
+    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, with the error that all can share.
+
+    doubt: (4, 4) the covariance of this error, as from `shared_at_most`. The points `index` of the objects `there` have
+    priors with covariances `prior`. The better a prior determines a point, the less the shared error moves it.
+    """
     move = np.zeros((len(there), 3, 4))
     move[:, :, :3] = np.eye(3)
     move[:, :, 3] = np.array([_turned(p - pivot) for p in placed]).reshape(-1, 3)

@@ -9,12 +9,12 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.object_map import TagPose
-from objslam.core.rotation import quaternion_from_rotation, rotation_vector, skew
+from objslam.core.rotation import quaternion_from_rotation, rotation_vector
 from objslam.core.types import Rays
 from objslam.graph.optimizers import indeterminate
 from objslam.graph.tags.corner_rays import TagCorners
 from objslam.graph.tags.placement import place
-from objslam.graph.tags.shapes import squares_of
+from objslam.graph.tags.shapes import squares_of, turned_by_squares
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 LEAST_PROBABILITY = 0.01
@@ -113,15 +113,8 @@ def _marginals(
 
 
 def _of_squares(local: Floats, rotation: Floats) -> Floats:
-    """Return the derivatives (t, 7, 12) of squares by their corners in map: rotation and position in the frame of the
-    square, and the logarithm of the side, in least squares.
-
-    local: (t, 4, 3) m, the corners in this frame. rotation: (t, 3, 3).
-    """
-    count = len(local)
-    columns = [-skew(local), np.broadcast_to(np.eye(3), (count, 4, 3, 3)), local[..., None]]
-    by_square = np.einsum("tij,tcjk->tcik", rotation, np.concatenate(columns, axis=3))
-    return np.linalg.pinv(by_square.reshape(count, 12, 7))
+    """Return the derivatives (t, 7, 12) of squares by their corners in map, in least squares, as `turned_by_squares`."""
+    return np.asarray(np.linalg.pinv(turned_by_squares(local, rotation)), dtype=np.float64)
 
 
 def _second(

@@ -3,6 +3,7 @@
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.rotation import skew
 
 COUNTER_CLOCKWISE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 """(4, 3) the corners of a tag of side 1 in its own frame, if they go round counter-clockwise in the image, as AprilTag's do.
@@ -28,3 +29,15 @@ def squares_of(corners: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]
     axes = u @ vt
     rotation = np.concatenate([axes, np.cross(axes[:, :, 0], axes[:, :, 1])[:, :, None]], axis=2)
     return rotation, centre, size.sum(axis=1) / (shapes**2).sum(axis=(1, 2))
+
+
+def turned_by_squares(local: Floats, rotation: Floats) -> Floats:
+    """Return the derivatives (T, 12, 7) of the corners of squares in map: by rotation and position in the frame of the
+    square, and by the logarithm of the side.
+
+    local: (T, 4, 3) m, the corners in this frame. rotation: (T, 3, 3).
+    """
+    count = len(local)
+    columns = [-skew(local), np.broadcast_to(np.eye(3), (count, 4, 3, 3)), local[..., None]]
+    turned = np.einsum("tij,tcjk->tcik", rotation, np.concatenate(columns, axis=3))
+    return np.asarray(turned.reshape(count, 12, 7))

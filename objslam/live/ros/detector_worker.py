@@ -47,7 +47,9 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            late = self._waiting.pop(topic, None)
+            late = self._waiting.get(
+                topic
+            )  # The newer image keeps its place. At the end of the queue it might never be next.
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:
                 self._waiting[topic] = message, stamp

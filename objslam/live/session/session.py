@@ -253,7 +253,10 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now. Right after a quick frame, the most time is left until the next frame."""
+        """Return whether to make a snapshot now: no frame came for a while, the last one was quick, or the wait is long.
+
+        worked: whether a frame was just processed. begin: when this began, s (`time.perf_counter`).
+        """
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 

@@ -65,7 +65,7 @@ def repair(path: Path) -> list[Path]:
         last = found[-1].header
         assert last is not None
         made += [compress(full) for full in uncompressed_segments(file, identity_of(file, last), last.number)]
-    return made
+    return [one for one in made if one.exists()]  # A segment that was rewritten and then compressed has another name.
 
 
 def json_lines(path: Path, ledger: Ledger, left_out: Counter[str]) -> Iterator[str]:
