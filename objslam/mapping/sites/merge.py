@@ -14,7 +14,7 @@ from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse
-from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
+from objslam.core.object_map import MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
 from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
@@ -265,6 +265,7 @@ def _objects(
             first_seen=min(o.first_seen for _, _, o in of),
             last_seen=max(o.last_seen for _, _, o in of),
             life=track.life,
+            tag=_best_tag(solved, of),
         )
         item = replace(item, label=max(item.labels, key=lambda n: (item.labels or {})[n]) if item.labels else item.label)
         if track.life.probability >= GONE:
@@ -282,6 +283,12 @@ def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, Ma
     best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
     rotation = solved.site_T_map[best[1], :3, :3]
     return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
+
+
+def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:
+    """Return the rotation and size of a fiducial by the session that knew its rotation best, None for another object."""
+    best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
+    return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])
 
 
 def _labels(items: list[MapObject]) -> dict[str, float] | None:
