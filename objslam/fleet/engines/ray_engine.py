@@ -6,6 +6,7 @@ Ray places the tasks and runs them again when a node is lost. Results go to the 
 from __future__ import annotations
 
 import atexit
+import logging
 import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -50,7 +51,7 @@ def join_cluster(address: str) -> Cluster:
     try:
         if mark and port.isdigit():  # Ray itself waits for minutes where nobody listens.
             socket.create_connection((host.strip("[]"), int(port)), _PATIENT).close()
-        context = ray.init(address, log_to_driver=False, logging_level="ERROR")
+        context = ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         raise ObjslamError(f"no Ray cluster answers: {first_line(error)}", where=address, hint=hint) from error
     found = ray.cluster_resources()
