@@ -68,7 +68,7 @@ def calibrate_at_poses(
     positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: with the noise of
     the poses. SolveError if the linear system has no single solution.
     """
-    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # The index -1 (no object) takes the last.
+    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
     points = positions[number]
     if not held.any():
@@ -104,7 +104,8 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the angles (R,), rad, by which ray directions in map turn if shared errors (P,) change to others (P,)."""
+    """Return the angles (R,), rad, by which ray directions in map turn if the shared errors (P,) change. They must be
+    small."""
     ends = []
     for values in (before, after):
         keyframes, rays, _ = errors.at(values, drift=False)
@@ -153,7 +154,8 @@ def linearise_points(
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
-    """Return the factor (at least 1) by which the vector varies more than with independent errors of all rays.
+    """Return the factor (at least 1) by which the variance of `system.vector` is larger than if the errors of all rays were
+    independent.
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
     detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
@@ -174,7 +176,8 @@ def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: F
 
 
 def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the angles (n, 2) between rays and points, the axes across the rays (n, 2, 3), and the distances (n,)."""
+    """Return the angles (n, 2), rad, between rays and points, the axes (n, 2, 3) across the rays, and the distances (n,),
+    m."""
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)

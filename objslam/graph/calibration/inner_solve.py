@@ -59,7 +59,8 @@ class InnerSolve(Linearised):
         return replace(self.moved(system.sensitivity @ step + system.newton), measured=measured)
 
     def solved(self) -> Self:
-        """Return the state after an inner solve. One more step would hardly change it."""
+        """Return the state after at most `_INNER` steps of Gauss-Newton. If such a step does not lower the cost,
+        Levenberg-Marquardt solves from the start instead."""
         state = self
         for _ in range(_INNER):
             if state.decrease <= _TOLERANCE * state.rows.cost:
@@ -71,7 +72,7 @@ class InnerSolve(Linearised):
         return state
 
     def _damped(self) -> Self:
-        """Return the state after iterations of Levenberg-Marquardt. Steps of Gauss-Newton do not lower the cost."""
+        """Return the state after iterations of Levenberg-Marquardt."""
         landmarks = self.landmarks
         graph, values = self.measured.whole(self.association.object, self.used, self.map_T_camera, self.positions)
         found = levenberg_marquardt(graph, values, _INNER, _TOLERANCE).values

@@ -1,4 +1,4 @@
-"""The rotation and size of fiducials at given camera poses. Their positions are those of other objects."""
+"""The rotation and size of fiducials at given camera poses. Their positions are triangulated like those of other objects."""
 
 import numpy as np
 
@@ -13,17 +13,17 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.square_fit import Corners, fit, scatter
 
 _NOMINAL = 4.0
-"""The number of views at which the scatter of the views and the nominal noise have equal weight in the covariance. A larger
-number leaves more to the nominal noise."""
+"""The number of views at which the scatter of the views and the nominal noise have equal weight in the covariance. From this
+number on, a fit to all views leaves a known size free. A larger number leaves more to the nominal noise."""
 _STEPS = 5
-"""The iterations of a fit to all views, from one to some of them. More iterations are slower."""
+"""The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
 
 
 def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> dict[int, TagPose]:
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
-    The error of a pose is common to the four corners of a view, so the covariance comes from the scatter of whole views. A
-    fiducial whose views do not tell its size has no entry.
+    The error of a pose is common to the four corners of a view, so the covariance comes from the scatter of whole views, and
+    for few views also from the nominal noise. A fiducial whose views do not tell its size has no entry.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:
