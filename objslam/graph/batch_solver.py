@@ -31,8 +31,7 @@ from objslam.triangulation.triangulate import Triangulation
 
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
 """A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
-shared errors. The second is for a solve with them, because their estimation moves everything again. Larger values end a
-solve sooner."""
+shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
 _ROUNDS_BEFORE = 2
 """The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
 its steps. A larger number is slower, and leads to the same inliers."""

@@ -4,7 +4,7 @@ The filter keeps all correlations between errors. The errors include those that 
 lagging clock. So the filter knows in each frame where each landmark may appear. The rays of a frame are assigned together,
 because one error of the pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
 After a long way, a landmark that seems new may be an old one. Recent landmarks are tied to old ones if one drift explains
-all pairs much better than chance. The time for a frame grows with the number of landmarks, but hardly with the length of the
+all pairs much better than chance. The time for a frame grows with the number of landmarks, hardly with the length of the
 log.
 """
 
@@ -33,8 +33,7 @@ landmark. A larger number keeps false landmarks longer, and is slower."""
 _RECENT = 300
 """The number of frames after its first ray in which a landmark can be tied to an old one. A larger number is slower."""
 _SURE = 4.0
-"""The least log odds of a match over the best explanation without this match. Larger odds leave more rays without a
-landmark."""
+"""The least log odds of a match over the best explanation without this match. Larger odds match fewer rays."""
 _NEW = 0.2
 """The expected share of rays that belong to no known landmark. A larger share accepts fewer matches."""
 _PAIRS = 40
@@ -131,8 +130,7 @@ class _Exploration:
         return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 
     def _see(self, rays: Ints, now: int) -> None:
-        """Assign the rays of a frame, and correct the filter. Each unassigned ray with a range gives a landmark, unless it
-        is doubtful."""
+        """Assign a frame's rays, and correct the filter. A free ray with a range gives a landmark, unless it is doubtful."""
         if len(self.filter) and len(rays):
             self._match(rays)
         free = rays[(self.owner[rays] < 0) & ~self.doubtful[rays] & np.isfinite(self.rays.range[rays])]
@@ -168,16 +166,14 @@ class _Exploration:
             self._learn(*ekf.update(f, expected.take(chosen)))
 
     def _learn(self, step: Floats, expected: Floats) -> None:
-        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y (rad, m) with an expected covariance (3,
-        3)."""
+        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with its expected covariance (3, 3)."""
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first frame from which on the drift of the heading is below `HORIZON`, at most `_STRETCH` frames
-        ago."""
+        """Return the first of the last `_STRETCH` frames from which on the drift of the heading is below `HORIZON`."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:

@@ -116,8 +116,7 @@ class GrowingGraph(ABC):
             self._at.poses.pop(k, None)
 
     def drop_kind(self, kind: str) -> None:
-        """Remove all factors of a kind that `add` added, and the variables of `add_variable` that are left without a
-        factor."""
+        """Remove all factors of a kind of `add`, and the variables of `add_variable` that are left without a factor."""
         self._rebuild = None
         self._store.kinds.pop(kind, None)
         self._drop_free_variables()

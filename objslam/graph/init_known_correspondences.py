@@ -24,8 +24,7 @@ next solve continues from its result. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
 doubles. Above the second limit, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3
-to 5 and 15 degrees converge to the same map. With iSAM2 in place of the solves of a window, robot 1 or robot 5 did not
-converge."""
+to 5 and 15 degrees converge to the same map. With iSAM2 in place of a window, robot 1 or 5 did not converge."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
 median angle of the step. Larger values accept more false boxes. Both are well above the odometry's drift in one step."""
@@ -33,8 +32,7 @@ _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks are added
 later. With fewer rays, false boxes agree by chance too often."""
 _SHORTEST = 4
-"""The shortest step is joint.grow_step divided by this number, but at least 2 keyframes. A larger number allows shorter
-steps and slower growth."""
+"""The shortest step is joint.grow_step divided by this number, and at least 2. A larger number allows slower growth."""
 _AGAIN = 1.05
 """A landmark that is not yet in the graph is triangulated again when its number of rays has grown by this factor. A larger
 factor is faster, but landmarks come into the graph later. With a factor of 1, the time would grow with the square of the

@@ -33,8 +33,8 @@ landmark was observed. A larger value recognises landmarks after a longer absenc
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The error (m) that a measured range may have in addition to four standard deviations of its noise. A larger value accepts
-more wrong ranges."""
+"""The error (m) that a measured range may have beyond 4 standard deviations of its noise. A larger value accepts more wrong
+ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
 """The uncertainty of the poses in a step after their alignment with the landmarks. It is the share `_LEFT` of the drift's
 covariance, plus the standard deviations `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
@@ -46,8 +46,7 @@ _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
 starts farther from its optimum, so it needs more. Larger numbers are slower."""
 _STRAIN = 200.0
 """A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
-closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, and wrong loops by 240 or
-more."""
+closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ class IncrementalGraph(GrowingGraph):
         self.rebuilds = 0
 
     def update(self) -> None:
-        """Add the new variables and factors to the estimate. SolveError if the graph cannot be rebuilt after an
-        exception."""
+        """Add the new variables and factors to the estimate. SolveError if no rebuild succeeds after an exception."""
         self._updates += 1
         self._work_in()
 

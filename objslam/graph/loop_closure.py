@@ -26,8 +26,8 @@ number is faster and less exact. A landmark counts as new if it was first seen w
 
 @dataclass
 class Landmarks:
-    """A table of landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), first and last keyframe that saw it
-    (N,)."""
+    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw
+    each."""
 
     position: Floats
     covariance: Floats

@@ -21,8 +21,7 @@ OnIteration = Callable[[float, gtsam.Values], None]
 class Optimum:
     """The result of an optimisation. SolveError if its cost is not finite.
 
-    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weight of each factor by GNC, None for
-    Levenberg-Marquardt.
+    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weight of each factor by GNC, else None.
     """
 
     values: gtsam.Values

@@ -46,8 +46,7 @@ class SlidingWindow:
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
         """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
 
-        covariance: (m, 3, 3) m^2, of the landmarks by their rays. A prior with it replaces rays of keyframes that have left
-        the window.
+        covariance: (m, 3, 3) m^2, of the landmarks by their rays. It replaces the rays of keyframes before the window.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
@@ -106,9 +105,8 @@ class SlidingWindow:
     def _move(self, begin: int) -> None:
         """Let the window begin at another keyframe. The marginals of the removed part become priors of the window.
 
-        A landmark that leaves the window keeps its marginal for the time when it is seen again. If the marginals are
-        indeterminate, the window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve
-        raises SolveError.
+        A landmark that leaves the window keeps its marginal for when it is seen again. If the marginals are indeterminate,
+        the window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve raises SolveError.
         """
         if begin == self._begin:
             return

@@ -1,8 +1,7 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
 X(k) belongs to the camera of keyframe k. If images share a pose, X(k) belongs to the first camera of multiframe k. Y(t) is
-the pose of fiducial t. If the size of fiducial t is not known, Z(t) is the first value of half its diagonal minus the
-present value, m.
+the pose of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present one.
 
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """

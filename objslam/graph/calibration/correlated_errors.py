@@ -30,8 +30,7 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
 
 
 def _seconds(of: Linearised, system: LinearSystem) -> Floats:
-    """Return the time (M,) of each row after the first keyframe, s. The priors of landmarks, the absolute poses and the
-    fiducials have the time 0."""
+    """Return the time (M,) of each row after the first keyframe, s. It is 0 for landmark priors, absolute poses and tags."""
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     stamps = np.maximum.accumulate(keyframes.stamps) - keyframes.stamps[0]
     seen, ranged = stamps[rays.keyframe], np.isfinite(rays.range)

@@ -104,8 +104,7 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the angles (R,), rad, by which ray directions in map turn if the shared errors (P,) change. They must be
-    small."""
+    """Return the small angles (R,), rad, by which rays in map turn between two values (P,) of the shared errors."""
     ends = []
     for values in (before, after):
         keyframes, rays, _ = errors.at(values, drift=False)
@@ -154,8 +153,7 @@ def linearise_points(
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
-    """Return the factor (at least 1) by which the variance of `system.vector` is larger than if the errors of all rays were
-    independent.
+    """Return the factor (at least 1) on the variance of `system.vector` because the errors of rays are not independent.
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
     detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
@@ -176,8 +174,7 @@ def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: F
 
 
 def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the angles (n, 2), rad, between rays and points, the axes (n, 2, 3) across the rays, and the distances (n,),
-    m."""
+    """Return the angles (n, 2), rad, between rays and points, the axes (n, 2, 3) across the rays, and distances (n,), m."""
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)

@@ -59,8 +59,7 @@ class InnerSolve(Linearised):
         return replace(self.moved(system.sensitivity @ step + system.newton), measured=measured)
 
     def solved(self) -> Self:
-        """Return the state after at most `_INNER` steps of Gauss-Newton. If such a step does not lower the cost,
-        Levenberg-Marquardt solves from the start instead."""
+        """Return the state after at most `_INNER` Gauss-Newton steps, or `_damped` if a step does not lower the cost."""
         state = self
         for _ in range(_INNER):
             if state.decrease <= _TOLERANCE * state.rows.cost:

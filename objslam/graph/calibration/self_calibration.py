@@ -29,11 +29,10 @@ _ROUNDS = 8
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _HALVINGS = 3
-"""The most times that a step is halved if it does not lower the cost. After that, the parameters stay as they are. A larger
-number tries shorter steps."""
+"""The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If none lowers
+the cost, the parameters stay as they are."""
 _LEAST_SIGNAL = 0.05
-"""The least share of signal in the information about a clock or an odometry scale. With a smaller share, a noisy parameter
-takes larger steps."""
+"""The least share of signal in the information about a clock or odometry scale. A smaller share takes larger steps."""
 _RIDGE = 1e-9
 """The share of the information about the clocks that is added to its diagonal. It prevents a division by zero if a log
 cannot tell two clocks apart. A larger share mixes such clocks more."""

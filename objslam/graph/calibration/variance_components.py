@@ -25,19 +25,16 @@ _PROBES = 12
 """The number of random probes. With n residuals, the relative error of the redundancy is sqrt(2 / (n * probes)). More probes
 are slower."""
 _ITERATIONS = 20
-"""The most iterations. Each takes one factorisation of the linear system. MRCLAM takes 12 to 17. A larger number is
-slower."""
+"""The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 12 to 17."""
 _CONVERGED = 0.02
 """The iteration ends if all factors change by less than this share. A larger share ends it sooner."""
 _LIMITS = (0.05, 20.0)
-"""The smallest and the largest factor on a nominal noise. Outside these limits, the settings do not describe the sensor at
-all."""
+"""The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
 TOGETHER = 3.0
 """The time (s) over which errors may be correlated: wheels lag behind a command, and a detector's box is off for a while. A
 longer time finds slower errors, from fewer independent sums."""
 _MOST_SHRINKAGE = 0.3
-"""The largest shrinkage (a share of the size) that is corrected. A map that shrank more has another cause, which a larger
-value would hide."""
+"""The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger value would hide."""
 _LEAST_TOLD = 0.3
 """`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
 motions. A larger share uses it more rarely."""
@@ -216,8 +213,7 @@ def _updated(
 
 
 def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:
-    """Return the factor on the noise of rays. It is larger if rays of one object have correlated errors for a while. factor:
-    the present one.
+    """Return the factor on the noise of rays. It is larger if rays of one object have correlated errors for a while.
 
     The mean of absolute values is robust. The larger of azimuth and elevation counts, because a sensor may fix one of them.
     """
@@ -324,8 +320,7 @@ def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
 
 
 def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:
-    """Return the matrices (n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation in the base
-    frame."""
+    """Return matrices (n, 2, 2) from bearing residuals in GTSAM's basis to azimuth and elevation in the base frame."""
     basis = tangent_basis(directions)
     up = base_T_camera[:, 2, :3]
     elevation = up - (up * directions).sum(axis=1, keepdims=True) * directions

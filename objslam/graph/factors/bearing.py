@@ -111,8 +111,7 @@ def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric:
     """Return the residuals (R, 2) of the factors of rays, along axes (R, 3, 2).
 
     directions: (R, 3) unit. to_landmark: (R, 3) m, from the origin of the ray, in the same frame. metric: whether residuals
-    are distances from the ray (m, Eq. 1), or angles (rad). Above pi / 2, the angles differ from the residuals of GTSAM's
-    factors.
+    are distances from the ray (m, Eq. 1), or angles (rad). Below pi / 2, the angles agree with GTSAM's factors.
     """
     along = np.einsum("ri,ri->r", directions, to_landmark)
     across = to_landmark - along[:, None] * directions

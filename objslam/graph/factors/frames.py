@@ -15,7 +15,7 @@ _UPRIGHT = 1e-5
 """The standard deviation (rad) of roll and pitch between two frames with z up. A larger value lets frames tilt. It was
 chosen far below what a map can tell, and large enough to keep the linear system well conditioned."""
 _FREE = 100.0
-"""The standard deviation (rad, m) of the yaw and the shift of a frame in its prior. A larger value leaves them freer, and
+"""The standard deviation (rad, m) of the yaw and the shift of a frame in its prior. A larger value leaves more freedom, and
 conditions the linear system worse."""
 
 
@@ -26,8 +26,7 @@ def frame_prior(map_T_drive: Floats) -> gtsam.NonlinearFactor:
 
 
 def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]:
-    """Return for each of the objects (n,) the factor F * L(j) = P(j). Its covariance (n, 3, 3) m^2 is in the axes of the
-    map."""
+    """Return the factors F * L(j) = P(j) of objects (n,), with covariances (n, 3, 3) m^2 in the axes of the map."""
     make = gtsam.noiseModel.Gaussian.Covariance
     return [
         gtsam.ReferenceFrameFactorPoint3Pose3(L0 + j, F0, P0 + j, make(c))

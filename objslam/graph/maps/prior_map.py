@@ -138,8 +138,7 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return the part (n, 3, 3), m^2, of each object's covariance that the graph does not contain. Its standard deviation is
-    at least `LEAST`."""
+    """Return the part (n, 3, 3), m^2, of the objects' covariances that the graph does not contain, as in `beyond`."""
     floor = LEAST**2 * np.eye(3)
     if measured is None:  # The graph has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor

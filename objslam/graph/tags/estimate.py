@@ -18,8 +18,8 @@ from objslam.graph.tags.shapes import squares_of, turned_by_squares
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 LEAST_PROBABILITY = 0.01
-"""The second rotation of a flat square is reported if its probability is at least this. With a larger value, fewer second
-rotations are reported."""
+"""The least probability at which the second rotation of a flat square is reported. With a larger value, fewer are
+reported."""
 
 
 def with_objects(
@@ -114,15 +114,14 @@ def _marginals(
 
 
 def _of_squares(local: Floats, rotation: Floats) -> Floats:
-    """Return the derivatives (t, 7, 12) of least-squares squares by their corners in map: the inverse of
-    `turned_by_squares`."""
+    """Return the derivatives (t, 7, 12) of fitted squares by their corners in map: the inverse of `turned_by_squares`."""
     return np.asarray(np.linalg.pinv(turned_by_squares(local, rotation)), dtype=np.float64)
 
 
 def _second(
     tags: TagCorners, rays: Rays, map_T_camera: Floats, which: Ints, rotation: Floats, wider: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the shifts (t, 3) m to the second
+    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the shifts (t, 3) m to their
     positions.
 
     which: (t,) the fiducials. rotation: (t, 3, 3) the solved rotations. wider: (M,) as in `with_objects`. Both poses are

@@ -18,11 +18,10 @@ _VIEWS = 64
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
-"""The least information about the logarithm of an unknown side. It is that of a standard deviation of one half. With more,
-fewer fiducials of unknown size have a pose."""
+"""The least information about the logarithm of an unknown side: 1 / 0.5^2. With more, fewer fiducials of unknown size have a
+pose."""
 _SAME = np.radians(3.0)
-"""Two poses count as one if the angle (rad) between their rotations is not above this. With a larger angle, more fiducials
-have a single pose."""
+"""The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0
 """A fiducial is moved to a new pose if this decreases its cost (a robust sum of squared deviations) by more than this value.
 A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials where they are."""
@@ -128,8 +127,7 @@ def _nearest(seen: Corners, most: int) -> Ints:
 
 
 def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
-    """Return for each candidate the judging views of its fiducial. owner: (C,) the fiducial of each candidate, of
-    `count`."""
+    """Return for each candidate the `judges` of its fiducial. owner: (C,) the fiducial of each candidate, of `count`."""
     judges = judges.take(np.argsort(judges.square, kind="stable"))
     begin, number = np.searchsorted(judges.square, np.arange(count)), np.bincount(judges.square, minlength=count)
     candidate = np.repeat(np.arange(len(owner)), number[owner])

@@ -102,8 +102,7 @@ def _moved(squares: Squares, step: Floats) -> Squares:
 
 
 def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return whitened residuals (V, 4, 2), their derivatives (V, 4, 2, 3) by the corners in map, and which corners (V, 4)
-    are ahead."""
+    """Return whitened residuals (V, 4, 2), derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4) are ahead."""
     to = corners[seen.square] - seen.origin[:, None]
     along = np.einsum("vci,vci->vc", seen.direction, to)
     ahead = along > _BEHIND * np.linalg.norm(to, axis=2)
@@ -122,8 +121,7 @@ def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
 
 
 def scatter(seen: Corners, squares: Squares, free: Bools) -> Floats:
-    """Return the sums (H, 7, 7) of the squared gradients of the views of each square, because the corners of a view may
-    share errors.
+    """Return the sums (H, 7, 7) of the squared gradients of each square's views. The corners of a view may share errors.
 
     Between two inverses of the information, this is the covariance of a fit (cluster-robust; Liang and Zeger 1986).
     """
