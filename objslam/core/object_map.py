@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.body import Body
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -26,8 +27,13 @@ COLUMNS: dict[str, str] = {
     **dict.fromkeys(("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "float64"),
     **{"rays": "int64", "frames": "int64"},
     **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
+    "shape": "string",
+    **dict.fromkeys(
+        ("size_l", "size_w", "size_h", "yaw", "size_l_sigma", "size_w_sigma", "size_h_sigma", "yaw_sigma"), "float64"
+    ),
 }
-"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s."""
+"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
+yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,9 @@ class MapObject:
     the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
     rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
     existence are None if the run took all boxes of a label as one object. seen_from: from where it was detected, None if
-    unknown. life: what several sessions say of it, None if there was one.
+    unknown. life: what several sessions say of it, None if there was one. body: its size and heading, None for a point. The
+    position is its centre. ray_point: (3,) m, for an object with a body, the point at which the rays through the centres of
+    its boxes meet.
     """
 
     id: int
@@ -91,6 +99,8 @@ class MapObject:
     existence: float | None = None
     seen_from: SeenFrom | None = None
     life: Life | None = None
+    body: Body | None = None
+    ray_point: Floats | None = None
 
     @property
     def sigma(self) -> float | None:
@@ -110,6 +120,7 @@ class MapObject:
                 self.last_seen,
                 self.existence,
             ),
+            *_body_row(self.body),
         )
         known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
         return dict(zip(COLUMNS, known, strict=True))
@@ -220,6 +231,13 @@ class ObjectMap:
         return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
 
 
+def _body_row(body: Body | None) -> tuple[str | float | None, ...]:
+    """Return the values of a body in a table row."""
+    if body is None:
+        return ("point", *[None] * 8)
+    return (body.shape, *body.size.tolist(), body.yaw, *body.size_sigma.tolist(), body.yaw_sigma)
+
+
 def _point(values: ArrayLike) -> Floats:
     point = np.asarray(values, dtype=np.float64)
     if point.shape not in ((2,), (3,)) or np.isnan(point).any():
@@ -282,4 +300,13 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
         extent=None if extent is None else (float(extent[0]), float(extent[1])),
         labels=labels,
         existence=None if a.existence is None or b.existence is None else float(np.fmax(a.existence, b.existence)),
+        body=surer_body(a.body, b.body),
+        ray_point=None,
     )
+
+
+def surer_body(a: Body | None, b: Body | None) -> Body | None:
+    """Return the body whose size is known better, or the only one."""
+    if a is None or b is None:
+        return a or b
+    return b if b.size_sigma.prod() < a.size_sigma.prod() else a

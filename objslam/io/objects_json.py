@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
+from objslam.core.body import SHAPES, Body
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
@@ -18,6 +19,7 @@ from objslam.errors import LogError, ObjslamError, OutputError
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
 _READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
 _UNIT = 1e-3  # The largest difference of the length of a direction from 1. A larger value accepts worse directions.
+_TURN = 2 * math.pi  # The largest yaw, rad. A larger value accepts angles in degrees.
 _T = TypeVar("_T")
 
 
@@ -32,7 +34,16 @@ def dump_objects(objects: ObjectMap) -> str:
 
 def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
     """Return the text of a ground truth file. `read_truth_objects` restores the same objects."""
-    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map", [])
+    return _dump([_truth_entry(o) for o in objects], "map", [])
+
+
+def _truth_entry(o: TruthObject) -> dict[str, Any]:
+    entry: dict[str, Any] = {"id": o.id, "label": o.label, "position": o.position.tolist()}
+    if o.size is not None:
+        entry["size"] = o.size.tolist()
+    if o.yaw is not None:
+        entry["yaw"] = o.yaw
+    return entry
 
 
 def read_objects(file: Path) -> ObjectMap:
@@ -106,6 +117,12 @@ def _entry(o: MapObject) -> dict[str, Any]:
     if o.life is not None:
         moved = o.life.moved_from
         entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
+    if o.body is not None:
+        body = o.body
+        entry |= {"shape": body.shape, "size": body.size.tolist(), "size_sigma": body.size_sigma.tolist()}
+        entry |= {"yaw": float(body.yaw), "yaw_sigma": float(body.yaw_sigma)}
+    if o.ray_point is not None:
+        entry["ray_point"] = o.ray_point.tolist()
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
     return entry
@@ -158,7 +175,10 @@ def _stamp(entry: dict[str, Any], name: str) -> float:
 def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     if entry.get("status") == "unresolved":
         return None
-    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), _vector(entry.get("position"), "position"))
+    size = None if entry.get("size") is None else _size(entry["size"], "size")
+    yaw = None if entry.get("yaw") is None else _number(entry["yaw"], "yaw")
+    place = _vector(entry.get("position"), "position")
+    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), place, size, yaw)
 
 
 def _map_object(entry: dict[str, Any]) -> MapObject:
@@ -209,7 +229,29 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
         seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
+        body=_body(entry),
+        ray_point=None if entry.get("ray_point") is None else _vector(entry["ray_point"], "ray_point"),
     )
+
+
+def _body(entry: dict[str, Any]) -> Body | None:
+    shape = next((one for one in SHAPES if one == entry.get("shape", "point")), None)
+    if shape is None:
+        raise _Malformed(f"shape must be one of {', '.join(SHAPES)}, got {_short(entry.get('shape'))}")
+    if shape == "point":
+        return None
+    sides = _size(entry.get("size"), "size"), _size(entry.get("size_sigma"), "size_sigma")
+    yaw, sigma = (_number(entry.get(name), name) for name in ("yaw", "yaw_sigma"))
+    if not (abs(yaw) <= _TURN and 0 <= sigma <= _TURN):
+        raise _Malformed("yaw and yaw_sigma must be angles in radians")
+    return Body(shape, sides[0], yaw, sides[1], sigma)
+
+
+def _size(value: Any, name: str) -> Floats:
+    size = _vector(value, name)
+    if not ((size >= 0) & (size < MAX_POSITION)).all():
+        raise _Malformed(f"{name} must be a length, a width and a height in metres")
+    return size
 
 
 def _seen_from(value: Any) -> SeenFrom:

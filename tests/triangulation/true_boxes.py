@@ -1,0 +1,127 @@
+"""Boxes of ellipsoids and cuboids by their outlines, without the tangent planes that the fit uses."""
+
+import numpy as np
+
+from objslam.core.camera import Camera, project
+from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
+from objslam.triangulation.bodies.ellipsoid import from_axes, matrices
+
+CAMERAS = {
+    "pinhole": Camera("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])),
+    "plumb_bob": Camera(
+        "c",
+        640,
+        480,
+        np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]),
+        distortion=np.array([-0.28, 0.08, 0.001, -0.0005, 0.0]),
+    ),
+    "equidistant": Camera(
+        "c",
+        640,
+        480,
+        np.array([[250.0, 0, 320], [0, 250, 240], [0, 0, 1]]),
+        "equidistant",
+        np.array([-0.01, 0.003, 0.0, 0.0]),
+    ),
+}
+
+
+def looking_at(place, target):
+    """The pose of a level camera at a place that looks at a target."""
+    z = target - place
+    z = z / np.linalg.norm(z)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.column_stack([x, np.cross(z, x), z]), place
+    return pose
+
+
+def outline_box(camera, body, pose):
+    """The box around the image of an ellipsoid, from the circle on it whose tangents meet the camera. None if behind."""
+    root = np.linalg.cholesky(matrices(body[None])[0])
+    seen = np.linalg.solve(root, pose[:3, 3] - body[:3])
+    distance = np.linalg.norm(seen)
+    if distance <= 1:
+        return None
+    seen /= distance
+    a = np.cross(seen, [0.3, 0.5, 0.8])
+    a /= np.linalg.norm(a)
+    b = np.cross(seen, a)
+
+    def pixels(angle):
+        ring = np.sqrt(1 - distance**-2) * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b)
+        points = body[:3] + (seen / distance + ring) @ root.T
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        return project(camera, local), local[:, 2].min()
+
+    angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    rough, nearest = pixels(angles)
+    if nearest < 0.05:
+        return None
+    sides = []
+    for axis, pick in ((0, np.argmin), (1, np.argmin), (0, np.argmax), (1, np.argmax)):
+        best, step = angles[pick(rough[:, axis])], 2 * np.pi / 90
+        for _ in range(8):  # the vertex of a parabola through three points
+            before, at, after = pixels(best + step * np.array([-1, 0, 1]))[0][:, axis]
+            bend = before - 2 * at + after
+            best += np.clip(0.5 * step * (before - after) / bend, -step, step) if bend else 0.0
+            step = max(step / 4, 1e-4)
+        sides.append(pixels(np.array([best]))[0][0, axis])
+    return np.array(sides)
+
+
+def corner_box(camera, centre, half, yaw, pose):
+    """The box around the image of a cuboid, by its corners in a pinhole."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    corners = centre + signs * half @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    if local[:, 2].min() < 0.05:
+        return None
+    pixels = project(camera, local)
+    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+
+
+def random_bodies(count, rng):
+    """Ellipsoids of 0.1 to 1.4 m around the origin."""
+    half = np.exp(rng.uniform(np.log(0.05), np.log(0.7), (count, 3)))
+    return from_axes(rng.uniform(-0.3, 0.3, (count, 3)), half, rng.uniform(-1.5, 1.5, count))
+
+
+def views_of(camera, body, count, rng, arc=2 * np.pi):
+    """Boxes (count, 4) of an ellipsoid and the poses (count, 4, 4) that see it, at 1.6 to 4 m over an arc of azimuths."""
+    boxes, poses = [], []
+    while len(boxes) < count:
+        azimuth, distance = rng.uniform(0, arc), rng.uniform(1.6, 4)
+        place = body[:3] + distance * np.array([np.cos(azimuth), np.sin(azimuth), rng.uniform(-0.2, 0.6)])
+        pose = looking_at(place, body[:3] + rng.uniform(-0.3, 0.3, 3))
+        box = outline_box(camera, body, pose)
+        if box is not None:
+            boxes.append(box)
+            poses.append(pose)
+    return np.array(boxes), np.array(poses)
+
+
+def edges_of(camera, boxes, poses, body, sigma=1.0, contact=None):
+    """The edges of boxes of bodies (B,), without ranges."""
+    normal, turn, good = tangent_planes(camera, boxes, poses, contact)
+    assert good.all()
+    count = len(boxes)
+    size = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1))
+    none, unknown = np.zeros((count, 4), dtype=bool), np.full(count, np.nan)
+    flat = np.zeros(count)
+    return BoxEdges(
+        body,
+        poses[:, :3, 3],
+        normal,
+        turn,
+        np.full(count, sigma),
+        flat,
+        none,
+        size,
+        np.zeros((count, 3)),
+        unknown,
+        flat + 1,
+        flat,
+    )
