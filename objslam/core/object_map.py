@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.body import Body
+from objslam.core.bodies.body import Body
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]

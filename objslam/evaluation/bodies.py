@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Floats
+from objslam.core.bodies.upright_box import overlap
 from objslam.core.object_map import MapObject
 from objslam.core.types import TruthObject
-from objslam.core.upright_box import overlap
 from objslam.evaluation.alignment import Transform
 
 _SQUARE = 1.1

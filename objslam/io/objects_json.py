@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.body import SHAPES, Body
+from objslam.core.bodies.body import SHAPES, Body
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions

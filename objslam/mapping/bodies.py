@@ -9,9 +9,9 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH, extents
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
-from objslam.core.body import SHAPES, Body, PlacedBody
+from objslam.core.bodies.body import SHAPES, Body, PlacedBody
 from objslam.core.camera import Camera
-from objslam.frontend.up import from_above, up_axis, up_vector
+from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
@@ -31,7 +31,7 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     The covariance of a centre holds the noise of the boxes, the errors that they share, and what the covariance of the point
     holds beyond the noise of its rays, such as the noise of solved poses.
     """
-    if not settings.bodies.use:
+    if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
     views = _views(solution, cameras, settings)
     if not len(views.ray):
@@ -54,16 +54,18 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     extra = _beyond_rays(solution, settings, views)
     for at, j in enumerate(views.objects.tolist()):
         if found.shape[at]:
-            bodies[j] = _body(found, at, extra[at], views.from_upright)
-    return replace(solution, bodies=tuple(bodies), body_share=found.share)
+            bodies[j] = _body(found, at, extra[at])
+    to_centre = np.zeros((len(solution.rays), 3))
+    to_centre[views.ray] = np.einsum("bji,bj->bi", views.poses[:, :3, :3], found.to_centre)
+    return replace(solution, bodies=tuple(bodies), body_share=found.share, to_centre=to_centre)
 
 
 @dataclass(frozen=True)
 class _Views:
-    """The boxes of objects with a point, in a frame with z up.
+    """The boxes of objects with a point.
 
     objects: (n,) the objects, ray: (B,) the used rays. body: (B,) the object of each box as an index into `objects`. points:
-    (n, 3) m. half: (n, 2) m, apparent half axes. side: (B,) px. from_upright: (3, 3) the rotation to the map.
+    (n, 3) m. half: (n, 2) m, apparent half axes.
     """
 
     solution: Solution
@@ -74,7 +76,6 @@ class _Views:
     body: Ints
     points: Floats
     half: Floats
-    from_upright: Floats
 
     @property
     def side(self) -> Floats:
@@ -92,16 +93,14 @@ class _Views:
         return self.solution.keyframes.camera[self.solution.rays.keyframe[self.ray]]
 
     @property
-    def _poses(self) -> Floats:
-        keyframes = self.solution.keyframes
-        poses = (self.solution.estimate.map_T_base @ keyframes.base_T_camera)[self.solution.rays.keyframe[self.ray]].copy()
-        turn = self.from_upright.T
-        poses[:, :3, :3], poses[:, :3, 3] = turn @ poses[:, :3, :3], poses[:, :3, 3] @ turn.T
-        return np.asarray(poses)
+    def poses(self) -> Floats:
+        """(B, 4, 4) map_T_camera of each box."""
+        poses = self.solution.estimate.map_T_base @ self.solution.keyframes.base_T_camera
+        return np.asarray(poses[self.solution.rays.keyframe[self.ray]])
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
         """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch them, if known."""
-        rays, settings, poses = self.solution.rays.take(self.ray), self.settings, self._poses
+        rays, settings, poses = self.solution.rays.take(self.ray), self.settings, self.poses
         count = len(self.ray)
         normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), np.zeros((count, 4), dtype=bool)
         good = np.zeros(count, dtype=bool)
@@ -154,9 +153,6 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     number = np.bincount(association.object[ray], minlength=association.count)
     objects = np.flatnonzero(fit & (number >= _FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]
-    up = up_axis(keyframes)
-    axes = from_above(up)
-    turn = np.stack([np.eye(3)[axes[0]], np.eye(3)[axes[1]], up_vector(up)], axis=1)
     return _Views(
         solution,
         cameras,
@@ -164,9 +160,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
         objects,
         ray,
         np.searchsorted(objects, association.object[ray]),
-        estimate.positions[objects] @ turn,
+        estimate.positions[objects],
         apparent_half_axes(*sizes[objects].T),
-        turn,
     )
 
 
@@ -188,8 +183,8 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
     return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, np.maximum(size, 0.0), vectors))
 
 
-def _body(found: Bodies, at: int, extra: Floats, from_upright: Floats) -> PlacedBody:
-    """Return one body in the frame of the map."""
+def _body(found: Bodies, at: int, extra: Floats) -> PlacedBody:
+    """Return one body. extra: (3, 3) m^2, what is added to the covariance of its centre."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at].copy()
     # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.
@@ -198,10 +193,7 @@ def _body(found: Bodies, at: int, extra: Floats, from_upright: Floats) -> Placed
     slope = found.slope[at].copy()
     slope[3:6] *= 2.0  # from half axes to sizes
     covariance = slope @ covariance @ slope.T
-    turn = np.eye(7)
-    turn[:3, :3] = from_upright
-    covariance = turn @ covariance @ turn.T
     covariance[:3, :3] += extra
     sigma = np.sqrt(np.diagonal(covariance))
     body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], float(min(sigma[6], _ANY_YAW)))
-    return PlacedBody(body, from_upright @ centre, (covariance + covariance.T) / 2)
+    return PlacedBody(body, centre, (covariance + covariance.T) / 2)

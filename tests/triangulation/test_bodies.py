@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from triangulation.true_boxes import CAMERAS, corner_box, edges_of, looking_at, outline_box, random_bodies, views_of
 
-from objslam.core.body import SHAPES
+from objslam.core.bodies.body import SHAPES
 from objslam.core.camera import project
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes

@@ -14,7 +14,7 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
-_STILL = 1e-9
+STILL = 1e-9
 """The decrease of the cost that a step promises at which a body is at rest. The cost is half a sum of squared deviations. A
 larger decrease ends sooner."""
 _UPHILL = 1e-3
@@ -64,21 +64,32 @@ class Fit:
     prior: Floats
 
 
-def fit(edges: BoxEdges, start: Floats, prior: Prior, weights: Weights, kind: Kind) -> Fit:
-    """Return the most probable bodies (N, 7) of one kind from a start."""
+def fit(
+    edges: BoxEdges,
+    start: Floats,
+    prior: Prior,
+    weights: Weights,
+    kind: Kind,
+    *,
+    still: float = STILL,
+    most: int = _ITERATIONS,
+) -> Fit:
+    """Return the most probable bodies (N, 7) of one kind from a start. most: of the steps. still: see `STILL`."""
     values = start.copy()
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
     steps = 0
-    while len(moving) and steps < _ITERATIONS:
+    while len(moving) and steps < most:
         part = moving
         boxes = np.flatnonzero(np.isin(edges.body, part))
         some = edges.take(boxes)
         some = replace(some, body=np.searchsorted(part, some.body))
         mine = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
         own = Prior(prior.mean[part], prior.information[part])
-        values[part], damping[part], still, steps = _steps(some, values[part], damping[part], own, mine, kind, steps)
-        moving = part[~still]
+        values[part], damping[part], rest, steps = _steps(
+            some, values[part], damping[part], own, mine, kind, (steps, most, still)
+        )
+        moving = part[~rest]
     now = residuals(edges, values, kind)
     weight = _weight(now, weights)
     information, _, _ = _normal(edges.body, np.argsort(edges.body, kind="stable"), now, weight, prior, values)
@@ -86,12 +97,22 @@ def fit(edges: BoxEdges, start: Floats, prior: Prior, weights: Weights, kind: Ki
 
 
 def _steps(
-    edges: BoxEdges, values: Floats, damping: Floats, prior: Prior, weights: Weights, kind: Kind, steps: int
+    edges: BoxEdges,
+    values: Floats,
+    damping: Floats,
+    prior: Prior,
+    weights: Weights,
+    kind: Kind,
+    limits: tuple[int, int, float],
 ) -> tuple[Floats, Floats, Bools, int]:
-    """Return bodies and dampings after steps, which bodies are at rest, and the number of steps. It ends if many are."""
+    """Return bodies and dampings after steps, which bodies are at rest, and the number of steps. It ends if many are.
+
+    limits: the number of steps so far, the most steps, and the promised decrease of the cost at rest.
+    """
+    steps, most, enough = limits
     order, still = np.argsort(edges.body, kind="stable"), np.zeros(len(values), dtype=bool)
     now = residuals(edges, values, kind)
-    while steps < _ITERATIONS and (~still).mean() > _REMAIN:
+    while steps < most and (~still).mean() > _REMAIN:
         steps += 1
         weight = _weight(now, weights)
         information, gradient, cost = _normal(edges.body, order, now, weight, prior, values)
@@ -102,10 +123,10 @@ def _steps(
         promised = -(step * gradient).sum(axis=1)
         trial = values + step
         new = residuals(edges, trial, kind)
-        better = _cost(edges.body, new, weight, prior, trial) <= cost * (1 + _UPHILL) + _STILL
+        better = _cost(edges.body, new, weight, prior, trial) <= cost * (1 + _UPHILL) + enough
         values = np.where(better[:, None], trial, values)
         now = new if better.all() else _chosen(better[edges.body], new, now)
-        still |= (promised < _STILL) | (damping >= _DAMPING[2])
+        still |= (promised < enough) | (damping >= _DAMPING[2])
         damping = np.clip(np.where(better, damping / 10, damping * 10), *_DAMPING[1:])
     return values, damping, still, steps
 

@@ -52,21 +52,28 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     scale = np.maximum(np.linalg.norm(points - edges.origin[:, None], axis=2) * edges.turn, _LEAST)  # m per px
     off, by = gap / scale, by_gap / scale[..., None]
     count = len(edges)
-    value, use, sigma = np.empty((count, ROWS)), np.ones((count, ROWS)), np.empty((count, ROWS))
+    value, use = np.empty((count, ROWS)), np.ones((count, ROWS))
     jacobian = np.empty((count, ROWS, PARAMETERS))
     for out, mixed in ((value, off), (jacobian, by)):
         low, high = mixed[:, :2], mixed[:, 2:]
         out[:, :2], out[:, 2:4] = (high - low) / 2, (high + low) / 2
-    sigma[:, :2] = np.hypot(edges.sigma / np.sqrt(2), edges.shift)[:, None]
-    sigma[:, 2:4] = (edges.sigma / np.sqrt(2))[:, None]
     row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
     for place in (axis, axis + 2):
         value[row, place], jacobian[row, place] = off[row, place], by[row, place]
-        sigma[row, place] = np.hypot(edges.sigma, edges.shift)[row]
         use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
     value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
-    sigma[:, 4] = np.where(use[:, 4] > 0, edges.range_sigma, 1.0)
-    return Residuals(value, jacobian, use, sigma)
+    return Residuals(value, jacobian, use, nominal_noise(edges))
+
+
+def nominal_noise(edges: BoxEdges) -> Floats:
+    """Return the noise (B, 5) of the residuals, before the log tells it."""
+    edge, sigma = edges.sigma / np.sqrt(2), np.empty((len(edges), ROWS))
+    sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
+    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    for place in (axis, axis + 2):
+        sigma[row, place] = np.hypot(edges.sigma, edges.shift)[row]
+    sigma[:, 4] = np.where(np.isfinite(edges.range), edges.range_sigma, 1.0)
+    return sigma
 
 
 def _ranges(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:

@@ -14,7 +14,7 @@ from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, grouped
-from objslam.triangulation.bodies.residuals import ROWS, Residuals
+from objslam.triangulation.bodies.residuals import ROWS, Residuals, nominal_noise
 
 SIDES = 103
 """The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All boxes from one side
@@ -67,6 +67,17 @@ def sides_of(edges: BoxEdges, centre: Floats) -> Sides:
     return Sides(cell, owner, tuple(alike), shared[cell])
 
 
+def some_of_each_side(sides: Sides, most: int) -> Ints:
+    """Return the increasing indices of at most that many boxes of each side, evenly over the order of its boxes."""
+    order = np.argsort(sides.cell, kind="stable")
+    number = np.bincount(sides.cell)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - (np.cumsum(number) - number)[sides.cell[order]]
+    total = number[sides.cell]
+    kept = np.minimum(total, most)
+    return np.flatnonzero((rank * kept) // total != ((rank - 1) * kept) // total)
+
+
 def white_factors(now: Residuals, sides: Sides, which: Bools) -> Floats:
     """Return the factors (2,) on the nominal noise of shifts and of sizes, from the scatter of boxes within a side.
 
@@ -86,21 +97,21 @@ def white_factors(now: Residuals, sides: Sides, which: Bools) -> Floats:
     return factors
 
 
-def spread_of(edges: BoxEdges, now: Residuals, factors: Floats, share: float) -> Floats:
+def spread_of(edges: BoxEdges, factors: Floats, share: float) -> Floats:
     """Return the standard deviations (B, 5) of single residuals: their white noise, and the shared error of a box."""
-    return np.sqrt(_white(now, factors) ** 2 + _scale(edges, share) ** 2)
+    return np.sqrt(_white(nominal_noise(edges), factors) ** 2 + _scale(edges, share) ** 2)
 
 
-def effective_variance(edges: BoxEdges, now: Residuals, sides: Sides, factors: Floats, share: float) -> Floats:
+def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: float) -> Floats:
     """Return the variances (B, 5) with which residuals count, so that all boxes of one side count as one error."""
     number = np.repeat(sides.number[:, None], ROWS, axis=1)
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
     number[:, -1] = ranged[edges.body]
-    return np.asarray(_white(now, factors) ** 2 + number * _scale(edges, share) ** 2)
+    return np.asarray(_white(nominal_noise(edges), factors) ** 2 + number * _scale(edges, share) ** 2)
 
 
-def _white(now: Residuals, factors: Floats) -> Floats:
-    return np.concatenate([now.sigma[:, :4] * np.repeat(factors, 2), now.sigma[:, 4:]], axis=1)
+def _white(sigma: Floats, factors: Floats) -> Floats:
+    return np.concatenate([sigma[:, :4] * np.repeat(factors, 2), sigma[:, 4:]], axis=1)
 
 
 def _scale(edges: BoxEdges, share: float) -> Floats:
@@ -117,7 +128,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = -0.5 * (shares / prior) ** 2
-    white, size = _white(fit.found, factors)[:, :4], edges.size / 2
+    white, size = _white(fit.found.sigma, factors)[:, :4], edges.size / 2
     weight = fit.weight[:, :4] > 0
     total = np.stack([np.bincount(sides.cell, w) for w in (weight / white**2).T], axis=1)
     total = np.maximum(total, 1e-12)
@@ -160,7 +171,7 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
     """
     count, order = len(fit.values), np.argsort(edges.body, kind="stable")
     pulled = fit.found.by * fit.weight[..., None]
-    noisy = pulled * _white(fit.found, factors)[..., None]
+    noisy = pulled * _white(fit.found.sigma, factors)[..., None]
     middle = grouped(edges.body, order, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior
     together = pulled * _scale(edges, share)[..., None]
     by_side = grouped(sides.cell, np.argsort(sides.cell, kind="stable"), together, len(sides.owner))
