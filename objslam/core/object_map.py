@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.bodies.body import Body
+from objslam.core.bodies.body import Body, surer_body
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -303,10 +303,3 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
         body=surer_body(a.body, b.body),
         ray_point=None,
     )
-
-
-def surer_body(a: Body | None, b: Body | None) -> Body | None:
-    """Return the body whose size is known better, or the only one."""
-    if a is None or b is None:
-        return a or b
-    return b if b.size_sigma.prod() < a.size_sigma.prod() else a

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 _ROUNDS = 2
 """How often bodies and poses are solved in turns. More rounds are slower, and change less than the noise."""
+_KEPT = 0.5
+"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects, and then
+all bearings stay as they were."""
 _WORTH = 0.5
 """The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
 larger value solves fewer logs again."""
@@ -30,12 +33,17 @@ larger value solves fewer logs again."""
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
-    None was added, and the estimate is as before, if no body shifts its bearings by more than a part of their noise.
+    None was added, and the estimate is as before, if no body shifts its bearings by more than a part of their noise, or
+    if an object would be lost.
     """
     from objslam.graph import batch_solver
 
     if not state.settings.bodies.use:
         return estimate, None
+    # An object that the boxes' centres brought into the graph may have a little less parallax by the centres of bodies.
+    joint = state.settings.joint
+    joint = joint.model_copy(update={"min_parallax_deg": _KEPT * joint.min_parallax_deg})
+    settings = state.settings.model_copy(update={"joint": joint})
     added = None
     for _ in range(_ROUNDS):
         keyframes, rays = state.keyframes, state.rays
@@ -46,14 +54,15 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         if shift is None or not _any_object((np.linalg.norm(shift, axis=1) / rays.sigma)[held], association.object[held]):
             break
         measured = state.rays if state.errors is None else state.errors.rays
-        added = shift
-        turned = to_centres(measured, added)
-        errors = None if state.errors is None else replace(with_noise_of(state.errors, estimate), rays=turned)
-        estimate = batch_solver.solve_joint(
+        turned = to_centres(measured, shift)
+        errors = None
+        if state.errors is not None:
+            errors = replace(with_noise_of(state.errors, estimate), rays=turned, settings=settings)
+        solved = batch_solver.solve_joint(
             keyframes,
             turned if errors is None else rays,
             association,
-            state.settings,
+            settings,
             state.ledger,
             partial(state.progress, "bodies"),
             estimate.map_T_base @ keyframes.base_T_camera,
@@ -61,6 +70,9 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
             errors,
             None if estimate.calibration is None else estimate.calibration.values,
         )
+        if (estimate.solved & ~solved.solved).any():
+            break
+        estimate, added = solved, shift
         if state.trace is not None:
             state.trace.end_round("bodies", association, estimate)
     return estimate, added

@@ -114,7 +114,7 @@ def run(
         with _stage("localize", seconds, progress):
             where = localize(solution, objects, known, errors, settings, ledger)
             if where.solution is not None and where.map_T_drive is not None:
-                solution, log = where.solution, moved_log(log, where.map_T_drive)
+                solution, log = with_bodies(where.solution, cameras, settings), moved_log(log, where.map_T_drive)
                 keyframes, estimate = solution.keyframes, solution.estimate
                 described, residual = describe(solution, cameras, settings, trusted=trusted)
                 objects = with_map(described, where, known)

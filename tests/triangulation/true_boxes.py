@@ -3,8 +3,9 @@
 import numpy as np
 
 from objslam.core.camera import Camera, project
+from objslam.simulation.outlines import looking_at, outline_box
 from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
-from objslam.triangulation.bodies.ellipsoid import from_axes, matrices
+from objslam.triangulation.bodies.ellipsoid import from_axes
 
 CAMERAS = {
     "pinhole": Camera("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])),
@@ -24,51 +25,6 @@ CAMERAS = {
         np.array([-0.01, 0.003, 0.0, 0.0]),
     ),
 }
-
-
-def looking_at(place, target):
-    """The pose of a level camera at a place that looks at a target."""
-    z = target - place
-    z = z / np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.column_stack([x, np.cross(z, x), z]), place
-    return pose
-
-
-def outline_box(camera, body, pose):
-    """The box around the image of an ellipsoid, from the circle on it whose tangents meet the camera. None if behind."""
-    root = np.linalg.cholesky(matrices(body[None])[0])
-    seen = np.linalg.solve(root, pose[:3, 3] - body[:3])
-    distance = np.linalg.norm(seen)
-    if distance <= 1:
-        return None
-    seen /= distance
-    a = np.cross(seen, [0.3, 0.5, 0.8])
-    a /= np.linalg.norm(a)
-    b = np.cross(seen, a)
-
-    def pixels(angle):
-        ring = np.sqrt(1 - distance**-2) * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b)
-        points = body[:3] + (seen / distance + ring) @ root.T
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        return project(camera, local), local[:, 2].min()
-
-    angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
-    rough, nearest = pixels(angles)
-    if nearest < 0.05:
-        return None
-    sides = []
-    for axis, pick in ((0, np.argmin), (1, np.argmin), (0, np.argmax), (1, np.argmax)):
-        best, step = angles[pick(rough[:, axis])], 2 * np.pi / 90
-        for _ in range(8):  # the vertex of a parabola through three points
-            before, at, after = pixels(best + step * np.array([-1, 0, 1]))[0][:, axis]
-            bend = before - 2 * at + after
-            best += np.clip(0.5 * step * (before - after) / bend, -step, step) if bend else 0.0
-            step = max(step / 4, 1e-4)
-        sides.append(pixels(np.array([best]))[0][0, axis])
-    return np.array(sides)
 
 
 def corner_box(camera, centre, half, yaw, pose):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
+
+import numpy as np
 
 from objslam.core.arrays import Floats
 
@@ -28,6 +30,12 @@ class Body:
     yaw_sigma: float
 
 
+def turned(body: Body, rotation: Floats) -> Body:
+    """Return a body after a rotation (3, 3) about an upright axis."""
+    x, y, _ = rotation @ np.array([np.cos(body.yaw), np.sin(body.yaw), 0.0])
+    return replace(body, yaw=float(np.pi / 2 - (np.pi / 2 - np.arctan2(y, x)) % np.pi))
+
+
 @dataclass(frozen=True)
 class PlacedBody:
     """A body in a map. centre: (3,) m. covariance: (7, 7) of the centre, the size and the yaw."""
@@ -35,3 +43,10 @@ class PlacedBody:
     body: Body
     centre: Floats
     covariance: Floats
+
+
+def surer_body(a: Body | None, b: Body | None) -> Body | None:
+    """Return the body whose size is known better, or the only one."""
+    if a is None or b is None:
+        return a or b
+    return b if b.size_sigma.prod() < a.size_sigma.prod() else a

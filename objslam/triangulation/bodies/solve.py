@@ -34,6 +34,8 @@ _ROUNDS = 2
 _PER_SIDE = 3
 """The number of boxes from each side that choose the shape and tell the noise. Boxes from one side repeat one error, so more
 are slower and tell little. All boxes count in the last fit."""
+_RARE = 20.0
+"""The odds against a sphere before the boxes count, because few things are balls. With larger odds, fewer are spheres."""
 _STEPS = 12
 """The most steps of a fit that chooses a shape. A fit that needs more is of a shape that its boxes do not show."""
 _ENOUGH = 1e-3
@@ -85,7 +87,8 @@ class _State:
     """The noise, the prior and the bodies of the rounds so far.
 
     rounds, balls: (N, 7) ellipsoids and spheres. cuboids: one or several starts (N, 7). evidence, shape: as in `Bodies`.
-    best: the better of ellipsoid and cuboid, with its covariance (N, 7, 7). None before the first round.
+    best: the better of ellipsoid and cuboid, with its covariance (N, 7, 7). None before the first round. sized:
+    (N,) whether the size is known, so that no sphere is tried.
     """
 
     factors: Floats
@@ -98,6 +101,7 @@ class _State:
     shape: Ints
     best: Fit | None
     covariance: Floats
+    sized: Bools
 
 
 def solve_bodies(
@@ -124,7 +128,8 @@ def solve_bodies(
     weak = weak_prior(points, half)
     nothing = np.zeros((4, len(points))), np.zeros(len(points), dtype=np.int64), None, np.zeros((len(points), 7, 7))
     balls = sphere_prior(weak).mean
-    now = _State(np.ones(2), share, weak, weak.mean, (), balls, *nothing)
+    sized = np.array([name in (sizes or {}) for name in names])
+    now = _State(np.ones(2), share, weak, weak.mean, (), balls, *nothing, sized)
     for number in range(_ROUNDS + 1):
         some = edges.take(few)
         now = _round(some, sides_of(some, points), now, side[few])
@@ -160,7 +165,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
     evidence = np.stack(
         [
             _dot_evidence(edges, now.prior, weights, side),
-            log_evidence(edges, ball, ball_prior, weights),
+            log_evidence(edges, ball, ball_prior, weights) - np.log(_RARE) - 1e9 * now.sized,
             log_evidence(edges, rounds, now.prior, weights),
             log_evidence(edges, square, square_prior, weights),
         ]

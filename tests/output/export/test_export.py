@@ -52,7 +52,7 @@ def test_geojson_is_what_the_rfc_asks_for(result, tmp_path, datum):
     data = json.loads(write_export(result, "geojson", tmp_path / "x.geojson", datum).read_text())
     jsonschema.Draft202012Validator(SCHEMA).validate(data)
     kinds = ("object", "path", "footprint")
-    )
+    found, (path,), prints = ([f for f in data["features"] if f["properties"]["kind"] == kind] for kind in kinds)
     objects, trajectory = load_map(result).objects, load_trajectory(result)
     assert [f["id"] for f in found] == [o.id for o in objects]
     assert [f["properties"]["label"] for f in found] == [o.label for o in objects]
