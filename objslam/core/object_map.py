@@ -80,8 +80,8 @@ class MapObject:
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
-    in the map of a single run. body: its size and heading, None for a point. The position is its centre. ray_point: (3,) m,
-    for an object with a body, the point at which the rays through the centres of its boxes meet.
+    in the map of a single run. body: its size and heading around the position, None for a point. ray_point: (3,) m,
+    the point at which the rays through the centres of its boxes meet, if the position is the centre of the body.
     """
 
     id: int

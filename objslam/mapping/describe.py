@@ -77,8 +77,8 @@ def describe(
         mine = order[bounds[j] : bounds[j + 1]]
         kept = mine[estimate.weight[mine] > 0] if (estimate.weight[mine] > 0).any() else mine
         placed = None if solution.bodies is None else solution.bodies[j]
-        covariance = estimate.covariance[j] if placed is None else placed.covariance[:3, :3]
-        position = estimate.positions[j] if placed is None else placed.centre
+        covariance = estimate.covariance[j] if placed is None or placed.centre is None else placed.covariance[:3, :3]
+        position = estimate.positions[j] if placed is None or placed.centre is None else placed.centre
         parallax = widest_angle(directions[kept])
         solved = bool(estimate.solved[j] and np.isfinite(covariance).all())
         status = status_of(
@@ -111,7 +111,7 @@ def describe(
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
                 body=placed.body if placed is not None and known else None,
-                ray_point=None if placed is None or not known else estimate.positions[j],
+                ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
             )
         )
     return ObjectMap(tuple(objects)), residual

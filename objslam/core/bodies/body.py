@@ -38,10 +38,11 @@ def turned(body: Body, rotation: Floats) -> Body:
 
 @dataclass(frozen=True)
 class PlacedBody:
-    """A body in a map. centre: (3,) m. covariance: (7, 7) of the centre, the size and the yaw."""
+    """A body in a map. centre: (3,) m, None if the rays through the centres of its boxes tell the place as well. covariance:
+    (7, 7) of the centre, the size and the yaw."""
 
     body: Body
-    centre: Floats
+    centre: Floats | None
     covariance: Floats
 
 
