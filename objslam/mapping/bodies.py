@@ -63,7 +63,7 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
             bodies[j] = _body(found, at, extra[at], clear=bool(clear[at]))
     to_centre = np.zeros((len(solution.rays), 3))
     to_centre[views.ray] = np.einsum("bji,bj->bi", views.poses[:, :3, :3], found.to_centre)
-    return replace(solution, bodies=tuple(bodies), body_share=found.share, to_centre=to_centre)
+    return replace(solution, bodies=tuple(bodies), body_share=float(found.share[0]), to_centre=to_centre)
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     Otherwise the rays through the centres of boxes tell the place at least as well, and a body only tells the size.
     """
     edges = views.edges()
-    shared = found.share * edges.size / 2 * edges.turn.mean(axis=1)
+    shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
     ratio = np.linalg.norm(found.to_centre, axis=1) / np.maximum(shared, 1e-12)
     return np.asarray(grouped_median(ratio, views.body, len(views.objects)) > _CLEAR)
 
@@ -207,8 +207,8 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at].copy()
     # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.
-    covariance[:3, :3] += (found.share * half.mean()) ** 2 * np.eye(3)
-    covariance[[3, 6], [3, 6]] += found.share**2
+    covariance[:3, :3] += (found.share[0] * half.mean()) ** 2 * np.eye(3)
+    covariance[[3, 6], [3, 6]] += found.share[1] ** 2
     slope = found.slope[at].copy()
     slope[3:6] *= 2.0  # from half axes to sizes
     covariance = slope @ covariance @ slope.T

@@ -69,7 +69,6 @@ def test_large_objects_bend_neither_map_nor_path(seed):
     assert bodies["iou_median"] > 0.6
     assert bodies["size_error_median"] < 0.15
     assert bodies["inside_95_3d"] >= 0.875
-    assert sum(o.ray_point is not None for o in result.map) >= 6
     for o in result.map:
         assert o.body is not None
         assert (o.body.size_sigma > 0).all()

@@ -92,7 +92,7 @@ def test_the_covariance_is_that_of_repeated_boxes():
     prior = weak_prior(np.zeros((many, 3)), np.tile([[0.35, 0.35]], (many, 1)))
     now = residuals(edges, prior.mean, ELLIPSOID)
     found = fit(edges, prior.mean, prior, Weights(now.sigma**2, now.sigma), ELLIPSOID)
-    told = covariance_of(edges, found, sides_of(edges, prior.mean[:, :3]), np.ones(2), 0.0).mean(axis=0)
+    told = covariance_of(edges, found, sides_of(edges, prior.mean[:, :3]), np.ones(2), np.zeros(2)).mean(axis=0)
     root = np.linalg.cholesky(told)
     spread = np.linalg.solve(root, np.linalg.solve(root, np.cov(found.values.T)).T)
     assert np.abs(np.sqrt(np.linalg.eigvalsh(spread)) - 1).max() < 0.1

@@ -97,12 +97,12 @@ def white_factors(now: Residuals, sides: Sides, which: Bools) -> Floats:
     return factors
 
 
-def spread_of(edges: BoxEdges, factors: Floats, share: float) -> Floats:
+def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
     """Return the standard deviations (B, 5) of single residuals: their white noise, and the shared error of a box."""
     return np.sqrt(_white(nominal_noise(edges), factors) ** 2 + _scale(edges, share) ** 2)
 
 
-def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: float) -> Floats:
+def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Floats:
     """Return the variances (B, 5) with which residuals count, so that all boxes of one side count as one error."""
     number = np.repeat(sides.number[:, None], ROWS, axis=1)
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
@@ -114,20 +114,21 @@ def _white(sigma: Floats, factors: Floats) -> Floats:
     return np.concatenate([sigma[:, :4] * np.repeat(factors, 2), sigma[:, 4:]], axis=1)
 
 
-def _scale(edges: BoxEdges, share: float) -> Floats:
+def _scale(edges: BoxEdges, share: Floats) -> Floats:
     """Return the standard deviations (B, 5) of the errors that boxes share: a share of their size, px, or of the range."""
-    return np.concatenate([np.repeat((share * edges.size / 2)[:, None], 4, axis=1), edges.range_bias[:, None]], axis=1)
+    return np.concatenate([np.outer(edges.size / 2, np.repeat(share, 2)), edges.range_bias[:, None]], axis=1)
 
 
-def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: float, which: Bools) -> float:
-    """Return the standard deviation of the error that the boxes of one side share, as a share of half their size.
+def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: float, which: Bools) -> Floats:
+    """Return the standard deviations (2,) of the errors that the boxes of one side share, as shares of half their size.
 
+    The first is that of their shifts, the second that of their sizes. A detector may get one right and the other wrong.
     It is the root mean square of the share, given the residuals. The bodies are unknown, so the restricted likelihood is
     used (Patterson and Thompson 1971). The prior is a half-normal distribution (Gelman 2006). which: (N,) the bodies that
     count.
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
-    likelihood = -0.5 * (shares / prior) ** 2
+    likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
     white, size = _white(fit.found.sigma, factors)[:, :4], edges.size / 2
     weight = fit.weight[:, :4] > 0
     total = np.stack([np.bincount(sides.cell, w) for w in (weight / white**2).T], axis=1)
@@ -153,17 +154,19 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
         count = end - begin
         value = np.einsum("kij,ki->kj", vectors, value.reshape(4, count)).ravel()
         slope = np.einsum("kij,kid->kjd", vectors, slope.reshape(4, count, -1)).reshape(4 * count, -1)
-        variance = 1 + shares[:, None] ** 2 * np.maximum(eigen.ravel(), 0.0)
-        matrix = np.einsum("ki,kj,sk->sij", slope, slope, 1 / variance) + fit.prior[body]
-        vector = np.einsum("ki,k,sk->si", slope, value, 1 / variance)
-        explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
-        squares = (value**2 / variance + np.log(variance)).sum(axis=1)
-        likelihood -= 0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained)
-    weight_ = np.exp(likelihood - likelihood.max())
-    return float(np.sqrt((weight_ * shares**2).sum() / weight_.sum()))
+        for kind in range(2):  # The first half of the rows are shifts.
+            half = slice(2 * count * kind, 2 * count * (kind + 1))
+            variance = 1 + shares[:, None] ** 2 * np.maximum(eigen.ravel()[half], 0.0)
+            matrix = np.einsum("ki,kj,sk->sij", slope[half], slope[half], 1 / variance) + fit.prior[body]
+            vector = np.einsum("ki,k,sk->si", slope[half], value[half], 1 / variance)
+            explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
+            squares = (value[half] ** 2 / variance + np.log(variance)).sum(axis=1)
+            likelihood[kind] -= 0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained)
+    chance = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+    return np.asarray(np.sqrt((chance * shares**2).sum(axis=1) / chance.sum(axis=1)))
 
 
-def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: float) -> Floats:
+def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> Floats:
     """Return the covariances (N, 7, 7) of the parameters of bodies, with the errors that their boxes share.
 
     An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where V is the true covariance

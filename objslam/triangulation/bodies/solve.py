@@ -48,9 +48,9 @@ class Bodies:
 
     values: (N, 7) parameters of a cuboid or of an ellipsoid (see `shapes`). covariance: (N, 7, 7). shape: (N,) the chosen
     shape, an index into `SHAPES`. evidence: (4, N) the logarithm of the evidence of each shape. weight: (B,) the robust
-    weight of each box. share: the standard deviation of the error that boxes of one side share, as a share of half their
-    size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) the direction to the centre of each body,
-    minus the direction to the centre of its box, in map. It is 0 for a point.
+    weight of each box. share: (2,) the standard deviations of the errors of shift and size that boxes of one side share, as
+    shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) the direction to the
+    centre of each body, minus the direction to the centre of its box, in map. It is 0 for a point.
     """
 
     values: Floats
@@ -58,7 +58,7 @@ class Bodies:
     shape: Ints
     evidence: Floats
     weight: Floats
-    share: float
+    share: Floats
     factors: Floats
     to_centre: Floats
 
@@ -92,7 +92,7 @@ class _State:
     """
 
     factors: Floats
-    share: float
+    share: Floats
     prior: Prior
     rounds: Floats
     cuboids: tuple[Floats, ...]
@@ -129,7 +129,7 @@ def solve_bodies(
     nothing = np.zeros((4, len(points))), np.zeros(len(points), dtype=np.int64), None, np.zeros((len(points), 7, 7))
     balls = sphere_prior(weak).mean
     sized = np.array([name in (sizes or {}) for name in names])
-    now = _State(np.ones(2), share, weak, weak.mean, (), balls, *nothing, sized)
+    now = _State(np.ones(2), np.full(2, share), weak, weak.mean, (), balls, *nothing, sized)
     for number in range(_ROUNDS + 1):
         some = edges.take(few)
         now = _round(some, sides_of(some, points), now, side[few])
