@@ -25,9 +25,10 @@ _ROUNDS = 2
 _KEPT = 0.5
 """The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects, and then
 all bearings stay as they were."""
-_WORTH = 0.5
+_WORTH = 0.1
 """The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
-larger value solves fewer logs again."""
+shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
+again."""
 
 
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
