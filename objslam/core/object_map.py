@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.bodies.body import Body, surer_body
+from objslam.core.bodies.body_entry import BODY_COLUMNS, body_row
+from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -27,10 +29,7 @@ COLUMNS: dict[str, str] = {
     **dict.fromkeys(("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "float64"),
     **{"rays": "int64", "frames": "int64"},
     **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
-    "shape": "string",
-    **dict.fromkeys(
-        ("size_l", "size_w", "size_h", "yaw", "size_l_sigma", "size_w_sigma", "size_h_sigma", "yaw_sigma"), "float64"
-    ),
+    **BODY_COLUMNS,
 }
 """The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
 yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes."""
@@ -71,6 +70,49 @@ class Life:
 
 
 @dataclass(frozen=True)
+class TagPose:
+    """The rotation and the size of one fiducial. Its position is that of its object.
+
+    xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
+    covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
+    from the settings. other_xyzw: (4,) the second rotation that a flat square leaves open, None if the views rule it out.
+    other_probability: of this second rotation, 0 without one.
+    """
+
+    xyzw: Floats
+    covariance: Floats
+    size: float
+    size_sigma: float
+    other_xyzw: Floats | None = None
+    other_probability: float = 0.0
+
+    @property
+    def rotation(self) -> Floats:
+        """(3, 3) map_R_tag."""
+        return rotation_from_quaternion(self.xyzw[None])[0]
+
+    @property
+    def other(self) -> Floats | None:
+        """(3, 3) the second rotation, None without one."""
+        return None if self.other_xyzw is None else rotation_from_quaternion(self.other_xyzw[None])[0]
+
+    @property
+    def sigma_deg(self) -> float:
+        """The standard deviation of the rotation about its least certain axis, degrees."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
+
+    def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
+        """Return the fiducial in a frame in which its map has a rotation (3, 3), whose yaw has a sigma, rad."""
+        up = (rotation @ self.rotation)[2]
+        return replace(
+            self,
+            xyzw=_quaternion(rotation @ self.rotation),
+            covariance=self.covariance + yaw_sigma**2 * np.outer(up, up),
+            other_xyzw=None if self.other is None else _quaternion(rotation @ self.other),
+        )
+
+
+@dataclass(frozen=True)
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
@@ -80,8 +122,9 @@ class MapObject:
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
-    in the map of a single run. body: its size and heading around the position, None for a point. ray_point: (3,) m,
-    the point at which the rays through the centres of its boxes meet, if the position is the centre of the body.
+    in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
+    heading around the position, None for a point. ray_point: (3,) m, the point at which the rays through the centres of its
+    boxes meet, if the position is the centre of the body.
     """
 
     id: int
@@ -103,6 +146,7 @@ class MapObject:
     life: Life | None = None
     body: Body | None = None
     ray_point: Floats | None = None
+    tag: TagPose | None = None
 
     @property
     def sigma(self) -> float | None:
@@ -122,7 +166,7 @@ class MapObject:
                 self.last_seen,
                 self.existence,
             ),
-            *_body_row(self.body),
+            *body_row(self.body),
         )
         known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
         return dict(zip(COLUMNS, known, strict=True))
@@ -234,11 +278,8 @@ class ObjectMap:
         return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
 
 
-def _body_row(body: Body | None) -> tuple[str | float | None, ...]:
-    """Return the values of a body in a table row."""
-    if body is None:
-        return ("point", *[None] * 8)
-    return (body.shape, *body.size.tolist(), body.yaw, *body.size_sigma.tolist(), body.yaw_sigma)
+def _quaternion(rotation: Floats) -> Floats:
+    return quaternion_from_rotation(rotation[None])[0]
 
 
 def _point(values: ArrayLike) -> Floats:

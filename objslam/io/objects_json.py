@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.bodies.body import SHAPES, Body
-from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
+from objslam.core.bodies.body_entry import body_entry, body_of_entry, size_of
+from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
@@ -19,7 +19,6 @@ from objslam.errors import LogError, ObjslamError, OutputError
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
 _READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
 _UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
-_TURN = 2 * math.pi  # The largest yaw, rad. A larger value accepts angles in degrees.
 _T = TypeVar("_T")
 
 
@@ -119,13 +118,26 @@ def _entry(o: MapObject) -> dict[str, Any]:
         moved = o.life.moved_from
         entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
     if o.body is not None:
-        body = o.body
-        entry |= {"shape": body.shape, "size": body.size.tolist(), "size_sigma": body.size_sigma.tolist()}
-        entry |= {"yaw": float(body.yaw), "yaw_sigma": float(body.yaw_sigma)}
+        entry |= body_entry(o.body)
     if o.ray_point is not None:
         entry["ray_point"] = o.ray_point.tolist()
+    if o.tag is not None:
+        entry["tag"] = _tag_entry(o.tag)
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
+    return entry
+
+
+def _tag_entry(tag: TagPose) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "rotation_xyzw": tag.xyzw.tolist(),
+        "rotation_covariance": tag.covariance.tolist(),
+        "size": tag.size,
+        "size_sigma": tag.size_sigma,
+    }
+    if tag.other_xyzw is not None:
+        entry["other_rotation_xyzw"] = tag.other_xyzw.tolist()
+        entry["other_probability"] = tag.other_probability
     return entry
 
 
@@ -176,7 +188,7 @@ def _stamp(entry: dict[str, Any], name: str) -> float:
 def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     if entry.get("status") == "unresolved":
         return None
-    size = None if entry.get("size") is None else _size(entry["size"], "size")
+    size = None if entry.get("size") is None else _of_body(lambda: size_of(entry, "size"))
     yaw = None if entry.get("yaw") is None else _number(entry["yaw"], "yaw")
     place = _vector(entry.get("position"), "position")
     return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), place, size, yaw)
@@ -230,29 +242,17 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
         seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
-        body=_body(entry),
+        body=_of_body(lambda: body_of_entry(entry)),
         ray_point=None if entry.get("ray_point") is None else _vector(entry["ray_point"], "ray_point"),
+        tag=None if entry.get("tag") is None else _tag(entry["tag"]),
     )
 
 
-def _body(entry: dict[str, Any]) -> Body | None:
-    shape = next((one for one in SHAPES if one == entry.get("shape", "point")), None)
-    if shape is None:
-        raise _Malformed(f"shape must be one of {', '.join(SHAPES)}, got {_short(entry.get('shape'))}")
-    if shape == "point":
-        return None
-    sides = _size(entry.get("size"), "size"), _size(entry.get("size_sigma"), "size_sigma")
-    yaw, sigma = (_number(entry.get(name), name) for name in ("yaw", "yaw_sigma"))
-    if not (abs(yaw) <= _TURN and 0 <= sigma <= _TURN):
-        raise _Malformed("yaw and yaw_sigma must be angles in radians")
-    return Body(shape, sides[0], yaw, sides[1], sigma)
-
-
-def _size(value: Any, name: str) -> Floats:
-    size = _vector(value, name)
-    if not ((size >= 0) & (size < MAX_POSITION)).all():
-        raise _Malformed(f"{name} must be a length, a width and a height in metres")
-    return size
+def _of_body(read: Callable[[], _T]) -> _T:
+    try:
+        return read()
+    except ValueError as error:
+        raise _Malformed(str(error)) from error
 
 
 def _seen_from(value: Any) -> SeenFrom:
@@ -265,6 +265,34 @@ def _seen_from(value: Any) -> SeenFrom:
     if not (np.abs(np.linalg.norm(sides, axis=1) - 1) < _UNIT).all():
         raise _Malformed("a side of seen_from must have the length 1")
     return SeenFrom(near, far, sides)
+
+
+def _tag(value: Any) -> TagPose:
+    if not isinstance(value, dict):
+        raise _Malformed("tag must be a mapping")
+    rows = value.get("rotation_covariance")
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise _Malformed("tag.rotation_covariance must be 3 rows of 3 numbers")
+    covariance = np.stack([_vector(row, "a row of tag.rotation_covariance") for row in rows])
+    if (fault := covariance_fault(covariance)) is not None:
+        raise _Malformed(f"tag.rotation_covariance {fault}")
+    size, sigma = (_number(value.get(name), f"tag.{name}") for name in ("size", "size_sigma"))
+    if not (0 < size < MAX_POSITION and 0 <= sigma < MAX_POSITION):
+        raise _Malformed("tag.size must be above 0 m, and tag.size_sigma not below")
+    rotation, other, probability = _quaternion(value.get("rotation_xyzw"), "tag.rotation_xyzw"), None, 0.0
+    if value.get("other_rotation_xyzw") is not None:
+        other = _quaternion(value["other_rotation_xyzw"], "tag.other_rotation_xyzw")
+        probability = _number(value.get("other_probability"), "tag.other_probability")
+        if not 0 <= probability <= 1:
+            raise _Malformed("tag.other_probability must be from 0 to 1")
+    return TagPose(rotation, covariance, size, sigma, other, probability)
+
+
+def _quaternion(value: Any, name: str) -> Floats:
+    xyzw = _vector(value, name, 4)
+    if not abs(float(np.linalg.norm(xyzw)) - 1) < _UNIT:
+        raise _Malformed(f"{name} must have the length 1")
+    return xyzw
 
 
 def _life(value: Any) -> Life:

@@ -154,6 +154,7 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
         & np.isfinite(estimate.positions).all(axis=1)
         & np.isfinite(sizes).all(axis=1)
     )
+    fit[list(estimate.tags)] = False  # The corners of a tag tell more than its box.
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe]]
     box = (rays.box[:, 2:] > rays.box[:, :2]).all(axis=1)
     ray = np.flatnonzero((association.object >= 0) & sees_size & box)

@@ -112,6 +112,7 @@ def describe(
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
                 body=placed.body if placed is not None and known else None,
                 ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
+                tag=estimate.tags.get(j) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual
