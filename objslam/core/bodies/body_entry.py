@@ -15,9 +15,6 @@ from objslam.core.validity import MAX_POSITION
 _SIDES = ("size_l", "size_w", "size_h")
 _SIGMAS = tuple(f"{name}_sigma" for name in (*_SIDES, "yaw"))
 BODY_COLUMNS = {"shape": "string", **dict.fromkeys((*_SIDES, "yaw", *_SIGMAS), "float64")}
-    "shape": "string",
-    **dict.fromkeys((*_SIDES, "yaw", *(f"{s}_sigma" for s in _SIDES), "yaw_sigma"), "float64"),
-}
 """The columns of a body in a table of objects, with their types: sizes in m, yaws in rad."""
 _TURN = 2 * math.pi  # The largest yaw, rad. A larger value accepts angles in degrees.
 
