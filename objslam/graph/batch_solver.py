@@ -47,8 +47,8 @@ def solve_fixed(
 ) -> Estimate:
     """Solve the objects at fixed poses, starting from the triangulation, with one point-to-line factor for each inlier.
 
-    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions of objects
-    that need their ranges. The other losses weigh each ray by the noise across it at the object's distance, and add a
+    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions that Eq. 1
+    cannot give without ranges. The other losses weigh each ray by the noise across it at the object's distance, and add a
     factor along the ray for a measured range. Objects that the triangulation did not resolve are left out.
     """
     loss = settings.fixed.loss

@@ -57,7 +57,7 @@ def optimize(
 ) -> Optimum:
     """Minimise from `start` by `graduated` for the loss `gnc`, by `levenberg_marquardt` for the other losses.
 
-    Only the first uses known_inliers. Only the second uses tolerance and on_iteration.
+    Only `gnc` uses known_inliers. Only the other losses use tolerance and on_iteration.
     """
     if loss == "gnc":
         return graduated(graph, start, settings.joint.max_iterations, known_inliers)

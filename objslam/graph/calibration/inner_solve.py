@@ -36,7 +36,7 @@ class InnerSolve(Linearised):
 
     @property
     def decrease(self) -> float:
-        """The decrease of the cost by this step, in the linear system."""
+        """The decrease of the cost by `step`, in the linear system."""
         return float(-(self.rows.jacobian.T @ self.rows.residual) @ self.step / 2)
 
     def ordered(self) -> Self:

@@ -29,7 +29,7 @@ _ROUNDS = 8
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _HALVINGS = 3
-"""The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If none lowers
+"""The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
 _LEAST_SIGNAL = 0.05
 """The least share of signal in the information about a clock or odometry scale. A smaller share takes larger steps."""

@@ -54,17 +54,17 @@ class Linearised:
 
     @cached_property
     def graph(self) -> JointGraph:
-        """The graph. The means of the weak priors of landmarks are these positions."""
+        """The graph. The means of the weak priors of landmarks are `positions`."""
         return JointGraph.of(self.measured, self.association, self.used, self.positions)
 
     @cached_property
     def rows(self) -> JointRows:
-        """The rows of the graph at these values."""
+        """The rows of the graph at the values."""
         return self.graph.rows(self.map_T_camera, self.positions[self.landmarks])
 
     @cached_property
     def normal(self) -> NormalEquations:
-        """The normal equations of these rows. SolveError if they are singular."""
+        """The normal equations of `rows`. SolveError if they are singular."""
         jacobian = self.rows.jacobian
         order = elimination_order(jacobian, self.graph.blocks) if self.order is None else self.order
         return NormalEquations.of(jacobian, order)

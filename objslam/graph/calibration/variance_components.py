@@ -34,7 +34,7 @@ TOGETHER = 3.0
 """The time (s) over which errors may be correlated: wheels lag behind a command, and a detector's box is off for a while. A
 longer time finds slower errors, from fewer independent sums."""
 _MOST_SHRINKAGE = 0.3
-"""The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger value would hide."""
+"""The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
 _LEAST_TOLD = 0.3
 """`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
 motions. A larger share uses it more rarely."""
@@ -181,8 +181,8 @@ def _updated(
 ) -> NoiseFactors:
     """Return the noise after one step of the iteration.
 
-    kinds: the kinds of noise to estimate. left: (M, probes + 1) the probes and residuals after the solution. prior: as many
-    residuals as the nominal noise counts for.
+    kinds: the kinds of noise to estimate. left: (M, probes + 1) the probes and residuals after the solution. prior: the
+    nominal noise counts like this number of residuals.
     """
     found = noise.to_dict(None)
     residual, kept = left[:, -1], left[:, :-1]

@@ -31,8 +31,8 @@ def bearings(
     """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
 
     offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
-    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. The
-    distance of the landmark from the image's centre is then the angle. Behind this camera the error is constant, and larger
+    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. In its
+    image, the distance of the landmark from the centre is the angle. Behind this camera the error is constant, and larger
     than in front of it.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)

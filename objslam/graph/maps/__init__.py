@@ -1,1 +1,1 @@
-"""Graphs with an older map: a drive is solved in the map, offline and live."""
+"""Graphs with an older map. A drive is solved in the map, offline or live."""

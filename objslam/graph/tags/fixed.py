@@ -35,7 +35,7 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
     away = np.linalg.norm(found.best.pose[seen.square, :3, 3] - seen.origin, axis=1)
     of_pose = np.maximum(angle[source] ** 2 - rays.sigma[source] ** 2, 0.0) + (shift / away) ** 2
     seen = Corners(seen.square, seen.origin, seen.direction, np.sqrt(seen.sigma**2 + of_pose))
-    # Between views whose poses err, a known size would turn a tag to explain distances that do not agree.
+    # If the poses of views err, a fixed size would turn the tag to explain distances that do not agree.
     number = np.bincount(seen.square, minlength=len(tags.side))
     known = np.isfinite(tags.side)
     free = ~known | (number >= _NOMINAL)
