@@ -4,8 +4,7 @@ The filter keeps all correlations between errors. The errors include those that 
 lagging clock. So the filter knows in each frame where each landmark may appear. The rays of a frame are assigned together,
 because one error of the pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
 After a long way, a landmark that seems new may be an old one. Recent landmarks are tied to old ones if one drift explains
-all pairs much better than chance. The time for a frame grows with the number of landmarks, hardly with the length of the
-log.
+all pairs much better than chance. The time for a frame grows with the number of landmarks, hardly with that of frames.
 """
 
 from collections.abc import Callable

@@ -115,7 +115,7 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 def second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
 ) -> tuple[Floats, Bools]:
-    """Triangulate undetermined objects and objects with outliers again. Move an object if more of its rays agree then.
+    """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
     The corners of fiducials stay, because rays to four separate points say less than rays to one square.
 

@@ -22,8 +22,8 @@ def planar_noise(drift: Floats, odom_T_base: Floats, settings: Settings) -> Floa
 def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints, motion: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives (P-1, 3, S) of the motions' yaw, x and y by S shared errors, and the errors' prior sigmas (S,).
 
-    The shared errors are the errors of the odometry, and one clock for all cameras. first: (P,) the keyframes between the
-    motions. motion: (P-1, 4, 4).
+    The shared errors are the errors of the odometry, and one clock for all cameras. first: (P,) the keyframes before and
+    after the motions (P-1, 4, 4) of the base.
     """
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(errors.names if errors is not None else ()):

@@ -145,10 +145,7 @@ class _Fit:
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: InnerSolve, theta: Floats, noisy: Floats | None = None) -> _Found:
-        """Return the parameters that fit best. The search starts at theta (P,).
-
-        noisy: (P, P) from `noise_shares`. None if it is not known yet.
-        """
+        """Return the parameters that fit best. The search starts at theta (P,). noisy: from `noise_shares`, if known."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         sigma = np.sqrt(np.diagonal(errors.prior))

@@ -151,10 +151,7 @@ def _unknown_to(
 
 
 def beyond(covariance: Floats, alone: Floats) -> Floats:
-    """Return the part (n, 3, 3) of covariances (n, 3, 3), m^2, beyond the covariances `alone` (n, 3, 3).
-
-    Along each axis, its standard deviation is at least `LEAST`.
-    """
+    """Return the part of covariances (n, 3, 3), m^2, beyond `alone` (n, 3, 3): at least `LEAST`^2 along each axis."""
     size, axes = np.linalg.eigh(covariance - alone)
     return np.asarray((axes * np.maximum(size, LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
@@ -193,8 +190,7 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, plus the error that all objects can
-    share.
+    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, plus an error that all objects share.
 
     doubt: (4, 4) the covariance of this error, as from `shared_at_most`. there: (n,) the objects of the points. index: (M,)
     those of them that have priors, with covariances `prior` (M, 3, 3). The better a prior determines a point, the less the

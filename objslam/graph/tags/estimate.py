@@ -18,8 +18,7 @@ from objslam.graph.tags.shapes import squares_of, turned_by_squares
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 LEAST_PROBABILITY = 0.01
-"""The least probability at which the second rotation of a flat square is reported. With a larger value, fewer are
-reported."""
+"""The least probability at which the second rotation of a flat square is reported. With more, fewer are reported."""
 
 
 def with_objects(
@@ -114,7 +113,8 @@ def _marginals(
 
 
 def _of_squares(local: Floats, rotation: Floats) -> Floats:
-    """Return the derivatives (t, 7, 12) of fitted squares by their corners in map: the inverse of `turned_by_squares`."""
+    """Return the derivatives (t, 7, 12) of fitted squares by their corners in map: the pseudoinverse of
+    `turned_by_squares`."""
     return np.asarray(np.linalg.pinv(turned_by_squares(local, rotation)), dtype=np.float64)
 
 
