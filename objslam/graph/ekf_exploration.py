@@ -28,7 +28,7 @@ from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 _STRETCH = 150
 """A landmark with too few rays is dropped after this number of frames without a ray, or sooner if the heading drifted by
 `HORIZON` since its last ray. Recent landmarks are compared with old ones until this number of frames after the last new
-landmark. A larger number keeps false landmarks longer, and is slower."""
+landmark or tie. A larger number keeps false landmarks longer, and is slower."""
 _RECENT = 300
 """The number of frames after its first ray in which a landmark can be tied to an old one. A larger number is slower."""
 _SURE = 4.0
@@ -109,7 +109,7 @@ class _Exploration:
         self.owner, self.doubtful = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays), dtype=bool)
         self.label, self.first, self.last, self.hits = np.zeros((4, 0), dtype=np.int64)
         self.rarity = -np.log(_NEW) + _log_spread(self.sight)
-        self.birth = -_STRETCH  # The last frame with a new landmark.
+        self.birth = -_STRETCH  # The last frame with a new landmark or a tie.
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
         """Explore all frames."""
@@ -237,8 +237,8 @@ def _likeliest(squared: Floats) -> Ints:
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the area or volume over which rays of new things spread, estimated from all rays. The unit is
-    rad^2, or rad^2 m with a range."""
+    """Return the log (R,) of the area or volume over which rays to new landmarks spread, estimated from all rays. The unit
+    is rad^2, or rad^2 m with a range."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

@@ -59,7 +59,8 @@ class IncrementalGraph(GrowingGraph):
         if relinearise or sunk or self._new.size():
             self._work_in(relinearise, self._layout(coming))
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
-            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # The others may be deep now.
+            # A landmark that is not in this table counts as deep.
+            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}
         if self._newest in self._at.poses:
             self.pose(self._newest)  # This makes iSAM2 solve now.
 

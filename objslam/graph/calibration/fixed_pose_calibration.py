@@ -21,8 +21,8 @@ _CONVERGED = 0.01
 _CAUCHY = 3.0
 """The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
 _STRETCHES = 50
-"""The number of stretches of the drive that count as independent. With fewer, longer stretches, errors may last longer, but
-the size of these errors is less exact."""
+"""The number of stretches of the drive that count as independent. With fewer and longer stretches, errors that last longer
+are found, but their size is less exact."""
 _FREE = 1e-6
 """The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
 objects."""
@@ -65,8 +65,8 @@ def calibrate_at_poses(
 ) -> FixedCalibration:
     """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
 
-    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: with the noise of
-    the poses. SolveError if the linear system has no single solution.
+    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the rays, with
+    the noise of the poses. SolveError if the linear system has no single solution.
     """
     held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
@@ -117,7 +117,8 @@ def linearise_points(
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    held: (R,) the rays that count. owner: (n,) the point of each of them. noise: with the noise of the poses.
+    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the rays, with the noise of the
+    poses.
     """
     angle, place = noise
     target = points[owner]

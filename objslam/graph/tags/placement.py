@@ -14,7 +14,7 @@ _CANDIDATES = 8
 """The most views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over time. A
 larger number is slower, and finds the pose more often if many views are false."""
 _VIEWS = 64
-"""The most views of a fiducial that judge a pose, spread over time. A larger number is slower and judges better."""
+"""The most views of a fiducial on which a pose is judged, spread over time. A larger number is slower and judges better."""
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
@@ -137,7 +137,7 @@ def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
 
 
 def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Floats:
-    """Return the side (H,) m at which squares of side 1, scaled from their origins (H, 3), fit the other views best.
+    """Return the side (H,) m at which squares of side 1, scaled about `origins` (H, 3) m, fit the views best.
 
     Least squares of the distances from the rays. NaN where the views do not tell it.
     """
@@ -152,7 +152,7 @@ def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Float
 
 
 def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
-    """Return squares of side 1 with other sides (H,), scaled from points (H, 3)."""
+    """Return squares of side 1 after a scaling to sides (H,) m. The points `origins` (H, 3) m are the fixed points."""
     pose = squares.pose.copy()
     pose[:, :3, 3] = origins + side[:, None] * (pose[:, :3, 3] - origins)
     return Squares(squares.shape, pose, side)
