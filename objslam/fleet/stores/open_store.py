@@ -21,7 +21,7 @@ def open_store(url: str) -> Store:
 
 
 def open_source(url: str) -> Source:
-    """Return the tree that holds a path or URL. The errors are those of `open_store`."""
+    """Return the source that has a path or URL. The errors are those of `open_store`."""
     if is_remote(url):
         return RemoteSource(url)
     return LocalSource()
