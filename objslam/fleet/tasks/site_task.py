@@ -59,8 +59,8 @@ class SiteTask:
 
 @dataclass(frozen=True, slots=True)
 class SiteResult:
-    """The counts of a site. islands, sessions: all of them. objects, gone: the objects of the largest island, and those of it
-    that are gone. changed: whether this run wrote the site."""
+    """The counts of a site. islands, sessions: all of them. objects, gone: the present and the gone objects of the largest
+    island. changed: whether this run wrote the site."""
 
     site: str
     islands: int
