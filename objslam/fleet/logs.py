@@ -57,7 +57,9 @@ class Layout:
         if len(set(fields)) < len(fields) or not fields:
             raise ConfigError(f"a layout names each field once: {template!r}", hint=hint)
         if by not in (*fields, "folder", "none"):
-            raise ConfigError(f"--by {by!r} is no field of the layout {template!r}", hint="or folder, or none")
+            raise ConfigError(
+                f"--by {by!r} is no field of the layout {template!r}", hint="name a field of it, folder or none"
+            )
         self._template, self._by = template, by
 
     def fields(self, path: str) -> tuple[str, str, str]:
