@@ -49,7 +49,7 @@ def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str
 
 
 def key_of(*parts: str) -> str:
-    """Return the key of some texts, in their order."""
+    """Return the key of texts: the first digits of the hash of the texts, in their order."""
     return sha256("\0".join(parts).encode()).hexdigest()[:_LETTERS]
 
 

@@ -14,7 +14,7 @@ from objslam.fleet.stores.store import FileState
 DEFAULT_LAYOUT = "{site}/{log}"
 """The default layout: the folder that holds a log is its site."""
 NO_SITE = "all"
-"""The name of the only site with --by none, and of the site of a log without a folder with --by folder."""
+"""The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
 _LOG_MARKS = {
     *("camera.yaml", "cameras", "odometry.txt", "localization.txt", "journal.objslam"),  # Log folders and journals.
     *("Barcodes.dat", "groundtruth.txt", "groundtruth.txt.gz", "truth_cam_poses.txt"),  # MRCLAM and TUM RGB-D.
@@ -43,7 +43,8 @@ class Layout:
     """The folders above a log, as "{site}/{robot}/{day}/{log}". Each {name} is one part of a path."""
 
     def __init__(self, template: str, by: str) -> None:
-        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`.
+        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`
+        for one site of all logs.
 
         ConfigError for a wrong template or field.
         """

@@ -43,7 +43,7 @@ arguments."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
-    """Run one task in a worker, and return its answer or its failure. Each engine calls it where its worker is."""
+    """Run one task in a worker, and return its answer or its failure. The process that owns the worker calls this."""
     try:
         return Answer(argument, worker.call(work, argument, limits))
     except LimitError as error:

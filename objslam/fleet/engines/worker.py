@@ -30,7 +30,7 @@ _TIRED = 0.5
 """The share of the memory limit that a process may still have after a task. A process that has more is replaced, so that the
 next task has its memory. A larger share replaces processes less often."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""The variables of the process that give each numerical library one thread, because each core has a process of its own."""
+"""The environment variables that give numerical libraries one thread, because each core has a process of its own."""
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux.
 

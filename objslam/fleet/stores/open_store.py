@@ -14,7 +14,7 @@ def is_remote(url: str) -> bool:
 
 
 def open_store(url: str) -> Store:
-    """Return the store at a path or URL. ObjslamError if fsspec or the package of its protocol is not installed."""
+    """Return the store at a path or URL. The errors of a URL are those of `open_filesystem`."""
     if is_remote(url):
         return RemoteStore(url)
     return LocalStore(local_path(url))

@@ -48,7 +48,7 @@ def persistent(call: Callable[[], _T], where: str) -> _T:
     """Return what a call to a store returns, after up to `_TRIES` tries.
 
     where: the file, for messages. A FileNotFoundError is raised at once, and so is a StoreError if access is denied. After
-    the last try, any failure is a StoreError.
+    the last try, any other OSError becomes a StoreError.
     """
     pause = _PAUSE
     for left in range(_TRIES - 1, -1, -1):

@@ -44,9 +44,9 @@ class MergeTask:
 class Placed:
     """A session in the frame of its island.
 
-    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence that tied the session, or its
-    part of the site, to those before, NaN for the first. common: how many of its objects other sessions had in the first
-    merge that found any.
+    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence that tied the session, or the
+    part of the site that begins with it, to those before, NaN for the first. common: how many of its objects other sessions
+    had in the first merge that found any.
     """
 
     key: str

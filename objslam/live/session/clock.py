@@ -22,9 +22,9 @@ class Clock:
 
     shift: float = 0.0
     newest: float = -float("inf")
-    _older: list[float] = field(default_factory=list)
-    _ahead: float | None = None
-    _shifts: list[float] = field(default_factory=list)
+    _older: list[float] = field(default_factory=list)  # The stamps of the last poses in a row that were older than the path.
+    _ahead: float | None = None  # The stamp of the last pose, if it leapt ahead.
+    _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
         """Return a new pose's stamp in session time, or None, and whether the clock was set back.

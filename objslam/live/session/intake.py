@@ -59,7 +59,7 @@ class Intake:
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
-        self._start_T_odom = np.eye(4)
+        self._start_T_odom = np.eye(4)  # The present frame of the robot's odometry in that of its first odometry.
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
 

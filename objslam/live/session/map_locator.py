@@ -27,8 +27,8 @@ _EVERY, _AT = 10, 9
 """The period of the search in keyframes, and the keyframe in each period. A longer period finds the map later. The keyframe
 differs from those of the maintenance, to spread the delay."""
 _MOST = 40
-"""The most landmarks of a search, the last seen ones. A larger number needs a smaller share of common objects, and delays a
-frame longer. A search of 40 in a map of 1,000 objects takes 0.1 s."""
+"""The most landmarks of a search, the last seen ones. With more, a smaller share of them must be in the prior map,
+and a frame waits longer. A search of 40 in a map of 1,000 objects takes 0.1 s."""
 _GROWTH = 1.2
 """A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks
 are more exact by then. A larger factor searches more rarely."""

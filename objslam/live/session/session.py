@@ -33,9 +33,7 @@ _IDLE = 0.05
 """The longest sleep of the idle thread, s. A snapshot is also made if no frame came for this time. A larger value makes
 snapshots later."""
 _SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
-_LONG = (
-    0.5  # If a caller has waited longer than this, s, a snapshot follows any frame. A larger value makes snapshots later.
-)
+_LONG = 0.5  # If a caller waits longer than this, s, a snapshot follows any frame. A larger value makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
@@ -75,14 +73,14 @@ class Session(Intake):
             self.counters.drop("torn record at the end of the journal", f"{journal}, {self._journal.torn} bytes")
         self._queue: deque[tuple[Message, float]] = deque()
         self._taken: deque[tuple[Message, float]] = deque()
-        self._frames = self._others = 0
+        self._frames = self._others = 0  # How many frames and how many other messages are in the queue.
         self._changed = threading.Condition()
-        self._wanted = self._given = 0
+        self._wanted = self._given = 0  # How many snapshots were asked for, and how many of these requests were answered.
         self._busy = self._running = self._stopping = False
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._describer = Describer()
-        self._asked = -np.inf
+        self._asked = -np.inf  # When the oldest request without an answer came, s (`time.perf_counter`).
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:

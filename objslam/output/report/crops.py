@@ -71,7 +71,7 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
     """Choose at most `count` of the best used rays of an object, and return their indices.
 
     The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. If
-    scores are equal, it has the largest box.
+    scores are equal, the largest box decides.
 
     Args:
         mine: (M,) the indices of the object's rays, in the order of time.

@@ -43,7 +43,7 @@ def sketch(
     path: Floats,
     others: Floats,
 ) -> Sketch | None:
-    """Return the sketch of an object; None without a position or without rays. All positions are in a plane from above, m.
+    """Return the sketch of an object; None without a position or without rays. Positions are in a plane seen from above, m.
 
     Args:
         origins, directions: (M, 2) of the rays. A direction is the part of the unit vector in the plane.

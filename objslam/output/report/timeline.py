@@ -34,6 +34,6 @@ def timeline(stamps: Floats, used: Bools, begin: float, end: float) -> Timeline:
 
 
 def _bars(bottom: Floats, height: Floats) -> str:
-    """Return bars as SVG path data. bottom: (_BINS,) the y of the lower edge, which grows downwards. height: (_BINS,)."""
+    """Return bars as SVG path data. bottom: (_BINS,) the y, downwards, of the lower edges. height: (_BINS,)."""
     rows = np.flatnonzero(height > 0).tolist()
     return "".join(f"M{i} {bottom[i]:.1f}v{-height[i]:.1f}h1v{height[i]:.1f}z" for i in rows)
