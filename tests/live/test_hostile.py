@@ -61,7 +61,7 @@ def odometry(stamp, x=0.0):
 
 
 def boxes(count):
-    """A message that says it has so many boxes, all of them the same bytes."""
+    """A message with `count` boxes, all of them the same bytes."""
     one, two = (serialize(MAKER, MAKER.detections(S, [(1, 2, 30, 40, "cup", 0.9, "7")] * n)) for n in (1, 2))
     at = next(i for i in range(4, len(one), 4) if one[i : i + 4] == b"\1\0\0\0" and two[i : i + 4] == b"\2\0\0\0")
     body = two[at + 4 + (len(two) - len(one)) :]
@@ -73,7 +73,7 @@ def test_a_million_boxes_are_refused_before_they_are_decoded(robot):
     data = boxes(10**6)
     assert len(data) > 10**8
     send("/boxes", DETECTIONS, data)
-    send("/boxes", DETECTIONS, data[:400])  # It only says that it has so many.
+    send("/boxes", DETECTIONS, data[:400])  # It says that it has a million boxes, but ends early.
     assert messages.ledger.dropped == {"message that cannot be decoded": 2}
     assert "more than 10000 detections" in messages.ledger.lines()[0]
     assert not taken

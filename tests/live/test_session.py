@@ -102,7 +102,7 @@ def test_an_object_keeps_its_id_to_the_end(classes):
     assert len({o.id for o in end}) == len(end)
     kept = [(shown[o.id], o) for o in end if o.id in shown]
     assert len(kept) >= 10
-    if classes == 3:  # counted anew, they would have other ids
+    if classes == 3:  # if the end numbered them again, they would have other ids
         assert [o.id for o in end] != list(range(len(end)))
     for before, after in kept:
         others = [o for o in end if o.label == before.label]
