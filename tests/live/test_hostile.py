@@ -97,7 +97,7 @@ def test_numbers_that_are_none_and_stamps_that_cannot_be(robot):
 
 
 def test_one_message_moves_no_clock(robot):
-    """Far ahead, or back by little or much, among poses at 200 Hz."""
+    """Single stamps that are far ahead, or back by little or much, among poses at 200 Hz."""
     send, entry, _, taken = robot
     for i in range(400):
         send("/odom", ODOMETRY, odometry(10 + 0.005 * i, 0.001 * i))
