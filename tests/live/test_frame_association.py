@@ -41,7 +41,7 @@ def rays(targets, label=0):
 
 
 def uncertainty(heading, place=np.nan):
-    """heading: the sigma (rad) of the drift since the landmarks were seen. place: the sigma (m, rad) of the pose in the map."""
+    """heading: the sigma (rad) of the drift since the landmarks were seen. place: that (m, rad) of the pose in the map."""
     drift = np.diag([1e-8, 1e-8, heading**2, 1e-6, 1e-6, 1e-8])
     return PoseUncertainty(drift, adjoint(inverse(AHEAD)), np.eye(6) * place**2)
 

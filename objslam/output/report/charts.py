@@ -64,7 +64,7 @@ def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = N
 
 
 def axis_end(residual: Floats) -> float:
-    """Return a round number that at least 98 % of the residuals (R,) do not exceed. Both have the same unit."""
+    """Return a round number at or above the 98 % quantile of residuals (R,), in the unit of the residuals."""
     most = max(float(np.quantile(residual, 0.98)), 1e-6)
     power = 10.0 ** np.floor(np.log10(most))
     return float(power * _ENDS[np.searchsorted(_ENDS, most / power - 1e-9)])
