@@ -60,6 +60,6 @@ def _misfit(
 
 
 def _steps(sigma: float, finest: float, most: int) -> Floats:
-    """Return the grid values along one axis, which include 0."""
+    """Return the grid values along one axis, which include 0. finest: the least step. most: the most steps."""
     half = int(min(np.ceil(_GRID_SIGMAS * sigma / finest), most // 2))
     return np.linspace(-_GRID_SIGMAS * sigma, _GRID_SIGMAS * sigma, 2 * half + 1) if half else np.zeros(1)

@@ -31,7 +31,8 @@ _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two cor
 
 @dataclass(frozen=True)
 class Constellation:
-    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 relative to it. label: (N,)."""
+    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 relative to the neighbourhood. label:
+    (N,)."""
 
     position: Floats
     covariance: Floats
@@ -39,10 +40,9 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Make a constellation of landmarks with larger covariances.
+    """Make a constellation of landmarks. Their covariances get larger, because a neighbourhood may be deformed.
 
-    The added standard deviation grows with the horizontal distance from the pivot (2,) m, because a neighbourhood may be
-    deformed.
+    The added standard deviation grows with the horizontal distance from the pivot (2,) m.
     """
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
@@ -60,6 +60,7 @@ class Recognition:
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
     second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the best other place.
+    Negative evidence of the other place counts as 0.
     """
 
     correction: Floats
@@ -222,7 +223,10 @@ def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2), or None."""
+    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2).
+
+    None if no pair gains, or if a pair leaves its gate. one, two: (C,) the candidates.
+    """
     gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
         gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)
