@@ -30,7 +30,7 @@ def make_result(
 ) -> RunResult:
     """Return the result of a solution with the map by `describe`, and add the judgement to the summary.
 
-    more: the fields that are not in the solution.
+    residual: (R,) rad, by `describe`. more: the fields of the result that are not in the solution.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -133,9 +133,9 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
-    Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
-    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
-    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
+    seconds: the time of each stage. The entry `map_frame` says what fixed the frame of the map: `localization`, or
+    `odometry` without an absolute measurement. The entry `planar` says whether the measured path has one height, roll and
+    pitch. The entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]

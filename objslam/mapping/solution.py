@@ -48,6 +48,9 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them. Other poses depend on odometry only."""
+    """Return the keyframes that have a ray, and the rays with indices into them.
+
+    Keyframes without a ray are left out, because they measure no object.
+    """
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
