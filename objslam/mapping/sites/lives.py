@@ -15,7 +15,8 @@ GONE = 0.5
 FORGOTTEN = 0.01
 """The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
 UNPROVEN = 0.9
-"""The probability that an object of one session exists if the session does not say. A larger value trusts it more."""
+"""The probability that an object of one session exists, if the session does not say. It is also the largest one that a
+session gives. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
 """The largest ratio of the sizes of an object before and after it moved. A larger value takes more pairs for one object."""
@@ -77,10 +78,10 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
 
 
 def joined(old: Life, new: Life) -> Life:
-    """Return the life of an object that two sites have, the sessions of one before those of the other.
+    """Return the life of an object that two sites have. old, new: in the earlier and in the later site.
 
-    The later site began with an object of which nothing was known (`UNPROVEN`). What its sessions say of the object goes on
-    from what the earlier site knew, after the first of them found it.
+    The later site began with the prior `UNPROVEN`. Its odds are divided by the odds of this prior, which leaves what its
+    sessions say. They multiply the odds of the earlier site, after one more session that found the object.
     """
     days = np.array([max(new.updated - old.updated, 0.0) / _DAY])
     one, none = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
