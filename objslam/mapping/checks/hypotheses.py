@@ -26,7 +26,8 @@ _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault of the input. what: a description of the corrected log. cause: the probable mistake."""
+    """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
+    mistake. put_right: returns the corrected log."""
 
     name: str
     what: str
@@ -92,7 +93,8 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
 
 
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Some hypotheses change its meaning."""
+    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Without it, the hypotheses about width and
+    height are left out."""
 
     def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
         def put_right(log: Log) -> Log:

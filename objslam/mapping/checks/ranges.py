@@ -29,13 +29,15 @@ _SIGMAS = 5.0
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
 """The name of each unit of length, by its number in a metre."""
 _CLOSE = 0.25
-"""A factor is one of these units if the logarithm of their ratio is below this."""
+"""A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
+units."""
 _UNIT = 0.7
 """The logarithm of a factor above which no calibration error explains the factor."""
 _GROUP = 8
 """The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which a label in a window is one thing. In a larger crowd, its ranges end at several."""
+"""The crowd (`Part.crowd`) up to which a label in a window is one thing. In a larger crowd, its ranges end at several
+things."""
 _LEAST_BY_ODOMETRY = 0.18
 """The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
