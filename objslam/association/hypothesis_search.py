@@ -112,9 +112,9 @@ def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[
 class _Scorer:
     """Scores points by the rays of one label.
 
-    The rays are sorted into slices. Slice k, from 0, holds the (k + 1)-th ray of every frame with more than k rays. Frames
-    with more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices gives
-    the best support in each frame.
+    The rays are sorted into slices. Slice k, from 0, contains the (k + 1)-th ray of every frame with more than k rays.
+    Frames with more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices
+    gives the best support in each frame.
     """
 
     def __init__(self, obs: Observations, search: Search, backend: Backend) -> None:

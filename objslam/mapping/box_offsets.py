@@ -1,7 +1,7 @@
 """Errors that the boxes of an object share. The centre of a box is not the centre of the object, and from one side all boxes
 have about the same offset.
 
-More rays from the same side do not average such an error out. So many rays count as few (Kish 1965).
+More rays from the same side do not average such an error out. Therefore many rays count as few (Kish 1965).
 """
 
 from dataclasses import dataclass, replace

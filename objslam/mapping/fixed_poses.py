@@ -50,7 +50,7 @@ class FixedPoses:
     settings: Settings
 
     def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
-        """Return the same input without shared errors (P,)."""
+        """Return the same input, corrected for the shared errors theta (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
         seen, rays_seen, _ = errors.at(theta, drift=False)
         return replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)

@@ -264,7 +264,7 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
 
 def _by_label(state: JointState) -> tuple[JointState, bool]:
     """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
-    the shared errors and the noise of the state are still better than the nominal ones."""
+    the shared errors and the noise of the state are still better than the nominal values."""
     association, errors = associate_by_label(state.rays), state.errors
     solved = state.solve("labels", association)
     assert solved.estimate is not None

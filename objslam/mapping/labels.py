@@ -76,7 +76,7 @@ def clock_explains(association: Association, errors: SharedErrors, solve: Callab
 def noise_explains(
     association: Association, estimate: Estimate, errors: SharedErrors, solve: Callable[[SharedErrors], Estimate]
 ) -> Estimate | None:
-    """Return the solution with one object for each label if larger noise makes all labels agree. None otherwise.
+    """Return the solution with one object for each label if larger noise makes all labels agree. None if it does not.
 
     With too little noise in the settings, poses cannot move far enough. Then rays of one object look like rays of several
     objects. So all noise is estimated, even if the settings fix it, and the labels are judged with this noise.
@@ -106,5 +106,5 @@ def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> N
     if factors:
         ledger.warn(
             f"the settings say too little noise for this log (factors found: {factors}), and many boxes are rejected; "
-            f"leave it out of the settings, or set {', '.join(f'noise.{kind}=true' for kind in sorted(said))}"
+            f"leave the noise out of the settings, or set {', '.join(f'noise.{kind}=true' for kind in sorted(said))}"
         )

@@ -53,7 +53,7 @@ def centred(whole: Constellation, keep: Ints, centre: Floats) -> Constellation:
 
 
 def move(x: Floats, points: Floats) -> Floats:
-    """Return points (..., P, 3) under transforms (..., 4)."""
+    """Return points (..., P, 3) under transforms (..., 4), each of x, y, z (m) and yaw (rad)."""
     cos, sin = np.cos(x[..., 3, None]), np.sin(x[..., 3, None])
     turned = (cos * points[..., 0] - sin * points[..., 1], sin * points[..., 0] + cos * points[..., 1])
     return np.stack([*turned, np.broadcast_to(points[..., 2], turned[0].shape)], axis=-1) + x[..., None, :3]

@@ -29,7 +29,7 @@ _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9. A
 larger value costs more runs a few seconds."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
-"""The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of these offsets."""
+"""The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of the offsets."""
 _CROWD = 5.0
 """The crowd (`Part.crowd`) above which rays meet anywhere and show nothing. A larger value takes longer."""
 _FEWEST = 60

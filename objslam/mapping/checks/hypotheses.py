@@ -170,7 +170,7 @@ def _mounted(pose: Floats, turn: Floats) -> Floats:
 
 
 def w_last(poses: Floats) -> Floats:
-    """Return poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
+    """Correct poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
     read = quaternion_from_rotation(poses[..., :3, :3])
     return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
@@ -187,7 +187,7 @@ def _yaw_times(poses: Floats, factor: float) -> Floats:
 
 
 def _from_degrees(poses: Floats) -> Floats:
-    """Return poses whose headings (degrees) were taken for radians.
+    """Correct poses whose headings (degrees) were taken for radians.
 
     A rotation matrix keeps a heading modulo 2 pi, so multiples of 6.3 degrees are lost here. Two assumptions restore them: a
     robot turns evenly, and it drives in the direction of its heading.

@@ -69,7 +69,7 @@ class SmallErrors:
         return tuple(n for n, v in named if abs(v) > _HARMFUL[kind(n)] and n not in self.estimated)
 
     def corrected(self, log: Log, only: Collection[str] | None = None) -> Log:
-        """Return a log without the errors, or without `only` those of these names."""
+        """Return a log without the errors. only: the names of the errors to remove, None for all."""
         every = np.zeros(len(self.errors.names))
         for name, value in zip(self.names, self.values.tolist(), strict=True):
             if only is None or name in only:
@@ -168,7 +168,7 @@ def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agree
 
 
 def _gain(system: PointSystem, which: list[int]) -> float:
-    """Return the decrease of the cost by these errors."""
+    """Return the decrease of the cost by the errors `which`."""
     if not which:
         return 0.0
     at = np.ix_(which, which)
@@ -176,6 +176,6 @@ def _gain(system: PointSystem, which: list[int]) -> float:
 
 
 def _step(system: PointSystem, which: list[int]) -> tuple[Floats, Floats]:
-    """Return the step of these errors, and the step of the points (N, 3)."""
+    """Return the step (P,) of the errors `which`, and the step of the points (N, 3)."""
     step = np.linalg.lstsq(system.matrix[np.ix_(which, which)], -system.vector[which], rcond=1e-9)[0]
     return np.asarray(step), np.asarray(system.own + system.back[:, :, which] @ step)

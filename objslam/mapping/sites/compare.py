@@ -51,7 +51,8 @@ class Comparison:
 
 
 def compare(a: Session, b: Session) -> Comparison:
-    """Compare a map with that of a later session. The later one needs its views to say that an object is gone."""
+    """Compare a map with the map of a later session. b: the later one, which needs its views to say that an object is
+    gone."""
     found = register(b.objects, a.objects)
     why = reason(found, b.objects, a.objects, (b.name, a.name))
     if not found.accepted:

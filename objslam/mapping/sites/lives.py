@@ -42,8 +42,9 @@ class Track:
 def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
     """Return the lives (N) of the tracks after one session.
 
-    found: (N,) whether the session found each. looks: (N,) how often it should have. seen: the objects that it found, None
-    elsewhere. when: the time of the session, s. A track without a life begins here.
+    found: (N,) whether the session found each. looks: (N,) in how many frames it should have been detected. seen: the object
+    of the session for each track, None if it was not found. when: the time of the session, s. A track without a life begins
+    here.
     """
     old = [t.life for t in tracks]
     before = np.array([UNPROVEN if life is None else life.probability for life in old])

@@ -197,7 +197,7 @@ def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject
 def _visit(
     tracks: list[Track], some: list[int], here: dict[int, MapObject], session: Session, positions: Floats, back: Floats
 ) -> None:
-    """Let some tracks live through one session. here: the objects that it found, by track. back: session_T_site."""
+    """Let some tracks live through one session. here: the objects that the session found, by track. back: session_T_site."""
     looks = session.looks(tuple(tracks[at].item for at in some), positions[some], back)
     found = np.array([at in here for at in some], dtype=bool)
     lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
