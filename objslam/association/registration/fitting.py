@@ -60,7 +60,8 @@ def move(x: Floats, points: Floats) -> Floats:
 
 
 def covariances(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
-    """Return the covariances (H, P, 3, 3) of the differences of objects `a` under transforms x (H, 4) from objects `b`."""
+    """Return the covariances (H, P, 3, 3) of the offsets from objects `a` (H, P), under transforms x (H, 4), to objects
+    `b`."""
     rotation = lift_se2(np.stack([x[:, 0], x[:, 1], x[:, 3]], axis=1))[:, None, :3, :3]
     return rotation @ problem.a.covariance[a] @ np.swapaxes(rotation, -1, -2) + problem.b.covariance[b]
 

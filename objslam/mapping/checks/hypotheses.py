@@ -195,7 +195,7 @@ def _from_degrees(poses: Floats) -> Floats:
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     steps = np.diff(said)
     rate = 0.0
-    for i, step in enumerate(steps.tolist()):  # each step is near the one before
+    for i, step in enumerate(steps.tolist()):  # Each step is near the step before.
         steps[i] = step + 2 * np.pi * round((rate - step) / (2 * np.pi))
         rate = steps[i]
     yaw = np.radians(np.append(0.0, np.cumsum(steps)))
