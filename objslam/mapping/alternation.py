@@ -11,6 +11,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
 from objslam.mapping.joint_alternation import JointState, solve_joint
@@ -62,8 +63,11 @@ def solve(
     else:
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         association, estimate, rounds = solve_joint(begin, start)
+        estimate, added = solve_to_centres(begin, association, estimate)
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
+        if added is not None:
+            rays_of_keyframes = to_centres(rays_of_keyframes, added)
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     return Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)

@@ -76,7 +76,9 @@ def describe(
     for j in range(association.count):
         mine = order[bounds[j] : bounds[j + 1]]
         kept = mine[estimate.weight[mine] > 0] if (estimate.weight[mine] > 0).any() else mine
-        covariance = estimate.covariance[j]
+        placed = None if solution.bodies is None else solution.bodies[j]
+        covariance = estimate.covariance[j] if placed is None or placed.centre is None else placed.covariance[:3, :3]
+        position = estimate.positions[j] if placed is None or placed.centre is None else placed.centre
         parallax = widest_angle(directions[kept])
         solved = bool(estimate.solved[j] and np.isfinite(covariance).all())
         status = status_of(
@@ -94,7 +96,7 @@ def describe(
             MapObject(
                 id=j,
                 label=rays.label_names[association.label[j]],
-                position=estimate.positions[j],
+                position=position if known else estimate.positions[j],
                 covariance=covariance if known else None,
                 status=status,
                 rays=len(kept),
@@ -108,6 +110,8 @@ def describe(
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
+                body=placed.body if placed is not None and known else None,
+                ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
                 tag=estimate.tags.get(j) if known else None,
             )
         )

@@ -21,6 +21,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
@@ -95,6 +96,7 @@ def run(
         if settings.checks.use and solution.estimate.calibration is not None:
             diagnosis = diagnosis.with_findings(uncorrected(solution.estimate.calibration, errors.bounds))
             say(diagnosis, ledger)
+    solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     trusted = not diagnosis.spoilt
@@ -112,7 +114,7 @@ def run(
         with _stage("localize", seconds, progress):
             where = localize(solution, objects, known, errors, settings, ledger)
             if where.solution is not None and where.map_T_drive is not None:
-                solution, log = where.solution, moved_log(log, where.map_T_drive)
+                solution, log = with_bodies(where.solution, cameras, settings), moved_log(log, where.map_T_drive)
                 keyframes, estimate = solution.keyframes, solution.estimate
                 described, residual = describe(solution, cameras, settings, trusted=trusted)
                 objects = with_map(described, where, known)

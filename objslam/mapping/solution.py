@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.core.arrays import Floats
+from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
@@ -20,7 +22,10 @@ class Solution:
     """The association, the estimate, and counts of each round.
 
     keyframes: the solved keyframes, which have at least one ray. rays: their rays, with indices into these keyframes. trace:
-    the rounds for the recording, empty without a recording.
+    the rounds for the recording, empty without a recording. bodies: the body of each object, None for a point. They are None
+    if nobody looked for bodies. body_share: the standard deviation of the error that the boxes of one side of a body share,
+    as a share of half their size. to_centre: (R, 3) what to add to the direction of each ray, in the camera frame, so that
+    it points to the centre of its body. None without bodies.
     """
 
     keyframes: Keyframes
@@ -29,6 +34,9 @@ class Solution:
     estimate: Estimate
     rounds: tuple[dict[str, int], ...]
     trace: tuple[Round, ...] = ()
+    bodies: tuple[PlacedBody | None, ...] | None = None
+    body_share: float | None = None
+    to_centre: Floats | None = None
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:

@@ -21,6 +21,7 @@ from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
@@ -60,6 +61,7 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
+    solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)

@@ -13,6 +13,7 @@ from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body import Body, surer_body, turned
 from objslam.core.geometry import inverse
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
@@ -272,6 +273,8 @@ def _objects(
             position=solved.positions[at],
             covariance=_at_least_the_best(solved, at, of),
             labels=_labels([o for _, _, o in of]),
+            body=_surest_body(solved, of),
+            ray_point=None,
             first_seen=min(o.first_seen for _, _, o in of),
             last_seen=max(o.last_seen for _, _, o in of),
             life=track.life,
@@ -293,6 +296,15 @@ def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, Ma
     best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
     rotation = solved.site_T_map[best[1], :3, :3]
     return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
+
+
+def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> Body | None:
+    """Return the body whose size is known best, with its yaw in the frame of the site. None if no session has one."""
+    best: Body | None = None
+    for n, _, o in of:
+        if o.body is not None:
+            best = surer_body(best, turned(o.body, solved.site_T_map[n, :3, :3]))
+    return best
 
 
 def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:
