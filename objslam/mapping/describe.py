@@ -61,7 +61,8 @@ def describe(
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
     The map counts the rays and frames of an object without its rejected rays. If all its rays are rejected, it counts all.
-    trusted: whether positions are reliable. If not, all objects are unresolved.
+    The position of an object with a body may be the centre of the body (`PlacedBody`). trusted: whether positions are
+    reliable. If not, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
