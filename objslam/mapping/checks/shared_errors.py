@@ -27,12 +27,13 @@ _CAUSES = {
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
     """Warn of each shared error that is far from the mean of its prior, and name the probable cause.
 
+    The value of an error that the log does not show follows the noise, so it causes no warning.
     The prior is from the settings or from a calibration file. A large error causes no warning if the file already has it.
     """
     for name, of in calibration.to_dict()["parameters"].items():
         expected = of["prior_mean"]
         sigmas = abs(of["value"] - expected) / of["prior_sigma"]
-        if sigmas > MOST_SIGMAS:
+        if sigmas > MOST_SIGMAS and of["observable"]:
             cause = _CAUSES.get(kind(name), "is the calibration right?")
             unit = "" if of["unit"] == "share" else f" {of['unit']}"
             far = f"{sigmas:.1f} times its prior sigma"

@@ -177,7 +177,7 @@ def test_a_fixed_run_says_why_it_has_no_edges(tmp_path):
 def test_a_file_goes_into_the_result_and_leaves_with_it(mapped, result, tmp_path):
     copy = Path(shutil.copytree(result, tmp_path / "out"))
     written = {write_export(copy, to).name for to in FORMATS}
-    write_result(mapped, copy)  # what was exported of an older run would be taken for this one's
+    write_result(mapped, copy)  # An export of an older run would be taken for one of this run.
     assert not written & {file.name for file in copy.iterdir()}
 
 
