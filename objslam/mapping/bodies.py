@@ -1,4 +1,4 @@
-"""Give the objects of a solution bodies: upright ellipsoids that fit the edges of their boxes."""
+"""Give the objects of a solution bodies: upright spheres, ellipsoids and cuboids that fit the edges of their boxes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
 _FEWEST = 5
-"""The least number of boxes of a body. A larger number leaves more objects points."""
+"""The least number of boxes of a body. With a larger number, more objects stay points."""
 _CLEAR = 1.0
 """The angle between the centre of a body and that of its box, in standard deviations of the error that boxes share, above
 which the position is the centre of the body. It is 4 for a cabinet from close by, and below 0.6 for things on a table that a
@@ -31,10 +31,10 @@ _ANY_YAW = np.pi / np.sqrt(12)
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return a solution with the body of each object that its boxes carry. The points and their covariances stay.
+    """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
 
-    The covariance of a centre holds the noise of the boxes, the errors that they share, and what the covariance of the point
-    holds beyond the noise of its rays, such as the noise of solved poses.
+    The covariance of a centre contains the noise of the boxes and the errors that they share. It also contains what the
+    covariance of the point has beyond the noise of its rays, such as the noise of solved poses.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -71,7 +71,7 @@ class _Views:
     """The boxes of objects with a point.
 
     objects: (n,) the objects, ray: (B,) the used rays. body: (B,) the object of each box as an index into `objects`. points:
-    (n, 3) m. half: (n, 2) m, apparent half axes.
+    (n, 3) m. half: (n, 2) m, the apparent half axes across and upwards.
     """
 
     solution: Solution
@@ -109,7 +109,7 @@ class _Views:
         rays, settings, poses = self.solution.rays.take(self.ray), self.settings, self.poses
         count = len(self.ray)
         normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), np.zeros((count, 4), dtype=bool)
-        direction = np.zeros((count, 3))  # That of a ray may already point to the centre of a body.
+        direction = np.zeros((count, 3))  # The direction of a ray may already point to the centre of a body.
         good = np.zeros(count, dtype=bool)
         for i in np.unique(self._camera):
             mine, camera = np.flatnonzero(self._camera == i), self.cameras[i]
@@ -177,7 +177,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
 def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     """Return whether the centre of each body (n,) is farther from the centres of its boxes than their shared error.
 
-    Otherwise the rays through the centres of boxes tell the place at least as well, and a body only tells the size.
+    If it is not, the rays through the centres of the boxes give the place at least as well, and the body gives only the
+    size.
     """
     edges = views.edges()
     shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
@@ -186,7 +187,7 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
 
 
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
-    """Return what the covariance of each point (n, 3, 3) holds beyond the noise of its rays at known poses, m^2."""
+    """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2."""
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
     if settings.mode != "joint" and estimate.calibration is None:
         return np.zeros((len(views.objects), 3, 3))
@@ -204,7 +205,8 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
 
 
 def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
-    """Return one body. extra: (3, 3) m^2, added to the covariance of its centre. clear: whether that is its place."""
+    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the centre is the
+    position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at].copy()
     # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.

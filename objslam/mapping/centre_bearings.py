@@ -1,5 +1,5 @@
-"""Bearings to the centres of bodies, for the joint mode. The centre of a box is not where the centre of its body is seen, so
-near large objects bend the path of the robot.
+"""Bearings to the centres of bodies, for the joint mode. The centre of a box is not where the centre of its body is seen. So
+large objects nearby bend the path of the robot.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from objslam.mapping.joint_alternation import JointState
 
 _ROUNDS = 2
-"""How often bodies and poses are solved in turns. More rounds are slower, and change less than the noise."""
+"""The most rounds in which bodies and poses are solved in turns. More rounds are slower, and change less than the noise."""
 _KEPT = 0.5
-"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects, and then
-all bearings stay as they were."""
+"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. If one
+is lost, all bearings stay as they were."""
 _WORTH = 0.1
 """The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
 shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
@@ -34,8 +34,8 @@ again."""
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
-    None was added, and the estimate is as before, if no body shifts its bearings by more than a part of their noise, or
-    if an object would be lost.
+    If no body shifts its bearings enough (`_WORTH`), or if an object would be lost, the estimate is as before, and the
+    second value is None.
     """
     from objslam.graph import batch_solver
 
@@ -80,7 +80,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
 
 
 def to_centres(rays: Rays, added: Floats) -> Rays:
-    """Return rays with a vector (R, 3) added to each direction."""
+    """Return rays with a vector (R, 3) added to each direction, in the camera frame."""
     direction = rays.direction + added
     return replace(rays, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
 

@@ -30,7 +30,7 @@ def make_result(
 ) -> RunResult:
     """Return the result of a solution with the map by `describe`, and add the judgement to the summary.
 
-    more: the fields that are not in the solution.
+    residual: (R,) rad, by `describe`. more: the fields of the result that are not in the solution.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -61,7 +61,8 @@ def describe(
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
     The map counts the rays and frames of an object without its rejected rays. If all its rays are rejected, it counts all.
-    trusted: whether positions are reliable. If not, all objects are unresolved.
+    The position of an object with a body may be the centre of the body (`PlacedBody`). trusted: whether positions are
+    reliable. If not, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
@@ -137,9 +138,9 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
-    Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
-    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
-    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
+    seconds: the time of each stage. The entry `map_frame` says what fixed the frame of the map: `localization`, or
+    `odometry` without an absolute measurement. The entry `planar` says whether the measured path has one height, roll and
+    pitch. The entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]

@@ -32,7 +32,7 @@ class PriorMap:
 
     @property
     def first_free_id(self) -> int:
-        """The first id that no object of the map has, nor any id after it."""
+        """The largest id in the map plus 1. The objects that are gone count too."""
         return max((o.id for o in (*self.objects.objects, *self.objects.gone)), default=-1) + 1
 
 
@@ -41,8 +41,8 @@ class Localization:
     """A drive in the frame of an older map, or the reason why it is not there.
 
     registration: of the drive to the map. told: the entry of summary.json. solution: the drive in the frame of the map, with
-    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2, the same with the map's objects
-    as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
+    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects, with the map's
+    objects as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
     """
 
     registration: Registration
@@ -61,7 +61,7 @@ def localize(
     objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
     the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
     """
-    # They import scipy.optimize, which takes longer than the map of a small log.
+    # These functions import scipy.optimize, which takes longer than the map of a small log.
     from objslam.association.registration.object_maps import placed, reason, register
 
     found = register(objects, known.objects)
@@ -100,7 +100,7 @@ def localize(
 
 
 def _with_covariances(solution: Solution, objects: ObjectMap) -> Solution:
-    """Return the solution with the covariances of its map, which hold the errors that checks found after the solve."""
+    """Return the solution with the covariances of its map, which include the errors that checks found after the solve."""
     widened = objects.covariances
     covariance = np.where(np.isfinite(widened), widened, solution.estimate.covariance)
     return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
@@ -132,7 +132,7 @@ def _solve(
     if settings.mode == "joint":
         estimate, images, keyframes, rays = solution.estimate, solution.keyframes, solution.keyframes, solution.rays
         if errors is not None and estimate.calibration is not None:
-            # Inside a solve, lengths make up for its shrinkage. Those of the solution are as measured.
+            # Inside a solve, lengths are corrected for its shrinkage. The lengths of the solution are as measured.
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
@@ -143,10 +143,11 @@ def _solve(
 
 
 def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
-    """Return the objects of a drive that was found in a map, at the places that the map gives them, with the ids of the map.
+    """Return the objects of a drive that was found in a map, with the ids of the map. The map's objects count as priors of
+    their positions.
 
-    objects: the drive's, described in the frame of the map. Objects that the map does not have get the first free id of the
-    map, plus their id in the drive.
+    objects: of the drive, described in the frame of the map. An object without a covariance keeps its position. Objects that
+    the map does not have get the first free id of the map, plus their id in the drive.
     """
     assert where.positions is not None
     assert where.covariance is not None
@@ -174,7 +175,8 @@ def moved_object(item: MapObject, map_T_drive: Floats) -> MapObject:
 
 
 def moved_log(log: Log, map_T_drive: Floats) -> Log:
-    """Return the log with its poses in the frame of the map. The ground truth stays, because nobody says where it lies."""
+    """Return the log with its poses in the frame of the map. The ground truth stays, because its place in the map is
+    unknown."""
     odometry, localization = (
         None if path is None else Trajectory(path.stamps, map_T_drive @ path.poses)
         for path in (log.odometry, log.localization)

@@ -52,8 +52,8 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
-    LogError if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
-    or does not fit the log.
+    LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
+    SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     log = chosen_poses(log, settings)
     settings = with_mode_of(log, settings)
@@ -119,7 +119,7 @@ def run(
                 described, residual = describe(solution, cameras, settings, trusted=trusted)
                 objects = with_map(described, where, known)
     path = log.robot_path
-    assert path is not None  # Otherwise build_keyframes has raised LogError.
+    assert path is not None  # Without a path, build_keyframes raises LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
@@ -127,7 +127,7 @@ def run(
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # The second call counts the drops.
+                before = reconstruct(log, path, settings, Ledger(), progress)  # The first call counted the drops.
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),

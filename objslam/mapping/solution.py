@@ -22,10 +22,10 @@ class Solution:
     """The association, the estimate, and counts of each round.
 
     keyframes: the solved keyframes, which have at least one ray. rays: their rays, with indices into these keyframes. trace:
-    the rounds for the recording, empty without a recording. bodies: the body of each object, None for a point. They are None
-    if nobody looked for bodies. body_share: the standard deviation of the error that the boxes of one side of a body share,
-    as a share of half their size. to_centre: (R, 3) what to add to the direction of each ray, in the camera frame, so that
-    it points to the centre of its body. None without bodies.
+    the rounds for the recording, empty without a recording. bodies: the body of each object, None for a point. The tuple is
+    None if no bodies were solved. body_share: the standard deviation of the error that the boxes of one side of a body
+    share, as a share of half their size. to_centre: (R, 3) what to add to the direction of each ray, in the camera frame, so
+    that it points to the centre of its body. None without bodies.
     """
 
     keyframes: Keyframes
@@ -56,6 +56,9 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them. Other poses depend on odometry only."""
+    """Return the keyframes that have a ray, and the rays with indices into them.
+
+    Keyframes without a ray are left out, because they measure no object.
+    """
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
