@@ -26,7 +26,9 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     try:
         return _marginals(graph, values, landmarks)
     except RuntimeError as error:
-        ledger.warn(f"covariances: {indeterminate(error).message}; objects that no measurement holds are left unresolved")
+        ledger.warn(
+            f"covariances: {indeterminate(error).message}; objects that no measurement determines are left unresolved"
+        )
     held = graph.clone()
     for j in landmarks.tolist():
         held.push_back(point_prior(j, values.atPoint3(L0 + j), HELD))

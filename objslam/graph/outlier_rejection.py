@@ -147,7 +147,8 @@ def second_opinion(
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
     """Return which rays (R,) agree with their object, given the noise of the object's inliers.
 
-    used: (R,) the inliers. If there are none yet, the noise comes from all rays of the object.
+    used: (R,) the inliers. If no ray of any object is one yet, all rays count. An object with few inliers (`_FEWEST`) has
+    the nominal noise.
     """
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]

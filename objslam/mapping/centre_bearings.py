@@ -1,5 +1,7 @@
-"""Bearings to the centres of bodies, for the joint mode. The centre of a box is not where the centre of its body is seen. So
-large objects nearby bend the path of the robot.
+"""Bearings to the centres of bodies, for the joint mode.
+
+The centre of a box is not the image of the centre of the object. For large objects nearby, this error bends the estimated
+path.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ def _covariances(
         tangent = marginals.marginalCovariance(F0)
     except RuntimeError as error:
         raise indeterminate(error) from error
-    to_pivot = np.zeros((4, 6))  # From the tangent of F, rotation first, to a shift of the pivot and a yaw.
+    to_pivot = np.zeros((4, 6))  # The Jacobian from the tangent of the frame (rotation first) to the shift and the yaw.
     to_pivot[:3, 3:], to_pivot[3, 2] = values.atPose3(F0).rotation().matrix(), 1.0
     to_pivot[:3, 2] = _turned(pivot - frame[:3, 3])
     return to_pivot @ tangent @ to_pivot.T, spread

@@ -17,7 +17,7 @@ _SPREAD = 0.1
 """The most by which half of the points' ratios may differ from their median, as a share. A wrong unit or scale is equal for
 all points. The ratios of points at wrong positions differ."""
 _SPREAD_OF_UNITS = 0.3
-"""`_SPREAD` for a factor so large that it must be a unit."""
+"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
 _LEAST = 0.04
 """The least error of the ranges, as a share. Smaller errors also come from the depth of things and from cameras that are
 turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
