@@ -6,9 +6,6 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from objslam.core.bodies.upright_box import footprint
 from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
@@ -59,6 +56,10 @@ def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
 
 def _footprint(o: MapObject, body: Body, datum: Datum | None) -> dict[str, Any]:
     """Return the footprint of a body as a rectangle. Its corners go counter-clockwise, as the RFC asks."""
+    import numpy as np
+
+    from objslam.core.bodies.upright_box import footprint
+
     corners = footprint((o.position, body.size, body.yaw))
     closed = np.concatenate([corners, corners[:1]])
     ring = np.column_stack([closed, np.full(len(closed), o.position[2])])
