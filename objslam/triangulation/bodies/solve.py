@@ -230,7 +230,8 @@ def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
         predicted += (gap[:, axis] * turn)[:, None] * across
     predicted /= np.linalg.norm(predicted, axis=1, keepdims=True)
     towards = centre[edges.body] - edges.origin
-    return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True) - predicted)
+    away = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    return np.asarray(towards / away - predicted)
 
 
 def _dot_evidence(edges: BoxEdges, prior: Prior, weights: Weights, side: Floats) -> Floats:
