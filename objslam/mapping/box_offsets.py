@@ -17,16 +17,8 @@ from objslam.core.geometry import evenly_spread, is_planar
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
+from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
 
-_SIDES = 103
-"""The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All rays from one side
-count as one measurement. A larger number is finer and slower."""
-_ALIKE = np.radians(20.0)
-"""The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
-angle, more views are needed to average them out. On three objects of YCB-Video, it is 5 to 20 degrees for a detector."""
-_WITHIN = 0.7
-"""The variance of the mean error over one side, as a share of the variance in one direction. Two directions in a side are 10
-degrees apart on average, and their correlation is 0.7. A larger share finds smaller errors."""
 _SHARES = 81
 """The number of tried values of the error of a box as a share of its size, from 0 to `_WIDEST` times the prior. A larger
 number is finer and slower."""
@@ -144,7 +136,7 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
     deviation. In the other solves it pulls with the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
-    lattice = evenly_spread(_SIDES)
+    lattice = evenly_spread(SIDES)
     pairs = np.column_stack([landmark, (rays.direction @ lattice.T).argmax(axis=1)])
     pairs, cell = np.unique(pairs, axis=0, return_inverse=True)
     cell, owner, axes = cell.ravel(), pairs[:, 0], _azimuth_elevation(lattice[pairs[:, 1]])
@@ -173,9 +165,9 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
     seen = {}
     for j in np.unique(owner).tolist():
         mine = np.flatnonzero(owner == j)
-        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / _ALIKE
+        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / ALIKE
         seen[j] = Sides(
-            alike=_WITHIN * 0.5**turned,
+            alike=WITHIN * 0.5**turned,
             mean=mean[mine, :, 0],
             white=white[mine],
             shift=shift[mine],
