@@ -30,7 +30,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
+from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
@@ -114,10 +114,9 @@ def run(
         with _stage("localize", seconds, progress):
             where = localize(solution, objects, known, errors, settings, ledger)
             if where.solution is not None and where.map_T_drive is not None:
-                solution, log = with_bodies(where.solution, cameras, settings), moved_log(log, where.map_T_drive)
+                solution, objects, residual = describe_in_map(where, known, cameras, settings, trusted=trusted)
+                log = moved_log(log, where.map_T_drive)
                 keyframes, estimate = solution.keyframes, solution.estimate
-                described, residual = describe(solution, cameras, settings, trusted=trusted)
-                objects = with_map(described, where, known)
     path = log.robot_path
     assert path is not None  # Without a path, build_keyframes raises LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)

@@ -1,5 +1,7 @@
 """Bodies in the whole pipeline: a robot that drives between large objects, and what becomes of its map and its path."""
 
+import threading
+
 import numpy as np
 import pytest
 from triangulation.true_boxes import outline_box
@@ -10,7 +12,10 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.evaluation.evaluate import evaluate
+from objslam.live.adapters.replay import ReplayAdapter
+from objslam.live.session.session import Session
 from objslam.mapping import pipeline
+from objslam.mapping.localization import PriorMap, moved_log
 from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
 
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.8], [0, 0, 0, 1]])
@@ -81,3 +86,31 @@ def test_a_known_size_is_kept():
     (thing,) = (o for o in result.map if o.label == "thing 3")
     np.testing.assert_allclose(thing.body.size, [length, width, height], rtol=0.1)
     assert (thing.body.size_sigma <= 0.15 * thing.body.size).all()
+
+
+def test_a_drive_in_an_older_map_has_its_bodies_there():
+    """The same things in another frame: centres, headings and ray points come back to those of the map."""
+    log, settings = drive(1), load_settings(None, ("mode=joint", "calibration.use=false", "output.recording=false"))
+    known = pipeline.run(log, settings, Ledger()).map
+    away = moved_log(log, lift_se2(np.array([3.0, -2.0, 1.1])))
+    session = Session(settings, patient=True, known=PriorMap("yesterday", known)).start()
+    ReplayAdapter(session, away, None, session.wait).run(threading.Event())
+    there = {o.id: o for o in known}
+    for result, far in (
+        (pipeline.run(away, settings, Ledger(), known=PriorMap("yesterday", known)), 0.02),
+        (session.stop(), 1.0),
+    ):
+        assert result.summary["localisation"]["localised"]
+        assert {o.id for o in result.map} == there.keys()
+        turns = []
+        for o in result.map:
+            before = there[o.id]
+            least = min(far, 2 * (o.sigma + before.sigma))  # The end of a session explains the boxes a little otherwise.
+            assert np.linalg.norm(o.position - before.position) < least
+            assert np.linalg.norm(ray_point(o) - ray_point(before)) < least
+            turns.append((o.body.yaw - before.body.yaw + np.pi / 2) % np.pi - np.pi / 2)
+        assert np.median(np.abs(turns)) < 0.5  # The frames differ by 1.1 rad, and the yaws are hardly known.
+
+
+def ray_point(o):
+    return o.position if o.ray_point is None else o.ray_point

@@ -12,7 +12,6 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Association, Log, Trajectory
@@ -25,7 +24,7 @@ from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
+from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
 
 
@@ -67,15 +66,14 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     ids = _kept_ids(found.association, found.ids, solution.association)
-    objects = _with_ids(objects, ids)
+    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     where = None
     if known is not None:
         where = localize(solution, objects, known, errors, settings, ledger)
         if where.solution is not None and where.map_T_drive is not None:
-            solution, log = where.solution, moved_log(log, where.map_T_drive)
+            solution, objects, residual = describe_in_map(where, known, cameras, settings, ids)
+            log = moved_log(log, where.map_T_drive)
             keyframes, estimate = solution.keyframes, solution.estimate
-            described, residual = describe(solution, cameras, settings)
-            objects = with_map(_with_ids(described, ids), where, known)
     accepted = m.counters.accepted()
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
@@ -97,10 +95,6 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
         path=Trajectory(stamps, keyframes.map_T_base[first]),
         path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
-
-
-def _with_ids(objects: ObjectMap, ids: list[int]) -> ObjectMap:
-    return replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:

@@ -21,7 +21,7 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import update_positions
 from objslam.live.session.landmark_description import describe_landmark
-from objslam.mapping.localization import PriorMap, moved_object
+from objslam.mapping.localization import PriorMap, at_ray_points, moved_object
 
 _EVERY, _AT = 10, 9
 """The period of the search in keyframes, and the keyframe in each period. A longer period finds the map later. The keyframe
@@ -53,6 +53,8 @@ class MapLocator:
 
     def __init__(self, known: PriorMap | None, mapper: Mapper, counters: Counters) -> None:
         self._known, self._mapper, self._counters = known, mapper, counters
+        if known is not None:  # The landmarks of a session are where rays meet, and not the centres of bodies.
+            self._known = replace(known, objects=at_ray_points(known.objects))
         self._last: _Search | None = None
         self._matched: dict[int, int] = {}  # By id of a landmark: the index of its object in the prior map.
         self.told: InPriorMap | None = None
