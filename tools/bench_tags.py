@@ -1,6 +1,6 @@
 """Measure whether the sigmas of square fiducials hold the truth, on simulated drives past eight tags.
 
-    python tools/bench_tags.py [--seeds 25] [--noise 0.3 0.5] [--reach 1.6] [--unknown] [--mode joint]
+    python tools/bench_tags.py [--seeds 25] [--noise 0.3 0.5] [--reach 1.6] [--unknown] [--defaults] [--mode joint]
 
 The odometry has the noise of the settings. A line for each noise of the corners (px) says which share of the positions, the
 rotations and, with --unknown, the sizes has the truth inside its 95 % region. It also gives the median error of each, the
@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, nargs="+", default=[0.3, 0.5], help="standard deviation of a corner, px")
     parser.add_argument("--reach", type=float, default=1.6, help="least distance of a tag, m; the largest is 1.5 m more")
     parser.add_argument("--unknown", action="store_true", help="the sizes are not told")
+    parser.add_argument("--defaults", action="store_true", help="the noise is not told, and shared errors are estimated")
     parser.add_argument("--mode", choices=("joint", "fixed"), default="joint")
     options = parser.parse_args()
     for noise in options.noise:
@@ -55,9 +56,9 @@ def measured(drive: TagDrive, seed: int, noise: float, options: argparse.Namespa
         rng, off = np.random.default_rng(seed), np.zeros((len(log.odometry), 6))
         off[:, 2], off[:, 3:5] = 0.005 * rng.normal(size=len(off)), 0.02 * rng.normal(size=(len(off), 2))
         log = replace(log, odometry=None, localization=replace(log.odometry, poses=drive.map_T_base @ exp_se3(off)))
-    plain = ("output.recording=false", "checks.use=false", "association.method=by_label", "calibration.use=false")
-    fixed_noise = ("noise.rays=false", "noise.odometry=false", f"tags.corner_sigma={noise}", f"mode={options.mode}")
-    settings = load_settings(None, (*plain, *fixed_noise))
+    plain = ("output.recording=false", "checks.use=false", "association.method=by_label", f"mode={options.mode}")
+    told = ("calibration.use=false", "noise.rays=false", "noise.odometry=false", f"tags.corner_sigma={noise}")
+    settings = load_settings(None, (*plain, *(() if options.defaults else told)))
     sizes = {} if options.unknown else drive.side
     settings = settings.model_copy(update={"tags": settings.tags.model_copy(update={"sizes": sizes})})
     rows = []
