@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from tag_drives import SQUARE, TagDrive, make_tag_drive, scale_of
 
 from objslam.config import Settings, load_settings
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, make_pose
-from objslam.core.object_map import TagPose
 from objslam.core.result import RunResult
 from objslam.graph.factors.tags import tag_ties
 from objslam.graph.least_squares.square_rows import SquareRows

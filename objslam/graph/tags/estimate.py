@@ -7,9 +7,9 @@ import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
-from objslam.core.object_map import TagPose
 from objslam.core.rotation import quaternion_from_rotation, rotation_vector
 from objslam.core.types import Rays
 from objslam.graph.optimizers import indeterminate

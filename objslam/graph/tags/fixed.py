@@ -4,8 +4,8 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.rotation import quaternion_from_rotation
-from objslam.core.object_map import TagPose
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.tags.corner_rays import TagCorners
