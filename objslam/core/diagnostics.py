@@ -20,7 +20,7 @@ class Ledger:
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
-        """Add `count` drops for a reason.
+        """Count dropped data under a reason.
 
         of: the number of data that were checked, None if unknown. where: the file:line or stamp, kept for the first few
         drops only.

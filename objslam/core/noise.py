@@ -29,8 +29,8 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the odometry noise multiplied by its factors. The noise of rays and ranges stays, because
-        `rays_with_noise` multiplies it."""
+        """Return the settings with the odometry noise multiplied by its factors. `rays_with_noise` multiplies the noise of
+        rays and ranges."""
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -44,7 +44,7 @@ class NoiseFactors:
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with the noise of their directions and of their ranges multiplied by its factors."""
+        """Return rays whose noise of directions and ranges is multiplied by the factors."""
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,
@@ -69,11 +69,10 @@ NOMINAL = NoiseFactors()
 
 
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
-    """Return the standard deviations (n,), m, of ranges (n,), m, and those (n,), m, of the bias that all ranges of an object
-    share.
+    """Return two standard deviations for each of the ranges (n,), m: of its own noise (n,), m, and of the bias (n,), m, that
+    all ranges of an object share.
 
-    camera: (n,) the index of each range's camera. The ranges of a camera with `depth_noise` have this noise. The ranges of
-    the other cameras have the noise of the settings.
+    camera: (n,) the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]
