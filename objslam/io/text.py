@@ -116,7 +116,8 @@ def to_table(
 
 
 def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | None:
-    """Return the table of lines that all have `columns` numbers, None if some line has not. It is three times as fast."""
+    """Return the table of lines that all have `columns` numbers, None if some line has not. It is three times as fast as
+    parsing line by line."""
     lines = [text for _, text in numbered]
     if not lines or any("_" in text or not text.isascii() for text in lines):
         return None
@@ -144,7 +145,7 @@ def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) 
 
 
 def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
-    """Count as drops, under `reason`, the rows that `bad` (N,) marks. `places` has the place (file:line) of each row."""
+    """Count the rows that `bad` (N,) marks as drops under `reason`. places: (N,) the place (file:line) of each row."""
     rows = np.flatnonzero(bad).tolist()
     count_drops(reason, len(rows), (places[i] for i in rows), ledger)
 
