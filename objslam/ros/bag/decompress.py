@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 from objslam.ros.bag.records import MAX_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # The first bytes of zstd data.
-_PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. With a larger one, data over the limit take more.
+_PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. A larger piece takes more memory.
 
 
 class CorruptDataError(ValueError):

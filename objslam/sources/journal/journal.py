@@ -1,7 +1,7 @@
 """Write the journal: the files with all messages that a live session accepted.
 
 A message is accepted only when its record is in the kernel's cache, so a killed process loses no accepted message. The
-record is on the disk about `_SYNC_EVERY` later, so a power failure loses about the messages of that time. If the disk is
+record is on the disk about 1 s later (`_SYNC_EVERY`), so a power failure loses the messages of about 1 s. If the disk is
 nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without it.
 """
 

@@ -127,7 +127,7 @@ Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessag
 
 
 def encode_stop(reason: str) -> bytes:
-    """Encode the record that a session had to stop the journal, with the reason."""
+    """Encode the record that says why a session had to stop the journal."""
     return _STOP_KIND + json.dumps([reason]).encode()
 
 
