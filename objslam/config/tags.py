@@ -18,7 +18,7 @@ class Tags(Section):
     null: the size of this one is estimated."""
     corner_sigma: Positive = 1.0
     """Standard deviation of a corner per axis in px. A detector finds corners better than that. The rest is what the
-    calibration of a lens leaves. Where the noise of rays is estimated, it has the same factor."""
+    calibration of a lens leaves. An estimated factor on the noise of rays also multiplies this noise."""
 
     def size_of(self, label: str) -> float | None:
         """Return the side (m) of the fiducial with a label, None if it is not known."""

@@ -70,7 +70,7 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
         return None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python warns of some texts that it cannot parse either.
+            warnings.simplefilter("ignore")  # Python also warns of some texts that it cannot parse.
             data = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         try:

@@ -29,8 +29,8 @@ _UNNAMED = "the model names no classes: they are numbered (set detector.names)"
 
 
 def with_description(network: Network, settings: config.Detector) -> config.Detector:
-    """Return the settings, with unset values filled in from the model's own description. The description is optional. It is
-    in the model's metadata. Raises DetectorError if it is invalid."""
+    """Return the settings, with unset values filled in from the model's own description, if its metadata has one. Raises
+    DetectorError if the description is invalid."""
     text = network.metadata.get(DESCRIPTION)
     if text is None:
         return settings
@@ -117,7 +117,7 @@ def _habits(
     """Return the usual properties of models of the layout, changed for families of models with other properties."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
-        habits = replace(habits, resize="none")  # such models resize the image themselves
+        habits = replace(habits, resize="none")  # An ssd model of free size resizes the image itself.
     if _is_tensorflow(roles):
         habits = replace(habits, box_form="yxyx", box_units="fractions")
     if layout == "end_to_end" and facts.ultralytics_detr:

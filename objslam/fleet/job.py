@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
 
 _INPUTS = "inputs"
-"""The folder of the files that settings name, in a store that is no folder of this machine."""
+"""The folder, in a remote store, of the files that settings name."""
 
 
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:

@@ -12,7 +12,7 @@ from objslam.fleet.stores.open_store import open_source
 from objslam.fleet.stores.store import FileState
 
 DEFAULT_LAYOUT = "{site}/{log}"
-"""The default layout: the folder that holds a log is its site."""
+"""The default of --layout: the folder that holds a log is its site."""
 NO_SITE = "all"
 """The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
 _LOG_MARKS = {
@@ -95,7 +95,7 @@ class Layout:
 def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
     """Return the logs that paths, glob patterns and URLs name, each once, in order.
 
-    A folder that is no log is searched. A path that is named and has no log counts as one: its run says what is wrong with
+    A folder that is no log is searched. A named path without a log counts as a log, so that its run says what is wrong with
     it. Of the files that a pattern names, only bags count. LogError if a source names nothing, ConfigError if a path does
     not fit the layout.
     """
@@ -116,7 +116,8 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
 
 
 def _split(files: Mapping[str, FileState]) -> Iterator[tuple[str, dict[str, FileState]]]:
-    """Yield the relative path of each log among files, with the files of the log. If there is no log, all files are one.
+    """Yield the relative path of each log among files, with the files of the log. If there is none, all files count as one
+    log.
 
     A log inside another log is a part of the outer one.
     """

@@ -64,7 +64,7 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return what the table of sites says of the sessions of a site that this run has."""
+    """Return the columns of the table of sites that come from the sessions of a site in this run."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),

@@ -27,7 +27,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What became of one log.
+    """The outcome of one log.
 
     key: of the content, the settings and the version. source: the path or URL of the log. log: the hash of its content.
     settings: the digest of the job. error: what is wrong with the log, empty if it was mapped. begin, end: the first and the

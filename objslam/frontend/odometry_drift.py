@@ -16,7 +16,7 @@ Length = TypeVar("Length", float, Floats)
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
     """Return the settings with the odometry noise for distances that are longer by the error "odometry.scale".
 
-    error: by name. If the noise stayed the same, the noise relative to the distances would depend on the size of the map.
+    error: by name. The ratio of noise to distance stays the same, so it does not depend on the size of the map.
     """
     way = 1 + error.get("odometry.scale", 0.0)
     if way == 1:
@@ -60,7 +60,7 @@ class DriftPath:
         self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
         px, py = places[1:, 0], places[1:, 1]
         one, none = np.ones_like(px), np.zeros_like(px)
-        # The factors of a step's variances of yaw, x and y, by the numbers in `_PLANAR`.
+        # How each variance of a step (of yaw, x, y) adds to the six distinct elements of the covariance, see `_PLANAR`.
         self._parts = (
             np.stack([one, py, -px, py * py, -px * py, px * px], axis=1),
             np.stack([none, none, none, c * c, c * s, s * s], axis=1),

@@ -1,6 +1,6 @@
 """The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations.
 
-The parameters change the measurements. They do not change the kinds of factors in the graph.
+The errors are parameters of the measurements. The graph has the same factors with and without them.
 """
 
 from collections.abc import Mapping
@@ -74,9 +74,9 @@ class SharedErrors:
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
-        """The names of the scales, if every measured length has an unknown scale. The set is empty if not.
+        """The names of the scales, if every measured length has an unknown scale, else an empty set.
 
-        If it is not empty, the log cannot tell a factor that all lengths have in common.
+        With unknown scales alone, the log does not determine the size of its map.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return frozenset()
@@ -206,7 +206,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # The stamps of the poses, which are all on the path.
+        known = stamps.copy()  # The stamps at which the poses are taken, all within the time of the path.
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)
@@ -270,8 +270,8 @@ class SharedErrors:
 class _Poses:
     """The poses (K, 4, 4) of K keyframes, corrected for the errors of clocks and odometry.
 
-    stamps: (K,) s, of the images. known: (K,) s, of the poses, which are all on the path. base_T_camera: not yet corrected
-    for the errors of the camera's rotation and place.
+    stamps: (K,) s, of the images. known: (K,) s, at which the poses are taken, all within the time of the path.
+    base_T_camera: not yet corrected for the errors of the camera's rotation and place.
     """
 
     stamps: Floats

@@ -23,7 +23,7 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
+    """The outcome of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
 
     kind: `memory`, `time`, `lost`, `store` or `error`, empty after a success.
     """
@@ -68,7 +68,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
         own = threading.local()
         with ExitStack() as stack:
             pool = stack.enter_context(ThreadPoolExecutor(jobs, "objslam fleet"))
-            closing = stack.enter_context(ExitStack())  # It ends the processes before the pool waits for its threads.
+            closing = stack.enter_context(ExitStack())  # Closed before the pool, whose threads wait for the processes.
 
             def task(argument: Any) -> Answer:
                 if not hasattr(own, "worker"):

@@ -27,7 +27,7 @@ from objslam.errors import ObjslamError
 _WATCH = 0.05
 """The pause between two looks at memory and time, s. A larger value costs less, and ends a task later."""
 _TIRED = 0.5
-"""The share of the memory limit that a process may still have after a task. A process that has more is replaced, so that the
+"""The share of the memory limit that a process may still use after a task. A process that uses more is replaced, so that the
 next task has its memory. A larger share replaces processes less often."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """The environment variables that give numerical libraries one thread, because each core has a process of its own."""

@@ -18,10 +18,10 @@ _TRIES = 5
 _PAUSE = 0.1
 """The pause after the first failure, s; it doubles after each further one. A larger value gives a busy store more rest."""
 _STAMPS = ("ETag", "etag", "md5Hash", "crc32c", "generation", "content_settings", "mtime", "LastModified", "created")
-"""The keys under which file systems of fsspec say what changes with the content of a file, the best first."""
+"""The keys in fsspec's information on a file whose values change with its content, the most reliable first."""
 _MAGIC = re.compile(r"[*?\[]")  # The marks of a pattern.
 _SAFE = re.compile(r"(?!(.*/)?\.\.?(/|$))[^\0]*")
-"""The names of files that stay below their folder: none of their parts is . or .. ."""
+"""The names of files that stay below their folder: no part of the name is "." or ".."."""
 
 _T = TypeVar("_T")
 
