@@ -30,8 +30,8 @@ class RayNoise(Section):
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
-    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object,
-    so the box is dropped and counted. A negative value keeps such boxes."""
+    """Distance in px from the image edge within which a box counts as cut off. The centre of such a box is not the centre of
+    its object, so the box is dropped and counted. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
     """Distance from the image edge within which a box also counts as cut off, as a share of the box width or height.
     Detectors often end a cut box short of the edge."""
@@ -135,8 +135,8 @@ class Bodies(Section):
     """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
 
     use: bool = True
-    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, it is the
-    point at which the rays through the centres of its boxes meet."""
+    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, the
+    position is the point at which the rays through the box centres meet."""
     sizes: dict[str, tuple[Positive, Positive, Positive]] = Field(default_factory=dict)
     """Known length, width and height in m by label. The sizes of other labels are learnt from the log."""
 

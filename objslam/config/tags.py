@@ -11,8 +11,8 @@ class Tags(Section):
     use: bool = True
     """Use the corners. false: a fiducial is a point where its diagonals meet, as other objects are."""
     size: Positive | None = None
-    """Side in m of every fiducial, from corner to corner as the detector reports them. It gives the map its scale. null: the
-    size of each fiducial is estimated, in the scale that the poses have."""
+    """Side in m of every fiducial, from corner to corner as the detector reports them. This length gives the map its scale.
+    null: the size of each fiducial is estimated, in the scale that the poses have."""
     sizes: dict[int | str, Positive | None] = Field(default_factory=dict)
     """Sides in m of single fiducials, instead of `size`. A key is the number in the label (12 for tag_12) or a whole label.
     null: the size of this one is estimated."""

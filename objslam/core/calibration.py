@@ -99,8 +99,8 @@ class Calibration:
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
     """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
 
-    A parameter that only some logs have is estimated from these logs. Its prior is the prior of the first log that has it,
-    given the parameters that earlier logs have too.
+    A parameter that only some logs have is estimated from these logs. Its prior is from the first log that has it,
+    conditional on the parameters that this log shares with earlier logs.
     """
     names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
     prior, prior_vector, told, told_vector = (np.zeros((len(names),) * axes) for axes in (2, 1, 2, 1))
@@ -171,8 +171,8 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def unknown_scales(self) -> frozenset[str]:
-        """The scale parameters of a log that does not determine the scale of its map, else an empty set. It does not if each
-        kind of measured length has such a parameter, and no absolute pose is measured."""
+        """The scale parameters, if the log leaves the scale of its map open, else an empty set. The scale is open if each
+        kind of measured length has a scale parameter, and no absolute pose is measured."""
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""

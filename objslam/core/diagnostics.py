@@ -22,8 +22,7 @@ class Ledger:
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
         """Count dropped data under a reason.
 
-        of: the number of data that were checked, None if unknown. where: the file:line or stamp, kept for the first few
-        drops only.
+        of: the number of data that were checked, None if unknown. where: file:line or stamp, kept for the first drops.
         """
         reason = one_line(reason)
         if of is not None:

@@ -90,8 +90,7 @@ def log_se3(pose: Floats) -> Floats:
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """Return the norms of the rotation half (N,), rad, and of the translation half (N,), m, of `log_se3` of poses
-    (N, 4, 4)."""
+    """Return the norms of the halves of `log_se3` of poses (N, 4, 4): rotation (N,), rad, and translation (N,), m."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))
@@ -127,8 +126,8 @@ def exp_se3(twist: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles (..., 1, 1) of vectors (..., 3), which of them are small and need a series, and the angles
-    with 1 in place of the small ones, as divisors."""
+    """Return for rotation vectors (..., 3) three arrays (..., 1, 1): the angles, whether each is so small that a series is
+    needed, and the angles as divisors, with 1 for the small ones."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)
@@ -212,8 +211,7 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 
 
 def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
-    """Return the rotation (3, 3) that maximises the sum of the dot products of the rotated `a` (N, 3) with `b` (N, 3), and
-    this sum."""
+    """Return the rotation (3, 3) of `a` (N, 3) with the largest sum of dot products with `b` (N, 3), and this sum."""
     u, size, vt = np.linalg.svd(b.T @ a)
     if size[0] > 0 and size[1] <= _ON_A_LINE * size[0]:
         from scipy.spatial.transform import Rotation

@@ -69,8 +69,8 @@ NOMINAL = NoiseFactors()
 
 
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
-    """Return two standard deviations for each of the ranges (n,), m: of its own noise (n,), m, and of the bias (n,), m, that
-    all ranges of an object share.
+    """Return the standard deviations (n,) of ranges (n,) and of their biases (n,), all in m. All ranges of an object share
+    one bias.
 
     camera: (n,) the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """

@@ -124,8 +124,8 @@ class MapObject:
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: its history over several sessions,
     None in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
-    heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its boxes meet.
-    None if this is the position: then the position is not the centre of a body.
+    heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its boxes meet,
+    None if that is the position itself.
     """
 
     id: int

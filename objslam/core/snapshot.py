@@ -33,7 +33,7 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class InPriorMap:
-    """What a session knows about its place in a prior map.
+    """The place of a session in a prior map.
 
     objects: how many of its objects were found there, 0 while the place is unknown. line: a sentence for the user, with this
     number and the evidence, or with the reason why the place is unknown.

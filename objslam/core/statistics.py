@@ -26,8 +26,8 @@ OUTLIER_RAY = 4.0
 """The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""The largest deviation that one ray adds to the measured noise of its object. A larger deviation lets a false box raise
-this noise more."""
+"""A ray with a larger deviation counts as one with this deviation in the measured noise of its object. A larger value lets a
+false box raise this noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives rays of other things more influence."""
@@ -45,7 +45,8 @@ NORMAL_MEDIAN = 0.6745
 """The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
 NOISE_FACTORS = (1.0, 3.0)
 """The limits on the factor by which association multiplies the nominal noise of an object's rays. The lower limit is 1,
-because box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
+because a median underestimates the heavy tails of box noise. A larger upper limit accepts rays that are farther from a noisy
+object."""
 MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
@@ -59,8 +60,7 @@ keeps objects near the nominal noise for longer."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
-    """Return for each group (N,) a factor >= 1 on the nominal noise of its rays. It comes from the median of their
-    deviations (R,).
+    """Return for each group (N,) a factor >= 1 on the nominal noise of rays, from the median of their deviations (R,).
 
     index: (R,) the group of each ray. count: the number of groups, N. A group of fewer than `fewest` rays has the factor 1.
     """

@@ -64,8 +64,8 @@ class Round:
 class Trace:
     """A collector of the rounds of an estimation.
 
-    base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: how many positions of an iteration are objects.
-    The positions behind them, such as further corners of fiducials, are left out. None means all.
+    base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: the number of objects, which are the first
+    positions of an iteration. The positions behind them, such as further corners of fiducials, are left out. None keeps all.
     """
 
     base_T_camera: Floats
@@ -82,7 +82,7 @@ class Trace:
         self._iterations.append(step)
 
     def aside(self) -> Trace:
-        """Return an empty trace for an attempt. `take` adds it if the attempt succeeds."""
+        """Return an empty trace for an attempt that may fail."""
         return Trace(self.base_T_camera, self.count)
 
     def take(self, attempt: Trace) -> None:

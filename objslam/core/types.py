@@ -56,10 +56,10 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge.
-    Then box centres are valid up to the edge. This holds for fiducials, because a detector needs all their corners.
-    corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if
-    no box has corners. ValueError if a shape, an index or the order is wrong.
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
+    as with fiducials, of which a detector needs all corners. Then box centres are valid up to the edge. corners: (M, 4, 2)
+    px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has corners.
+    ValueError if a shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -163,8 +163,7 @@ class Log:
 
     @property
     def robot_path(self) -> Trajectory | None:
-        """The path on which keyframes get their first poses: the localisation if it has poses, else the odometry, else
-        None."""
+        """The path that gives keyframes their poses: the localisation if it has poses, else the odometry, else None."""
         return next((path for path in (self.localization, self.odometry) if path is not None and len(path)), None)
 
 

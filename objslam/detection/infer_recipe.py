@@ -1,4 +1,4 @@
-"""Inference of a model's recipe. The settings override the model's own description. This description overrides the usual
+"""Inference of a model's recipe. The settings override the model's own description, and the description overrides the usual
 recipe of the layout."""
 
 import json
@@ -21,7 +21,7 @@ DESCRIPTION = "objslam.detector"
 
 _USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
 _SIZE = 640  # The width and height of an input of free size, px, if the settings and the metadata have no size.
-_LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. It bounds memory.
+_LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. The limit bounds memory.
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.

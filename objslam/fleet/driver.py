@@ -26,12 +26,12 @@ _CHUNK = 500
 
 Stage = Literal["mapping", "merging"]
 Tell = Callable[[Stage, int, int, int], None]
-"""A function that is called with the stage, and with the numbers of its tasks that succeeded, that failed, and of all."""
+"""A function that is called with the stage, and with how many of its tasks succeeded, failed and exist."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """What the driver keeps of a log that was mapped.
+    """The driver's summary of a mapped log.
 
     key: of the result. begin: the first stamp of the path, s. warnings: their number. seconds: of the task, s. report:
     whether the result has a report.html. new: whether this run mapped the log.

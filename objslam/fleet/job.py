@@ -1,4 +1,4 @@
-"""Make the job that all logs of a fleet share, from the settings of the user and the files that the settings name."""
+"""Make the job that all logs of a fleet share, from the settings of the user and the files that they name."""
 
 from __future__ import annotations
 

@@ -43,8 +43,7 @@ class Layout:
     """The folders above a log, as "{site}/{robot}/{day}/{log}". Each {name} is one part of a path."""
 
     def __init__(self, template: str, by: str) -> None:
-        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`
-        for one site of all logs.
+        """by: what names the site: a field of the layout, `folder` for the folder of the log, or `none` for one site of all.
 
         ConfigError for a wrong template or field.
         """
@@ -116,8 +115,7 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
 
 
 def _split(files: Mapping[str, FileState]) -> Iterator[tuple[str, dict[str, FileState]]]:
-    """Yield the relative path of each log among files, with the files of the log. If there is none, all files count as one
-    log.
+    """Yield the relative path of each log among files, with the files of the log. If there is none, all files are one log.
 
     A log inside another log is a part of the outer one.
     """

@@ -1,6 +1,6 @@
 """fleet.html: the sites, the failures, the drift of each robot's calibration, and links to the results.
 
-The page needs no network. What it shows of logs is escaped, because names come from strangers.
+The page needs no network. Texts from logs are escaped, because strangers chose the names in them.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ def result_name(key: str) -> str:
 
 
 def seen_name(task: str, key: str, good: bool) -> str:
-    """Return the name of the empty file that says which key a log has, and whether it was mapped (`good`).
+    """Return the name of an empty file. The name says which key a log has, and whether the log was mapped (`good`).
 
     task: the key of the log's fingerprint and the job, which is known before the log is read.
     """

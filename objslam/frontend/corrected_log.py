@@ -79,7 +79,7 @@ class CorrectablePath:
 class OdometryCorrection:
     """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose stays.
 
-    A session corrects every pose. For a single pose, this takes a fraction of the time of `corrected_odometry`.
+    A session corrects every pose, and this takes a fraction of the time of `corrected_odometry`.
     """
 
     def __init__(
@@ -158,8 +158,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data, corrected by the errors. path: the path on which its stamps stay (see `later`), or
-    None."""
+    """Return a camera and its data, corrected by the errors. path: on this path its stamps stay (see `later`)."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

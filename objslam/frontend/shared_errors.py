@@ -1,7 +1,4 @@
-"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations.
-
-The errors are parameters of the measurements. The graph has the same factors with and without them.
-"""
+"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -56,7 +53,8 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements.
+        """The kinds of noise that are estimated: those that the settings let be estimated, if the log has their
+        measurements.
 
         The set is empty in fixed mode, and if odometry is not used.
         """

@@ -14,8 +14,8 @@ from objslam.io.text import drop_rows, in_order
 @dataclass
 class BoxCollector:
     """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1. The corners of
-    fiducials are known by the index of their box.
-    Each frame and box has a place, such as file:line. The ledger shows the place if the frame or box is dropped."""
+    fiducials are stored by the index of their box. Each frame and box has a place, such as file:line. The ledger shows the
+    place if the frame or box is dropped."""
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)

@@ -1,6 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a number, although YAML 1.1 reads it as text.
+The reader uses YAML nodes, because they keep line numbers. The reader takes 1e-05 as a number. In YAML 1.1 it is text.
 """
 
 import math

@@ -154,7 +154,7 @@ def _load(file: Path) -> dict[str, Any]:
         raise _Malformed(f"not UTF-8 text (byte {error.start})") from error
     except json.JSONDecodeError as error:
         raise _Malformed(f"not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
-    except (ValueError, RecursionError) as error:  # An integer has thousands of digits, or brackets are deeply nested.
+    except (ValueError, RecursionError) as error:  # Integers of thousands of digits and deeply nested brackets raise these.
         raise _Malformed(f"not JSON that can be read: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
         raise _Malformed('not an objects file: a mapping with a list under "objects" is needed')

@@ -71,8 +71,8 @@ class CourseSettings(Section):
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift. config.Odometry: by distance and turn, without the floors. PoseNoise: by the time of one image. None: no
-    odometry."""
+    """The drift. config.Odometry: noise by distance and turn, without its floors. PoseNoise: noise in the time between two
+    images. None: no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 

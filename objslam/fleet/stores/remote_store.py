@@ -183,7 +183,7 @@ class RemoteSource:
         return isinstance(self._fs, AsyncFileSystem) and type(self._fs)._find is not AsyncFileSystem._find
 
     def _walk(self, root: str) -> dict[str, Any]:
-        """Return every file below a path, folder by folder, so that a call that fails is tried again alone."""
+        """Return every file below a path. Folders are listed one by one, and only a listing that fails is repeated."""
         found, left = {}, [root]
         while left:
             for name, info in self._inside(left.pop()).items():

@@ -54,10 +54,10 @@ def put_back(aside: Path, file: Path) -> bool:
 def restore_after_kill(file: Path) -> Path | None:
     """Put back the newest journal that was set aside, if `file` is the empty journal of a session that was killed.
 
-    A session sets the earlier journal aside before it has a message of its own. If it is killed before that message, it
-    leaves an empty journal, from which a resumed session would get nothing. Returns the path from which the journal came,
-    None if nothing was renamed. If another session has the empty journal open, nothing is renamed. Raises OutputError if the
-    journal cannot be renamed.
+    A session sets the earlier journal aside before its own first message. If it is killed before that message, it leaves an
+    empty journal, and a resumed session would start from nothing. Returns the path from which the journal came, None if
+    nothing was renamed. If another session has the empty journal open, nothing is renamed. Raises OutputError if the journal
+    cannot be renamed.
     """
     numbered = re.compile(rf"{re.escape(file.stem)}\.[0-9]+{re.escape(file.suffix)}")
     with refusals("put an earlier journal back", file):

@@ -222,7 +222,7 @@ def _locked(file: Path) -> int:
         except OSError:
             os.close(stream)
             raise
-        os.close(stream)  # The next segment replaced the file before it was locked.
+        os.close(stream)  # The next segment replaced this file before the lock.
 
 
 def _existing(file: Path) -> tuple[Header | None, int, int]:

@@ -25,7 +25,7 @@ from objslam.sources.journal.segments import Segment, compress, identity_of, jou
 
 @dataclass(frozen=True)
 class Check:
-    """What is in a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
+    """The content of a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
 
     records: the number of undamaged records. unknown: how many of them this version of objslam cannot read. damaged: the
     bytes that belong to no undamaged record. start, end: the least and the greatest stamp, s, None without stamps.
