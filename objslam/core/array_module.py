@@ -1,7 +1,7 @@
 """Functions that work on numpy arrays and on torch tensors alike, and the choice between the two libraries.
 
-Code for both calls the functions of `module_of(array)`, with `axis=` and positional arguments. torch is imported only if it
-may be used.
+Such code takes the library of an array from `module_of`, and gives it `axis=` and positional arguments, which both accept.
+torch is imported only if it may be used.
 """
 
 from __future__ import annotations

@@ -277,7 +277,7 @@ def _fisheye_radius(camera: Camera) -> Floats:
 def _growth(camera: Camera, angle: Floats) -> Floats:
     """Return how fast (A,) the image radius grows at angles (A,), rad. Beyond the fold this is <= 0.
 
-    It is the derivative by the angle for a fisheye, else by its tangent, in the image direction where it is least.
+    For a fisheye it is the derivative by the angle, else the least derivative by tan(angle) over all image directions.
     """
     with np.errstate(all="ignore"):  # A wrong calibration may overflow.
         if camera.fisheye:

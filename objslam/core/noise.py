@@ -17,7 +17,7 @@ class NoiseFactors:
 
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
-    odometry's noise of the heading. shrinkage: the share by which a joint solve makes all lengths too short (0: by nothing).
+    odometry's noise of the heading. shrinkage: the share by which a joint solve makes all lengths too short.
     """
 
     rays: float = 1.0
@@ -29,7 +29,7 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the odometry noise multiplied by its factors. `rays_with_noise` multiplies the noise of
+        """Return the settings with the odometry noise multiplied by the factors. `rays_with_noise` multiplies the noise of
         rays and ranges."""
         of = nominal.odometry
         odometry = {

@@ -173,12 +173,12 @@ class Keyframes:
 
     stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, this holds for each camera alone. camera: (K,)
     index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4).
-    map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: the mean
-    number of keyframes, at least 1, whose poses are interpolated from one measurement of the absolute pose, or 0 if
-    map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry.
-    drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its start, in the frame of odom_T_base.
-    stretch: (K,) the number of the odometry stretch of each keyframe, where gaps split the odometry into stretches. None
-    means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning.
+    map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
+    keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. odom_T_base:
+    (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry. drift: (K, 6, 6) covariance,
+    rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the number of the
+    odometry stretch of each keyframe, where gaps split the odometry into stretches. None means one stretch for all. -1 marks
+    a keyframe without odometry, whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats

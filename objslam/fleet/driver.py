@@ -26,7 +26,7 @@ _CHUNK = 500
 
 Stage = Literal["mapping", "merging"]
 Tell = Callable[[Stage, int, int, int], None]
-"""A function that is called with the stage, and with how many of its tasks succeeded, failed and exist."""
+"""A function that is called with the stage, and with three counts of its tasks: succeeded, failed, all."""
 
 
 @dataclass(frozen=True, slots=True)

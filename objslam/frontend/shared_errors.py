@@ -24,8 +24,9 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""A parameter may be as large as its absolute prior mean plus this many standard deviations of its prior. MOST_SCALE bounds
-scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its prior."""
+"""The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
+MOST_SCALE bounds scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its
+prior."""
 
 
 _KEPT = 9
@@ -53,8 +54,7 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: those that the settings let be estimated, if the log has their
-        measurements.
+        """The kinds of noise that are estimated: those that the settings allow, if the log has their measurements.
 
         The set is empty in fixed mode, and if odometry is not used.
         """

@@ -94,7 +94,7 @@ class DriveSettings(CourseSettings):
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """The least number of images, of all cameras together, that show a random object, as a share of one camera's images."""
+    """How many images of all cameras must show each random object, as a share of the number of images of one camera."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""

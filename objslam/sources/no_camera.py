@@ -1,4 +1,4 @@
-"""The error for a recording that has a path of the robot, but no camera. The path and the cameras' poses in tf are in it."""
+"""The error for a recording that has a path of the robot, but no camera. It carries the path, and poses of cameras in tf."""
 
 from __future__ import annotations
 

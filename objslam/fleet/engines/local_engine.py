@@ -23,9 +23,9 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The outcome of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
+    """The outcome of one task. value: what the function returned, None after a failure. message: of the failure.
 
-    kind: `memory`, `time`, `lost`, `store` or `error`, empty after a success.
+    kind: of the failure, `memory`, `time`, `lost`, `store` or `error`, empty after a success.
     """
 
     argument: Any
@@ -38,8 +38,8 @@ Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
 """A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
 
 _QUEUED = 2
-"""The most tasks of each process that are submitted and not answered yet. A larger number hides a slow source of
-arguments."""
+"""The most tasks of each process that are submitted and not answered yet. A larger number keeps processes busy while
+arguments come slowly."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:

@@ -36,7 +36,7 @@ WORK = "objslam.fleet.tasks.map_task:map_one"
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """The part of its tasks that all logs of a fleet have in common.
+    """The part that the tasks of all logs of a fleet share.
 
     store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
     log. files: the dotted key of each setting that names a file, or `detector`, with the path of the file, or with its name

@@ -49,7 +49,7 @@ class Placed:
 
     key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among the
     earlier sessions, NaN for the first. If it is the first of a part of the site, the evidence is that of the whole part.
-    common: how many of its objects other sessions had in the first merge that found any.
+    common: how many of its objects other sessions share, from the first merge with any.
     """
 
     key: str
@@ -126,7 +126,8 @@ def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
 
 
 def _session(part: SiteMap, load: Any) -> Session:
-    """Return an island as a session of the next merge. Its visits are loaded when an object may have been missed."""
+    """Return an island as a session of the next merge. The data of its own sessions are loaded only if an object may have
+    been missed."""
     from objslam.core.geometry import inverse
     from objslam.mapping.sites.session import Session, Visit
 

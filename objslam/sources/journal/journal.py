@@ -31,7 +31,7 @@ from objslam.sources.journal.segments import compress, identity_of, new_file, se
 
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
 _EARLY = 2.0  # A warning comes at this many times the free space at which the journal stops. A larger value warns earlier.
-_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share ends it earlier on a small disk.
+_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share stops it earlier on a small disk.
 _MB = 1_000_000
 
 
