@@ -17,8 +17,8 @@ class Tags(Section):
     """Sides in m of single fiducials, instead of `size`. A key is the number in the label (12 for tag_12) or a whole label.
     null: the size of this one is estimated."""
     corner_sigma: Positive = 1.0
-    """Standard deviation of a corner per axis in px. A detector finds corners better than that. The rest is what the
-    calibration of a lens leaves. An estimated factor on the noise of rays also multiplies this noise."""
+    """Standard deviation of a corner per axis in px. It covers the error of the detector, which is smaller, and the error
+    that a lens calibration leaves. An estimated factor on the noise of rays also multiplies this noise."""
 
     def size_of(self, label: str) -> float | None:
         """Return the side (m) of the fiducial with a label, None if it is not known."""

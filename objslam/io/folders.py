@@ -15,7 +15,7 @@ OLD = "old"
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """If the block raises an error, delete `path` and its parent folders, if the block created them and left them empty."""
+    """If the block raises an error, delete those of `path` and its parent folders that the block created and left empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

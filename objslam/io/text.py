@@ -16,7 +16,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
-_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason. The ledger keeps no more.
+_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
