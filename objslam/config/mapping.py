@@ -97,8 +97,8 @@ class AssociationSettings(Section):
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
     joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects, and is
-    slower."""
+    """Number of ray pairs whose points are tested per label in one pass. A larger value is slower and finds rarer
+    objects."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5

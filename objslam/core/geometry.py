@@ -211,8 +211,7 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 
 
 def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
-    """Return the rotation R (3, 3) with the largest sum of dot products of R a and b, for `a` and `b` (N, 3), and this
-    sum."""
+    """Return the rotation R (3, 3) with the largest sum of dot products of R a and b, both (N, 3), and this sum."""
     u, size, vt = np.linalg.svd(b.T @ a)
     if size[0] > 0 and size[1] <= _ON_A_LINE * size[0]:
         from scipy.spatial.transform import Rotation

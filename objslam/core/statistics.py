@@ -45,7 +45,7 @@ NORMAL_MEDIAN = 0.6745
 """The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
 NOISE_FACTORS = (1.0, 3.0)
 """The limits on the factor by which association multiplies the nominal noise of an object's rays. The lower limit is 1,
-because a median underestimates the heavy tails of box noise. A larger upper limit accepts rays that are farther from a noisy
+because a median underestimates the heavy tails of box noise. A larger upper limit accepts rays farther from a noisy
 object."""
 MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the

@@ -48,7 +48,7 @@ class Round:
     """One association and the estimate from it.
 
     why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
-    poses, `merge` for merged copies of one object, `bodies` for bearings to the centres of bodies. map_T_base: (K, 4, 4).
+    poses, `merge` for merged copies of one object, `bodies` for bearings to bodies' centres. map_T_base: (K, 4, 4).
     positions: (N, 3) m. weight: (R,) of each ray.
     """
 

@@ -149,8 +149,7 @@ def is_name(value: object) -> bool:
 
 
 def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
-    """Return the rules for boxes (M, 4), px. Each rule has a mask (M,) of the boxes that keep it, and the reason to drop the
-    others.
+    """Return the rules for boxes (M, 4), px. Each has a mask (M,) of the boxes that keep it, and the reason to drop others.
 
     scores: (M,). names: (M,) whether the label of each box `is_name`.
     """

@@ -53,8 +53,7 @@ def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
 
     if len(boxes) == 0:
         return np.zeros(0, dtype=np.int64)
-    # OpenCV keeps labels apart by offsets of the largest coordinate. Negative coordinates break this, so all boxes are
-    # moved.
+    # OpenCV keeps labels apart by offsets of the largest coordinate, so no coordinate may be negative.
     boxes = boxes - np.tile(boxes.reshape(-1, 2).min(axis=0), 2)
     sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxesBatched(sized, scores.astype(np.float32), label.astype(np.int32), -1.0, iou)  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ _STEP = 0.01
 """The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
 """The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
-MOST_SCALE bounds scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its
+MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
 prior."""
 
 

@@ -15,8 +15,7 @@ _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
 robots look up or down by less. A larger angle takes z more often."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
-"""The axes that point to the right and to the top of a view from above. With the axis towards the viewer, they form a
-right-handed frame."""
+"""The axes that point right and to the top of a view from above. With the axis to the viewer, they are right-handed."""
 
 
 def up_axis(keyframes: Keyframes) -> Up:

@@ -135,8 +135,7 @@ def beside(path: Path) -> Iterator[Path]:
 def check_target(path: Path, overwrite: bool) -> None:
     """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced.
 
-    The remains of killed processes beside `path` are removed first. If a process was killed while it replaced a log, the log
-    is put back.
+    The remains of killed processes beside `path` are removed first. A log that a killed process was replacing is put back.
     """
     with _writing(path):
         remove_leftovers(Path(os.path.realpath(path)))

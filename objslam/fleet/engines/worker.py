@@ -1,9 +1,8 @@
 """A process that does one task after another, with a limit of memory and of time for each.
 
 A task is a function, named as "module:function", and one argument. The limits are watched from outside, because native code
-neither returns to Python nor lets another thread of its process run. The limit of memory is for the RAM of the process.
-RLIMIT_AS and RLIMIT_DATA cannot set it, because they count what libraries reserve: 2.0 and 1.35 GB for a process that uses
-0.28 GB.
+neither returns to Python nor lets another thread of its process run. The memory is the RAM of the process. RLIMIT_AS and
+RLIMIT_DATA do not limit it: they count what libraries reserve, 2.0 and 1.35 GB for a process that uses 0.28 GB.
 """
 
 from __future__ import annotations

@@ -126,8 +126,7 @@ def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
 
 
 def _session(part: SiteMap, load: Any) -> Session:
-    """Return an island as a session of the next merge. The data of its own sessions are loaded only if an object may have
-    been missed."""
+    """Return an island as a session of the next merge. Its sessions are loaded only if an object may have been missed."""
     from objslam.core.geometry import inverse
     from objslam.mapping.sites.session import Session, Visit
 
