@@ -69,7 +69,7 @@ NOMINAL = NoiseFactors()
 
 
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
-    """Return the standard deviations (n,) of ranges (n,) and of their biases (n,), all in m. An object has one bias.
+    """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
 
     camera: (n,) the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """

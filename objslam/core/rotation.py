@@ -8,8 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 _SMALL = 1e-4
-"""If the sine of half a rotation angle is smaller, a series replaces the quotient of angle and sine, which would become
-0 / 0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
+"""If the sine of half a rotation angle is smaller than this, a series replaces angle / sine, which tends to 0 / 0. A larger
+value makes the series less exact. At this value, its relative error is below 1e-17."""
 
 
 def _cross_product_map() -> Floats:

@@ -116,7 +116,7 @@ def encode(text: str) -> bytes:
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """Turn OSError into OutputError with the name of the failing file, or of `path` if it names none or `only` is set."""
+    """Turn OSError into OutputError with the name of the failing file. With `only`, or if it is unknown, `path` is named."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
 """The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
 
-An engine is a function of the work, as "module:function", and of the arguments. It never holds more than a bounded number of
-arguments and answers, so that a fleet of any size needs the memory of a small one.
+An engine is called with the name of a function, "module:function", and its arguments. It never holds more than a bounded
+number of arguments and answers, so that a fleet of any size needs the memory of a small one.
 """
 
 from __future__ import annotations
