@@ -145,7 +145,7 @@ def _keep_inside(sockets: set[int]) -> None:
 
 
 def _listen(reading: int, unread: Counter[str]) -> None:
-    """Count the payloads that the library rejects when it checks their types. reading: the pipe with its log."""
+    """Count the payloads that the library rejects, from its log. reading: the file descriptor of a pipe with this log."""
     with os.fdopen(reading, errors="replace") as lines:
         for line in lines:
             if match := _FAILED.search(line):

@@ -82,7 +82,7 @@ class Describer:
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
-    """Return a snapshot of a map. lag: as in `Snapshot`, s. whole: as in `Describer.map`."""
+    """Return a snapshot of a map. lag: `Snapshot.lag`, s. whole: ignore the time budget of the descriptions."""
     return Snapshot(
         stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
         map=describer.map(m, whole),
@@ -107,7 +107,7 @@ def _path(m: MapState) -> Trajectory:
 
 
 def _map_T_odom(m: MapState) -> Floats | None:
-    """Return `Snapshot.map_T_odom`. The odometry is the received one, with its errors, as tf has no other."""
+    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as received, which tf has. None in a gap of the odometry."""
     k, driven = m.keyframes, m.course.driven
     if not len(k) or not len(driven):
         return None
