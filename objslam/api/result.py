@@ -98,7 +98,7 @@ class Result:
         found = self.summary.get("assessment")
         if found is None:
             raise OutputError("this result is from an older version, without an assessment", hint="run again")
-        return Assessment(found["level"], tuple(found["reasons"]))
+        return Assessment(found["level"], tuple(found.get("reasons", ())))
 
     @property
     def views(self) -> Views | None:
