@@ -115,8 +115,8 @@ def finish(
 ) -> RunResult:
     """End the session, write its result, print a summary, and return the result.
 
-    Then the error of the session or `broken`, if any, is raised. An error of the session becomes an ObjslamError. If there
-    is no result, the last snapshot is written to objects.json.
+    If the session ended early, raise its error afterwards, as an ObjslamError. Else raise `broken`, the error that `drive`
+    returned, if any. If there is no result, the last snapshot is written to objects.json.
     """
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
