@@ -55,7 +55,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     scale = _LONG_SIDE / float((high - low).max())
     wider = (
         np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
-    )  # a narrow map has room at its sides
+    )  # widens a narrow map to the least size
     low, high = low - wider, high + wider
     below, dots = _objects(result, plane, points)
     shapes = [*_rays(result, plane), *_paths(result, plane), *below]
