@@ -10,9 +10,9 @@ from objslam.core.array_module import Tensor, as_single, as_type, module_of, tak
 from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetric
 
 _WEIGHTED_STEPS = 3
-"""The number of weighted least-squares steps before Newton's. Fewer leave outliers more weight."""
+"""The number of weighted least-squares steps before Newton's. With fewer, outliers keep more weight."""
 _SMOOTHING = 0.05
-"""The smoothing (in mean distances) of the weighted steps. A larger one weakens outliers less."""
+"""Added in squares to the distance (in mean distances) that divides a line's weight. With more, outliers keep more weight."""
 _SINGLE_STEPS = 3
 """The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
 improve a single-precision point."""

@@ -109,7 +109,7 @@ def _places(bundle: Bundle) -> int:
 
 
 def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least-squares points (3, B) of a block, as in `least_squares`, and which are unique (B,)."""
+    """Return the points (3, B) of `least_squares` for a block, and which are unique (B,)."""
     xp = module_of(origin)
     number = weight.sum(axis=0)
     base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.

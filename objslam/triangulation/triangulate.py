@@ -114,7 +114,7 @@ def _triangulate(
     range_bias: Floats | None,
     backend: Backend,
 ) -> Triangulation:
-    """Triangulate checked rays, as `triangulate` does."""
+    """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
     where, base, bundle = _sorted_bundle(m, n, index, count, noise, position_sigma, backend)
     xp = module_of(base)
     if settings.consensus:

@@ -1,4 +1,4 @@
-"""The two kinds of bodies, an upright ellipsoid and an upright cuboid: what tangent planes and rays find of them.
+"""The two kinds of bodies, an upright ellipsoid and an upright cuboid, with the same functions for both.
 
 Both have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
 of the half axis upwards. p is the mean logarithm of the horizontal half axes. `support` returns how far tangent planes are
