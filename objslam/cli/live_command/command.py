@@ -174,8 +174,8 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
     """Check that a journal to resume exists, or rename the journal of an earlier session.
 
-    A session without a message gives the renamed journal its name back: at its end, or if it was killed, here at the next
-    start.
+    If the new session gets no message, the renamed journal gets its name back when the session ends. If such a session was
+    killed, this happens here, when the next session starts.
     """
     from objslam.errors import OutputError
     from objslam.sources.journal.aside import put_back, restore_after_kill, set_aside

@@ -33,7 +33,7 @@ class LatestObjects:
         self._out, self._begun, self._refused = out, False, False
 
     def try_write(self, snapshot: Snapshot) -> None:
-        """Write as `write` does, but do not raise an OutputError: warn of the first one, and say when it is over."""
+        """Write as `write` does, but only warn of the first OutputError, and say when writing works again."""
         refused = None
         try:
             self.write(snapshot)

@@ -1,4 +1,4 @@
-"""When a running session estimates its shared errors, such as clock offsets, and when the estimate corrects the map."""
+"""Decides when a running session estimates its shared errors, such as clock offsets, and when these correct the map."""
 
 from __future__ import annotations
 

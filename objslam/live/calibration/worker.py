@@ -91,7 +91,7 @@ class Worker:
         self._thread.join()
         if not self._answer:
             return None
-        found: Calibration | None = pickle.loads(self._answer)  # noqa: S301 - from this program itself
+        found: Calibration | None = pickle.loads(self._answer)  # noqa: S301 - this program wrote it
         return found
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class Worker:
 def main() -> None:
     """Read a request from stdin, and write its calibration to stdout."""
     os.nice(_NICE)
-    request: Request = pickle.load(sys.stdin.buffer)  # noqa: S301 - from this program itself
+    request: Request = pickle.load(sys.stdin.buffer)  # noqa: S301 - this program wrote it
     answer = pickle.dumps(request.solve())
     sys.stdout.buffer.write(answer)
 

@@ -89,7 +89,7 @@ def match(
         again = Landmarks(places[at], own[at], noises[at], accepts[at])
         unknown = unknown_density(some, rows[at], predicted, novelty)
         sure = back[jointly_compatible(some, again, uncertainty.against(to[at], then[at]), map_T_camera, unknown)]
-        if len(sure) < len(back):  # Assign again. A long unseen landmark may only get the ray with which it passed.
+        if len(sure) < len(back):  # Assign again. Long unseen landmarks may only get the rays that proved compatible.
             keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
             chosen = _best(_some(edges, keep), cost[keep], count, len(places), unmatched)
     return np.where(chosen >= 0, rows[chosen], -1)

@@ -18,8 +18,8 @@ from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
 _ANCHORS = 3  # How many past keyframes are tried as the start of the loop. More keyframes take longer.
-_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value leaves more to iSAM2.
-_TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. More leaves more to iSAM2.
+_NEAR = 0.25  # A correction above this (m) bends the path before landmarks merge. A larger value leaves more to iSAM2.
+_TURNED = 0.05  # A heading correction above this (rad) also bends the path first. A larger value leaves more to iSAM2.
 _AROUND = 6.0  # Other landmarks within this radius (m) of recognised ones match again. Cameras see about as far in a hall.
 _ERA = 15.0  # The landmarks _AROUND were last seen within this time (s) of the recognised ones. More lets more match.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
@@ -126,7 +126,10 @@ def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
 
 
 def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve or restore the map."""
+    """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve the map.
+
+    If too few rays are inliers after that, restore the old map.
+    """
     landmarks, k, rays = m.landmarks, m.keyframes, m.rays
     m.graph.refresh()
     saved = m.graph.save()

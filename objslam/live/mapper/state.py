@@ -67,8 +67,8 @@ class MaintenanceSchedule:
     """When the maintenance tasks last ran.
 
     solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: how many early
-    relinearisations remain. compared: what the last search for loops compared: the ids of the recently seen landmarks, and
-    the number of the long unseen ones. None before the first search.
+    relinearisations remain. compared: the input of the last search for loops, None before the first: the ids of the recently
+    seen landmarks, and the number of long unseen ones.
     """
 
     solved: int = 0

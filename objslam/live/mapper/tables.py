@@ -21,7 +21,7 @@ def column(kind: DTypeLike, *shape: int) -> Any:
 
 
 class GrowingTable:
-    """A table. Each column is an attribute, an array (n, *shape) with one entry per row, which may be changed in place.
+    """A table. Each column is an attribute: an array (n, *shape) with one entry per row. Entries may be changed in place.
 
     Subclasses declare columns with `column`. `add` and `keep` replace all arrays.
     """

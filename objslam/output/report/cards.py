@@ -1,4 +1,4 @@
-"""The cards of the page: what it says and draws of each object."""
+"""The cards of the page: what the page shows of each object."""
 
 import re
 from dataclasses import dataclass
