@@ -118,7 +118,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
             which = xp.arange(begin, min(begin + step, hypotheses), device=rays.device)
             first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
             candidates, valid = _midpoints(bundle, take_along(rays, first, 1), take_along(rays, second, 1))
-            chance = as_single(_chance(bundle, rays, real, candidates))  # This is enough for ranking, and faster.
+            chance = as_single(_chance(bundle, rays, real, candidates))  # Single precision is enough to rank, and faster.
             nfa = as_type(_least_chance(chance, bundle.number[chunk])[0], points)
             nfa = xp.where(valid & exists, nfa, xp.inf)
             row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
@@ -132,7 +132,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the indices (B, H) `first` < `second` of the two rays of each pair among the rays of an object, and whether the
-    pair exists. number: (B,) rays of each object. which: (H,) indices of the hypotheses, with their jitter (H,)."""
+    pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
     xp = module_of(number)
     n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2

@@ -1,7 +1,7 @@
 """Adapters bring messages to a session, one file per adapter. `ADAPTERS` lists them for `objslam live SOURCE`.
 
-A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` inherits its options. A SOURCE
-that is not in the table is a recording. This module imports no heavy library, because `--help` imports it.
+A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` must inherit the class of its
+options. A SOURCE that is not in the table is a recording. `--help` imports this module, so it imports no heavy library.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from objslam.ros.messages.topic_types import IMAGES, LATCHED
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
 _TAKE = 200  # The most messages that one call takes from a reader. A larger number makes fewer calls, and costs memory.
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
-_MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images bring a warning. A larger value warns more often.
+_MIN_BUFFER = 2 << 20  # With a smaller socket buffer, bytes, raw images bring a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
 

@@ -61,14 +61,14 @@ Push = Callable[[Sink], bool]
 
 
 def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
-    """Yield the events of a log in time order: the time, s, whether the event is a frame, and the push of the event.
+    """Yield the events of a log in time order: the time, s, whether the event is a frame, and the function that pushes it.
 
     The time of an event is its stamp, except for a frame. A frame directly follows the first pose of the robot's path at or
     after its stamp, and has the time of this pose. So no frame waits for a pose (live.max_lag). If this pose is more than
     live.max_late later, or if there is none, the frame keeps the time of its stamp.
     """
     settings = settings or Settings()
-    # Of each kind of event: the stamps, s, the rank (of two events with one stamp, the lower comes first), the i-th push.
+    # Of each kind of event: the stamps, s, the rank (lower first at one stamp), and the function that returns the i-th push.
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []
     for path, which in ((log.localization, "push_localization"), (log.odometry, "push_odometry")):
         if path is not None:

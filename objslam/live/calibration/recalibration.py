@@ -20,7 +20,7 @@ _AT_ONCE = 400
 """The most keyframes of a graph that is solved at once after its correction. A larger graph is rebuilt in slices, between
 frames. A larger number delays the next frame for longer."""
 _ITERATIONS = 8
-"""The most iterations of that solve. More iterations delay the next frame for longer."""
+"""The most iterations of the solve after a correction. More iterations delay the next frame for longer."""
 
 
 def recalibrate(m: MapState, calibration: Calibration) -> None:

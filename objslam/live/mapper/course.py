@@ -195,7 +195,7 @@ class Course:
         if len(localized) and on is not None and there is not None and (path is self.localization or on.stretch == stretch):
             row = localized[keyframes.stamp[localized].argmax()]
             start_T_base = keyframes.start_T_base[row] @ inverse(keyframes.map_T_base[row]) @ there.pose
-            drift = 2 * last.drift - keyframes.drift[row]  # That of `last`, plus the drift from the keyframe to `last`.
+            drift = 2 * last.drift - keyframes.drift[row]  # The drift of `last`, plus the drift from the keyframe to `last`.
             return self._lay(stretch, start_T_base, drift, path.from_start(on.pose), on.drift, self._noise)
         on = path.at(stamp)
         assert on is not None

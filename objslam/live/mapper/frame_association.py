@@ -17,10 +17,12 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, as a factor on the largest distance of all sights. More costs time.
-_NEAR = 10.0  # Up to this distance (m), a landmark is never too far to be a candidate. A larger distance costs time.
-_ROUGH = 3.0  # A candidate is rough if its uncertainty fills this many times the image area of a ray's noise.
-_CLEAR = 6.0  # The least difference in cost of a ray's two best candidates, if both are rough. More decides fewer boxes.
+_BEYOND = 1.5  # Candidates are at most this factor times the largest observed distance away. A larger factor costs time.
+_NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
+_ROUGH = 3.0
+"""A candidate is rough if its uncertainty fills more than this many times the image area of a ray's noise. With a larger
+value, fewer candidates are rough."""
+_CLEAR = 6.0  # The least difference in cost of a ray's two best candidates, if both are rough. More matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
 _BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
 
@@ -167,7 +169,7 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 
 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
-    """Remove the ambiguous (_CLEAR) or too uncertain (_WIDEST) ones of the matches with rough landmarks (_ROUGH).
+    """Remove matches with rough landmarks (_ROUGH) if they are ambiguous (_CLEAR) or too uncertain (_WIDEST).
 
     Loop closure may match these landmarks later. sigma: (n,) rad, of the rays. to: (m, 3) m from the camera to each
     candidate. landmark: (m,) False for a track.

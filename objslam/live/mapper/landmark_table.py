@@ -14,7 +14,7 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # The information (m^-2) added to each landmark, as parallel rays give none along them. More is too certain.
+_HELD = 1e-4  # Information (m^-2) that keeps covariances finite if all rays are parallel. More makes them too small.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
 _FURTHER = 1.1  # A landmark is expected up to this factor times its largest observed distance. More counts more misses.
@@ -45,7 +45,7 @@ class LandmarkTable(GrowingTable):
 
 
 def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Return the factor (n,) on the nominal noise of the rays of each landmark."""
+    """Return the factor (n,) on the nominal noise of the rays of each landmark, from their residuals."""
     seen = landmarks.seen[rows] + POOLED_WITH_PROMISE
     return np.sqrt((landmarks.squared[rows] / 2 + POOLED_WITH_PROMISE) / seen).clip(*NOISE_FACTORS)
 

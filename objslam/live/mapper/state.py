@@ -162,7 +162,7 @@ class MapState:
     def bearings(self, at: Ints) -> Bearings:
         """Return the rays in rows (n,) for the graph.
 
-        The ranges of a landmark share a bias, which does not average out. So their noise grows with their number.
+        The ranges of a landmark share a bias, which does not average out. So the noise of each grows with their number.
         """
         rays = self.rays
         sigma = rays.range_sigma[at]

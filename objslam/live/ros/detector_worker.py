@@ -47,9 +47,8 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            late = self._waiting.get(
-                topic
-            )  # The newer image keeps its place. At the end of the queue it might never be next.
+            # The newer image takes the place of the older one. At the end of the queue it might never be next.
+            late = self._waiting.get(topic)
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:
                 self._waiting[topic] = message, stamp

@@ -122,7 +122,7 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used for a role: the one that the user chose, else the first to arrive."""
+        """Return whether a source is used as odometry or localization: the one that the user chose, else the first one."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:

@@ -33,8 +33,8 @@ _GROWTH = 1.2
 """A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks
 are more exact by then. A larger factor searches more rarely."""
 _SAME_PLACE = 0.5
-"""A new registration replaces the old one if it moves the middle of the matched landmarks to a place further than this from
-the old one, m. A larger value keeps a wrong place for longer."""
+"""A new registration replaces the old one if it moves the middle of the matched landmarks by more than this, m. A larger
+value keeps a wrong place for longer."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class MapLocator:
 def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
     """Return the resolved landmarks in these rows, and their covariances (n, 3, 3), m^2, in the graph.
 
-    The covariances are relative to the newest keyframe, because the drift until then is the same error for all landmarks.
+    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike.
     """
     newest = int(m.keyframes.id[m.keyframes.stamp.argmax()])
     m.graph.refresh()

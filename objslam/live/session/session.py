@@ -33,7 +33,7 @@ _IDLE = 0.05
 """The longest sleep of the thread, s. If no frame came for this time, a requested snapshot is made. A larger value makes
 snapshots later."""
 _SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
-_LONG = 0.5  # If a caller waits longer than this, s, a snapshot follows any frame. A larger value makes snapshots later.
+_LONG = 0.5  # If a caller waits longer than this, s, a snapshot follows even slow frames. More makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
@@ -167,7 +167,7 @@ class Session(Intake):
             if self._journal is not None:
                 try:
                     self._journal.write(message)
-                except OutputError as error:  # Only for a message that is too long. A disk error ends the journal, unraised.
+                except OutputError as error:  # The message is too long. A disk error is not raised, but ends the journal.
                     self.counters.drop(f"messages that could not be written to the journal: {error.message}")
                     return False
             if not note:

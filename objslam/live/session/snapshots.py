@@ -23,9 +23,9 @@ class Describer:
     """Describes the objects of a map, and keeps each description until its object is seen again."""
 
     def __init__(self) -> None:
-        # Of each landmark by id: its rays and its last stamp, s, when it was described, and the description.
+        # By landmark id: the number of its rays and its last stamp, s, when it was described, and the description.
         self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
-        # Of each track by id: its number of rays when it was described, and the description.
+        # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.
 

@@ -53,9 +53,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
     scale = _LONG_SIDE / float((high - low).max())
-    wider = (
-        np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
-    )  # widens a narrow map to the least size
+    wider = np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
     low, high = low - wider, high + wider
     below, dots = _objects(result, plane, points)
     shapes = [*_rays(result, plane), *_paths(result, plane), *below]
