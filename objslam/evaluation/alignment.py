@@ -126,7 +126,7 @@ def _refine(
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
     """Return the best initial transforms. Each aligns two map objects with two true objects.
 
-    For se3 and sim3, each aligns three objects. If no three or no two objects fit, fewer objects are aligned.
+    For se3 and sim3, each aligns three objects. If no group of objects fits, smaller groups are aligned.
     """
     i, k = np.nonzero(same)
     if kind in ("se3", "sim3"):

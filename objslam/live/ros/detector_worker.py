@@ -25,7 +25,7 @@ _FAILED, _ENDED = "image that the detector failed on", "image that arrived after
 class DetectorWorker:
     """Runs a detector on offered images, and delivers its boxes.
 
-    For each topic, only the newest image waits. While it waits, the detector finishes at most one image of each topic.
+    For each topic, only the newest image waits. The topics take turns.
     """
 
     def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
