@@ -27,7 +27,7 @@ class LandmarkTable(GrowingTable):
     position: m, in map. information: m^-2, from the rays. drift: odometry drift at the last observation. first, last:
     stamps, s, of the first and last observation. label: number. seen: number of frames that showed the landmark. expected:
     number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
-    residuals of its rays. rejected: number of its rays outside the gate.
+    residuals of its rays, clipped. rejected: number of its rays outside the gate.
     """
 
     id: Ints = column(np.int64)

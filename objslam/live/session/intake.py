@@ -31,7 +31,7 @@ _JUMP = 0.1  # A step longer by this, m, than live.max_speed allows is a restart
 _TURN = 0.3  # A turn larger by this, rad, than _TURNS_PER_M allows is a restart. A larger value misses more restarts.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
 _ZERO = 0.05  # After a gap, an odometry pose nearer to 0 than this, m and rad, is a restart. More detects more restarts.
-_FAR = 0.1  # But only if the pose before the gap was further from 0 than this, m or rad. More detects fewer restarts.
+_FAR = 0.1  # For _ZERO, the pose before the gap must be further from 0 than this, m or rad. More detects fewer restarts.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
@@ -59,7 +59,7 @@ class Intake:
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
-        self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
+        self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._start_T_odom = np.eye(4)  # From the odometry's frame since its last restart to its first frame.
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
@@ -199,7 +199,7 @@ class Intake:
             return True
 
     def _place(self, stamp: float) -> float:
-        """Return the session time of a stamp that does not set the clock."""
+        """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""
         return self._clock.place(stamp, self.newest - self._settings.live.max_late, self.newest + _WAIT)
 
     def _continuous(self, at: float, odom_T_base: Floats) -> Floats:

@@ -124,7 +124,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
 
     The first is of the shifts of boxes, the second of their sizes. Each is the root mean square of its posterior. Because
     the bodies are unknown, the likelihood is the restricted one (Patterson and Thompson 1971). The prior is half-normal
-    (Gelman 2006), with the standard deviation `prior`. which: (N,) the bodies that count.
+    (Gelman 2006), with the scale `prior`. which: (N,) the bodies that count.
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
