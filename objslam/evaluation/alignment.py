@@ -91,7 +91,7 @@ def align_objects(
         same: (N, M), True if two objects may be the same.
         radius: maximum distance of a match in m.
         start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
-            with the same labels and a similar distance. The kinds se3 and sim3 align triples of objects likewise. At most
+            with the same labels and a similar distance. For se3 and sim3, triples of objects replace the pairs. At most
             3,000 of these alignments (1,000 of triples) are sampled, with a fixed seed. The best 12 are initial transforms.
     """
     if kind == "none" or not same.any():

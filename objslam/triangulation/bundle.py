@@ -36,10 +36,10 @@ class Bundle:
         return Bundle(self.origin[use], self.direction[use], self.sigma[use], self.position_sigma, index, number)
 
     def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into blocks. A block of several objects has at most `most` places for rays.
+        """Split objects, given by their indices, into blocks of B objects with up to n rays each.
 
         A block holds the objects (B,), the indices of their rays (B, n), and which of these indices are real. The other
-        indices only fill the rows of objects with fewer rays.
+        indices only fill the rows of objects with fewer rays. most: the largest B n of a block of several objects.
         """
         xp = module_of(self.number)
         first = xp.cumsum(self.number, 0) - self.number

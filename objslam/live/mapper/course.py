@@ -19,7 +19,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # The time beyond live.max_late for which poses are kept, s, for frames that wait in a queue. More costs memory.
+_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, for frames in a queue. A larger value costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 

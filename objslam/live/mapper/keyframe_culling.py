@@ -12,7 +12,7 @@ _SHARE = 0.25  # The share of live.max_keyframes that one culling removes. With 
 _AGAIN = 0.1  # The new keyframes before the next culling, as a share of live.max_keyframes. With more, culling is rarer.
 _ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
 _LEAST = 3  # The rays that every landmark keeps if too many keyframes stay (_CROWDED). Three rays still fix a position.
-_CROWDED = 1.2  # If _ENOUGH keeps more than this factor times live.max_keyframes, _LEAST applies. More costs memory.
+_CROWDED = 1.2  # If _ENOUGH keeps more than this times live.max_keyframes, _LEAST applies. A larger value costs memory.
 
 
 def cull_keyframes(m: MapState) -> None:

@@ -14,10 +14,10 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # Information (m^-2) that keeps covariances finite if all rays are parallel. More makes them too small.
+_HELD = 1e-4  # Information (m^-2) that keeps covariances of parallel rays finite. A larger value makes them too small.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
-_FURTHER = 1.1  # A landmark is expected up to this factor times its largest observed distance. More counts more misses.
+_FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 

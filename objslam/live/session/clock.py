@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The clock was set back if this many poses in a row are older than the path. More are surer, but slower.
+_SURE = 5  # The clock was set back if this many poses in a row are older than the path. A larger number is surer but slower.
 _BACK = 0.5  # A pose older than the path by less than this, s, is only late. A larger value ignores larger steps back.
 _LEAP = 60.0  # A stamp this far ahead, s, must be confirmed by the next pose. A larger value accepts more wrong stamps.
 _KEPT = 8  # The earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.

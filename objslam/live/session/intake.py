@@ -30,8 +30,8 @@ from objslam.sources.journal.records import (
 _JUMP = 0.1  # A step longer by this, m, than live.max_speed allows is a restart. A larger value misses more restarts.
 _TURN = 0.3  # A turn larger by this, rad, than _TURNS_PER_M allows is a restart. A larger value misses more restarts.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
-_ZERO = 0.05  # After a gap, an odometry pose nearer to 0 than this, m and rad, is a restart. More detects more restarts.
-_FAR = 0.1  # For _ZERO, the pose before the gap must be further from 0 than this, m or rad. More detects fewer restarts.
+_ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
+_FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
