@@ -20,7 +20,7 @@ SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a 
 _AGREE_BY_LABEL = 0.5  # AGREE for tracks that were grouped by label alone. A larger share makes landmarks later.
 _AGAIN = 1.2  # A track is tried again when its rays or its spread have grown by this factor. A smaller factor costs time.
 _EARLY = 0.4  # This share of joint.min_parallax_deg suffices if the position is certain. A larger share delays landmarks.
-_SURE = 0.05  # A position with a sigma below this share of its distance is certain. A larger share makes more false landmarks.
+_SURE = 0.05  # A position with a sigma below this share of its distance is certain. A larger share accepts more false ones.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
