@@ -133,8 +133,8 @@ def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tens
 
 
 def _hessian(direction: Tensor, u: Tensor, inverse: Tensor) -> Tensor:
-    """Return the sums of t t^T / d with t = n x u, (6, B) as in `outer`. u: (3, n, B) and inverse: (n, B) 1 / d, both zero
-    for a filler."""
+    """Return the sums of t t^T / d with t = n x u, by their six entries (6, B). u: (3, n, B) and inverse: (n, B) 1 / d,
+    both zero for a filler."""
     x, y, z = direction
     a, b, c = u
     t0, t1, t2 = y * c - z * b, z * a - x * c, x * b - y * a

@@ -22,7 +22,7 @@ _NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates
 _ROUGH = 3.0
 """A candidate is rough if its uncertainty fills more than this many times the image area of a ray's noise. With a larger
 value, fewer candidates are rough."""
-_CLEAR = 6.0  # The least difference in cost of the two best candidates, if rough. A larger value matches fewer rays.
+_CLEAR = 6.0  # The least difference in cost of the two best candidates, if both are rough. More matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
 _BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
 

@@ -155,7 +155,10 @@ class Session(Intake):
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into journal and queue, or into neither. A note is only journalled. Return whether accepted."""
+        """Put a message into journal and queue, or into neither, and return whether it was accepted.
+
+        A note, which stores the state of the clock and of the odometry's frame, only goes into the journal.
+        """
         with self._changed:
             if self._stopping:
                 self.counters.drop("messages after the end of the session")

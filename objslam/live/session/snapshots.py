@@ -67,8 +67,8 @@ class Describer:
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
 
-        It is relative to the prior map, if the session is tied to one. If it is not, or if that covariance is unknown, it is
-        relative to the frame of the session.
+        It is relative to the prior map if the session is tied to one and this covariance is known. Else it is relative to
+        the frame of the session.
         """
         covariance = covariance_in_map(m.graph, j) if self._tied else np.full((3, 3), np.nan)
         return covariance if np.isfinite(covariance).all() else m.graph.point_covariance(j)

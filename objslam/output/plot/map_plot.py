@@ -182,8 +182,8 @@ def _footprint(o: MapObject, body: Body) -> Floats:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge towards it, and the distance (F,) between
-    both, all in m."""
+    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
+    between both, all in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)

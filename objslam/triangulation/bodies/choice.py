@@ -1,7 +1,7 @@
 """The choice between a point, a sphere, an ellipsoid and a cuboid by their evidence (Laplace's method; MacKay 1992).
 
-A point explains the place of a box, but not its size, so each size is equally probable. A body explains both. It has more
-parameters, and the evidence falls with the volume of their prior.
+A point explains the place of a box, but not its size, so each size is equally probable. A body explains both. But it has
+more parameters, and the wider their priors are, the lower is its evidence (Occam's factor).
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def tangent_planes(
     """Return normals (B, 4, 3) in map, turns (B, 4), rad per px, and which boxes (B,) have all four planes.
 
     boxes: (B, 4) px of the raw image. map_T_camera: (B, 4, 4). contact: (B, 4) px, where each edge touches the image of the
-    body: y on a vertical edge, x on a horizontal one. The default is the middle of each edge. Only in a distorted image, the
-    plane depends on it, because the edge is curved: the plane is the tangent at the contact.
+    body: y on a vertical edge, x on a horizontal one. The default is the middle of each edge. The contact matters only in a
+    distorted image. There an edge is curved, and its plane is the tangent at the contact.
     """
     low, high = boxes[:, :2], boxes[:, 2:]
     middle = (low + high) / 2
@@ -83,7 +83,7 @@ def tangent_planes(
 def contacts(camera: Camera, boxes: Floats, map_T_camera: Floats, touched: Floats) -> Floats:
     """Return where (B, 4), px, the edges of boxes (B, 4) touch the image of a body, given the points (B, 4, 3) in map.
 
-    A point that is not in front of the camera gives the middle of its edge. Other points are moved to the edge's ends.
+    A point that is not in front of the camera gives the middle of its edge. A point beyond the edge gives its nearest end.
     """
     local = np.einsum("bij,bki->bkj", map_T_camera[:, :3, :3], touched - map_T_camera[:, None, :3, 3])
     ahead = local[..., 2] > 0

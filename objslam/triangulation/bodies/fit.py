@@ -52,7 +52,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Fit:
-    """The best bodies. values: (N, 7). weight: (B, 5) of each residual, one over its variance. found: (B,) its residuals.
+    """The best bodies. values: (N, 7). found: the residuals of the B boxes. weight: (B, 5) of each residual, 1 / variance.
 
     information: (N, 7, 7) of boxes and prior. prior: (N, 7, 7) of the prior alone.
     """

@@ -24,7 +24,7 @@ _DOT = 1e-4
 """The half axes (m) of an ellipsoid that stands for a point."""
 _LIKE = 2.0
 """With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
-it less."""
+the label less."""
 _LEAST = 0.1
 """The least standard deviation of the logarithm of a half axis, given the label. A smaller value trusts the label more."""
 _TIE = 1e-3

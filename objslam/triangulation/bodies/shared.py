@@ -1,5 +1,6 @@
-"""Errors that the boxes of a body share. From one side, all boxes of an object err alike, because its outline is no ellipse
-and detectors err systematically. More boxes from this side do not average the error out, so they count as few (Kish 1965).
+"""Errors that the boxes of a body share. A side is a direction from which an object is seen. All boxes from one side err
+alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so they count as few
+(Kish 1965).
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ ALIKE = np.radians(20.0)
 """The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
 angle, views must differ more to average the errors out. A detector had 5 to 20 degrees on three objects of YCB-Video."""
 WITHIN = 0.7
-"""The variance of the mean error over one side, as a share of the variance in one direction. Two directions in a side are 10
-degrees apart on average, and their correlation is 0.7. A larger share finds smaller errors."""
+"""The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
+mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
 """The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
 _NOMINAL = 20.0
-"""The number of residuals at which the scatter in the log weighs as much as the nominal noise. A larger number gives the
+"""With this many residuals, their scatter weighs as much as the nominal noise of the settings. A larger number gives the
 nominal noise more weight."""
 
 
