@@ -166,8 +166,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that a wrong box gives a ray as close to the points (B, H, 3) as each ray is. It is 1
-    for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes as close to the point (B, H, 3). It
+    is 1 for a ray that points away from the point, and for a ray that is not `real`."""
     xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]

@@ -43,10 +43,10 @@ def fuse_ranges(
     """Fuse the rays in `use` (R,) with their ranges (R,) m, and return points (N, 3) m and covariances (N, 3, 3) m^2.
 
     It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
-    range gets NaN. All ranges of an object share an error with the standard deviation range_bias (R,) m. It moves the point
-    along the rays, and the covariance includes it. The loss is squared across the rays, because `use` has no outliers. It is
-    Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is robust in both
-    directions and gives no covariance.
+    range gets NaN. range_bias: (R,) m, the standard deviation of an error that all ranges of an object share. The covariance
+    includes this error. Across the rays, the loss is squared, because `use` has no outliers. Along the rays, it is Cauchy's,
+    because a range may belong to the background. `association.refinement.refine` is robust in both directions, but gives no
+    covariance.
     """
     xp = module_of(ranges)
     rays, count = bundle.select(use), len(bundle.number)

@@ -122,8 +122,8 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, at points (3, B), the gradient (3, B) of Eq. 1, the second derivative (B,) of Eq. 1 along the unit vectors
-    `axis` (3, B), and the sum (B,) of 1 + 1 / d, at most 1e6."""
+    """Return, at points (3, B), the gradient (3, B) of Eq. 1, its second derivative (B,) along the unit vectors `axis`
+    (3, B), and the rounding error (B,) of the gradient, in units of epsilon: the sum of 1 + 1 / d, at most 1e6."""
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse

@@ -24,9 +24,9 @@ from objslam.triangulation.newton import approach, newton, off_nearest_line
 from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most places for rays in one block, for each backend. A smaller number needs more calls, and a call of torch costs more
-than a call of numpy. A larger block does not fit into the cache of a CPU. On CUDA, it needs more memory: 1 kB a ray. On the
-CPU, blocks four times as large take 1.1 (numpy) and 1.2 times (torch) as long. The number for CUDA was not measured."""
+"""The most rays, with fillers, in one block, for each backend. Smaller blocks need more calls, and a call of torch costs
+more than one of numpy. Larger blocks do not fit into the cache of a CPU: blocks four times as large take 1.1 (numpy) and 1.2
+times (torch) as long. On CUDA, a ray needs 1 kB. The number for CUDA was not measured."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest."""
 _LEAST_REGULAR = 1e-6
