@@ -144,7 +144,7 @@ def _ros(
 
 ADAPTERS = {
     "dds": LiveSource("a ROS 2 robot", _dds, DdsOptions),
-    "rclpy": LiveSource("a ROS 2 robot, received by a ROS node", _rclpy, LiveRosOptions),
+    "rclpy": LiveSource("a ROS 2 robot, through a ROS node", _rclpy, LiveRosOptions),
     "stdin": LiveSource("JSON lines", _stdin),
 }
 """The sources of `objslam live` by name."""
