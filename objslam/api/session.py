@@ -71,7 +71,10 @@ class Session(LiveSession):
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot. It holds from the stamp, s. Forms: see `push_odometry`."""
+        """Push base_T_camera of a camera that moves on the robot. It holds from the stamp, s, on.
+
+        The pose has one of the forms of `push_odometry`.
+        """
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:

@@ -30,7 +30,8 @@ times (torch) as long. On CUDA, a ray needs 1 kB. The number for CUDA was not me
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest."""
 _LEAST_REGULAR = 1e-6
-"""The regularity of a matrix, from 0 to 1, below which eigenvalues decide whether the lines fix a point."""
+"""If a matrix is less regular than this (from 0 to 1), its eigenvalues decide whether the lines fix a point. A larger value
+computes eigenvalues more often."""
 
 
 @dataclass(frozen=True)

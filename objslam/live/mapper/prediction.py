@@ -13,7 +13,7 @@ from objslam.live.mapper.state import MapState
 
 _ASK = 10
 """Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is added
-to it, which makes it too large. A larger number makes it larger."""
+to it, which overestimates it. A larger number overestimates it more."""
 
 
 @dataclass(frozen=True)
