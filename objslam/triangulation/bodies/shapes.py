@@ -23,7 +23,8 @@ class Kind:
     """One kind of bodies.
 
     support: takes parameters (B, 1, 7) and unit normals (B, 4, 3). Returns the distances (B, 4), m, of tangent planes from
-    the centre, their derivatives (B, 4, 4) by the last four parameters, and the touched points (B, 4, 3), m, from the centre.
+    the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m, that they touch,
+    relative to the centre.
     ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
     surface, their derivatives (B, 7), and which rays (B,) hit it. The others take parameters (N, 7). half_axes: returns the
     half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis. axes_jacobian: the
