@@ -23,8 +23,8 @@ class TagPose:
 
     xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
     covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
-    from the settings. other_xyzw: (4,) the second rotation that a flat square leaves open, None if the views rule it out.
-    other_probability: of this second rotation, 0 without one.
+    from the settings. other_xyzw: (4,) a second rotation at which a flat square looks nearly the same, None if the views
+    rule it out. other_probability: of this second rotation, 0 without one.
     """
 
     xyzw: Floats
@@ -54,7 +54,8 @@ class TagPose:
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
 
     def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
-        """Return the fiducial in a frame in which its map has a rotation (3, 3), whose yaw has a sigma, rad."""
+        """Return the fiducial after `rotation` (3, 3) turned its map. yaw_sigma: rad, the standard deviation of this
+        rotation's yaw."""
         up = (rotation @ self.rotation)[2]
         return replace(
             self,
