@@ -128,7 +128,7 @@ def write_report(
             label: (int(((rays.object < 0) & (rays.label == label)).sum()), [pictures[i] for i in index if i in pictures])
             for label, index in unexplained.items()
         },
-        dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
+        dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
         changed=_changed(settings),
