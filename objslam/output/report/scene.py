@@ -47,7 +47,7 @@ def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Tru
                 "at": positions[i].round(3).tolist(),
                 "axes": _half_axes(objects, i, turn),
                 "body": _body(objects, i, turn),
-                "cuboid": objects[i].body is not None and objects[i].body.shape == "cuboid",
+                "cuboid": getattr(objects[i].body, "shape", "point") == "cuboid",
             }
             for i in shown
         ],
