@@ -46,8 +46,8 @@ def imported(file: Path) -> set[str]:
 
 
 def test_what_objslam_imports_is_what_it_asks_for():
-    """Else it works where the tests run, and not where a user installed it. ROS brings rclpy and rosidl_runtime_py. pandas is
-    for those who have it."""
+    """Else it works where the tests run, and not where a user installed it. ROS brings rclpy and rosidl_runtime_py.
+    pandas is for those who have it."""
     asked = {canonicalize_name(Requirement(line).name) for line in licences.requirements(licences.ROOT / "pyproject.toml")}
     packages = packages_distributions()
     names = set().union(*(imported(file) for file in (licences.ROOT / "objslam").rglob("*.py")))
