@@ -148,6 +148,10 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
     if result.map.objects:
         console().print(objects_table(result.map.objects, console()))
+    if any(o.tag is not None and o.tag.size_sigma > 0 for o in result.map):
+        say(
+            "the sizes of tags are estimated, in the scale of the poses; a known side, --set tags.size=METRES, gives the scale"
+        )
     if calibration := result.summary.get("calibration"):
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
@@ -181,6 +185,13 @@ def _size(o: MapObject) -> str:
     if o.tag is not None:
         return f"{o.tag.size:.3f}"
     return "" if o.body is None else " x ".join(f"{side:.2f}" for side in o.body.size)
+
+
+def advice_on_tags(objects: Sequence[MapObject]) -> str:
+    """Return what to do if the sizes of fiducials are estimated. "" if there are no such fiducials."""
+    if not any(o.tag is not None and o.tag.size_sigma > 0 for o in objects):
+        return ""
+    return "the sides of the tags are estimated, in the scale of the poses; a known side gives the scale: --set tags.size=METRES"
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
