@@ -63,7 +63,7 @@ _NOISE: Final = {
 """The words for the factors of the noise. A factor of 1 is not shown: the log does not tell it, or confirms the settings."""
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""
-_WIDE = 10_000  # The width at which a table is measured, columns. It is larger than any table.
+_WIDE = 10_000  # The width, in characters, of a terminal on which no table is cut, to measure the full width of a table.
 
 
 @with_options
@@ -148,10 +148,8 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
     if result.map.objects:
         console().print(objects_table(result.map.objects, console()))
-    if any(o.tag is not None and o.tag.size_sigma > 0 for o in result.map):
-        say(
-            "the sizes of tags are estimated, in the scale of the poses; a known side, --set tags.size=METRES, gives the scale"
-        )
+    if advice := advice_on_tags(result.map.objects):
+        say(advice)
     if calibration := result.summary.get("calibration"):
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
@@ -191,7 +189,7 @@ def advice_on_tags(objects: Sequence[MapObject]) -> str:
     """Return what to do if the sizes of fiducials are estimated. "" if there are no such fiducials."""
     if not any(o.tag is not None and o.tag.size_sigma > 0 for o in objects):
         return ""
-    return "the sides of the tags are estimated, in the scale of the poses; a known side gives the scale: --set tags.size=METRES"
+    return "the sides of tags are estimated in the scale of the poses; a known side sets the scale: --set tags.size=METRES"
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:

@@ -20,10 +20,9 @@ class Ledger:
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
-        """Add `count` drops for a reason.
+        """Count dropped data under a reason.
 
-        of: the number of data that were checked, None if unknown. where: the file:line or stamp, kept for the first few
-        drops only.
+        of: the number of data that were checked, None if unknown. where: file:line or stamp, kept for the first drops.
         """
         reason = one_line(reason)
         if of is not None:

@@ -85,7 +85,7 @@ def detect_log(
 
 @dataclass(frozen=True)
 class Frame:
-    """One image file. image: its pixels, if the cache has no boxes of it. known: its boxes from the cache, if any.
+    """One image file. known: its boxes from the cache, if any. image: its pixels, if the cache has no boxes of it.
 
     problem: the reason why the image cannot be used, if any. where: the place of the problem. digest: SHA-256 of the file.
     """

@@ -1,6 +1,6 @@
 """fleet.html: the sites, the failures, the drift of each robot's calibration, and links to the results.
 
-The page needs no network. What it shows of logs is escaped, because names come from strangers.
+The page needs no network. Texts from logs are escaped, because strangers chose the names in them.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def duration(hours: float) -> str:
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return what the table of sites says of the sessions of a site that this run has."""
+    """Return the columns of the table of sites that come from the sessions of a site in this run."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),

@@ -1,7 +1,7 @@
 """The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
 
-An engine is a function of the work, as "module:function", and of the arguments. It never holds more than a bounded number of
-arguments and answers, so that a fleet of any size needs the memory of a small one.
+An engine is called with the name of a function, "module:function", and its arguments. It never holds more than a bounded
+number of arguments and answers, so that a fleet of any size needs the memory of a small one.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
+    """The outcome of one task. value: what the function returned, None after a failure. message: of the failure.
 
-    kind: `memory`, `time`, `lost`, `store` or `error`, empty after a success.
+    kind: of the failure, `memory`, `time`, `lost`, `store` or `error`, empty after a success.
     """
 
     argument: Any
@@ -38,8 +38,8 @@ Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
 """A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
 
 _QUEUED = 2
-"""The most tasks of each process that are submitted and not answered yet. A larger number hides a slow source of
-arguments."""
+"""The most tasks of each process that are submitted and not answered yet. A larger number keeps processes busy while
+arguments come slowly."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
@@ -68,7 +68,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
         own = threading.local()
         with ExitStack() as stack:
             pool = stack.enter_context(ThreadPoolExecutor(jobs, "objslam fleet"))
-            closing = stack.enter_context(ExitStack())  # It ends the processes before the pool waits for its threads.
+            closing = stack.enter_context(ExitStack())  # Closed before the pool, whose threads wait for the processes.
 
             def task(argument: Any) -> Answer:
                 if not hasattr(own, "worker"):

@@ -24,7 +24,7 @@ _PATIENT = 10.0
 _GB = 1e9
 
 _worker = Worker()
-"""The process that does the tasks of this process of Ray. It is kept, so that libraries are imported once."""
+"""The worker of this process of Ray. It is kept between tasks, so that libraries are imported once."""
 atexit.register(_worker.close)
 
 
