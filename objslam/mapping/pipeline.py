@@ -69,7 +69,13 @@ def run(
             diagnosis = diagnose(expected, settings)
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
+        if diagnosis.certain and settings.mode == "joint":
+            ledger.warn("the poses stay as they are, because no solve corrects wrong input")
+            settings = settings.model_copy(update={"mode": "fixed"})
         frames = build_keyframes(log, settings, ledger)
+        if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
+            cause = " and allow no calibration" if settings.calibration.use is True else ""
+            ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
         if sideways := lies_on_its_side(frames):
             ledger.warn(sideways)
         rays = build_rays(log, frames, settings, ledger)
