@@ -80,13 +80,16 @@ def _uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
 
 
 def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
-    """Return a finding for each noise that ended at its bound. With so much noise, wrong input fits too."""
+    """Return a finding for each noise that ended at its bound. With so much noise, wrong input fits too.
+
+    Wheels may slip so much, but no detector is off by so many pixels. So the noise of the boxes spoils the positions.
+    """
     return [
         Finding(
             f"noise {name} at its bound",
             f"the boxes agree only if the noise {words} is {MOST_NOISE:.3g} times what the settings say, or more: unless it "
             "really is, the input is wrong",
-            spoils=False,
+            spoils=name == "rays",
         )
         for name, words in _NOISES.items()
         if getattr(noise, name) >= 0.999 * MOST_NOISE
