@@ -31,9 +31,8 @@ def bearings(
     """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
 
     offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
-    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. In its
-    image, the distance of the landmark from the centre is the angle. Behind this camera the error is constant, and larger
-    than in front of it.
+    with an offset. So a ray with an offset gets an equidistant camera of focal length 1 px that looks along the ray. The
+    distance of the landmark from the centre of its image is the angle. Behind the camera the error is larger and constant.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
@@ -98,8 +97,8 @@ def tangent_basis(directions: Floats) -> Floats:
 def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:
     """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
-    The axes of GTSAM's bearing factor are perpendicular to the way to the landmark. The axes of the other factors are
-    perpendicular to the ray. The parameters are those of `bearings` and `ray_residuals`.
+    In GTSAM's bearing factor (no offset, not metric), they are perpendicular to the line from the origin to the landmark. In
+    the other factors, they are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
     """
     if metric:
         return tangent_basis(directions)
