@@ -25,8 +25,9 @@ _CHUNK = 500
 """The number of records that are read at once. A larger number asks a store less often, and takes more memory."""
 
 Stage = Literal["mapping", "merging"]
-Tell = Callable[[Stage, int, int, int], None]
-"""A function that is called with the stage, and with three counts of its tasks: succeeded, failed, all."""
+Tell = Callable[[Stage, int, int, int, int], None]
+"""A function that is called with the stage, and with the numbers of its tasks that succeeded, failed, are running, and of
+all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ def run_fleet(
     *,
     price: float = float("nan"),
     again: bool = False,
-    tell: Tell = lambda stage, done, failed, total: None,
+    tell: Tell = lambda stage, done, failed, running, total: None,
     merge_engine: Engine | None = None,
 ) -> FleetResult:
     """Map the logs that have no result yet, merge each site, and write all tables.
@@ -130,7 +131,7 @@ def _map_logs(
             continue
         failed += _add(found, place, record, new=False)
         done += 1
-    tell("mapping", done - failed, failed, len(logs))
+    tell("mapping", done - failed, failed, 0, len(logs))
     tasks = (MapTask(job, place.path, task, again) for task, place in places.items())
     for answer in engine(map_task.WORK, tasks):
         place = places[answer.argument.task]
@@ -140,7 +141,7 @@ def _map_logs(
             found.failures.append(Failure(place.path, answer.kind, answer.message, place))
             failed += 1
         done += 1
-        tell("mapping", done - failed, failed, len(logs))
+        tell("mapping", done - failed, failed, answer.running, len(logs))
 
 
 def _read_records(store: Store, known: Sequence[tuple[LogPlace, str]]) -> Iterator[tuple[LogPlace, Record | None]]:
@@ -208,7 +209,7 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
             done += 1
             if answer.value is None:
                 wrong.setdefault(tasks[answer.argument], answer.message)
-            tell("merging", done - len(wrong), len(wrong), total)
+            tell("merging", done - len(wrong), len(wrong), answer.running, total)
             yield answer
 
     for depth in range(max(map(len, trees.values()), default=0)):

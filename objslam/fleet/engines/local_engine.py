@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ class Answer:
     value: Any
     kind: str = ""
     message: str = ""
+    running: int = 0
 
 
 Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
@@ -77,7 +78,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
                 return attempt(own.worker, work, argument, limits)
 
             try:
-                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs * _QUEUED)
+                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -85,15 +86,15 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
     return run
 
 
-def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], most: int) -> Iterator[Answer]:
-    """Yield the answer of each task. most: the most tasks that are submitted and not answered yet."""
+def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], jobs: int) -> Iterator[Answer]:
+    """Yield the answer of each task. jobs: the number of processes."""
     left = iter(arguments)
-    running = {submit(argument) for argument in islice(left, most)}
+    running = {submit(argument) for argument in islice(left, jobs * _QUEUED)}
     while running:
         done, running = wait(running, return_when=FIRST_COMPLETED)
         for one in done:
             running |= {submit(argument) for argument in islice(left, 1)}
-            yield one.result()
+            yield replace(one.result(), running=min(len(running), jobs))
 
 
 def cores() -> int:
