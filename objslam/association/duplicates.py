@@ -5,8 +5,7 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""If two objects are seen together in more than this share of frames, they differ. A larger share merges separate
-objects."""
+"""Objects that are seen together in more than this share of frames differ. With a larger share, different objects merge."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
@@ -19,5 +18,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. `frames` frames show the rarer one, and `together` of them show both."""
+    """Return whether two objects differ. frames: how many frames show the rarer one. together: how many show both."""
     return together > TOGETHER * frames
