@@ -53,5 +53,5 @@ class Ledger:
         for reason, count in self.dropped.items():
             places, total = self.examples.get(reason), self.totals.get(reason)
             share = f" of {total} ({100 * count / total:.0f} %)" if total else ""
-            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {', '.join(places)})" if places else ""))
+            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {'; '.join(places)})" if places else ""))
         return lines + self.warnings

@@ -47,7 +47,9 @@ def detect_log(
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
-        raise LogError("no camera has rgb images for the detector", where=log.name, hint="rgb.txt lists them")
+        raise LogError(
+            "no camera has rgb images for the detector", where=log.name, hint="list them in rgb.txt, one a line: stamp path"
+        )
     for warning in detector.warnings:
         ledger.warn(warning)
     done, begin = count(1), time.perf_counter()

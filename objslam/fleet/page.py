@@ -51,7 +51,8 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
         version=__version__,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         found=found,
-        hours=hours,
+        spent=duration(hours),
+        robots=any(one.place.robot for one in found.mapped),
         cost=hours * price,
         sites=[(one, f"{SITES}/{quote(folder_of(one.site))}", _told(of_site[one.site])) for one in found.sites],
         failures=found.failures[:_FAILURES],
@@ -61,6 +62,13 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
         objects=OBJECTS,
     )
     return page.encode("utf-8", errors="replace")
+
+
+def duration(hours: float) -> str:
+    """Return a time in the unit that suits it, such as 15 s, 4.2 min or 31.50 h."""
+    if hours >= 1:
+        return f"{hours:.2f} h"
+    return f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.0f} s"
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:

@@ -171,6 +171,9 @@ def _read_cameras(path: Path, ledger: Ledger) -> tuple[CameraLog, ...]:
 
 
 def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLog:
+    if not (folder / CAMERA).exists():
+        hint = "write one with the image's size, camera_matrix, the distortion and base_T_camera, as README.md shows"
+        raise LogError(f"there is no {CAMERA}", where=str(folder), hint=hint)
     mount = read_trajectory(folder / MOUNT, ledger) if (folder / MOUNT).exists() else None
     detections = folder / DETECTIONS
     return CameraLog(

@@ -12,6 +12,8 @@ from objslam.core.arrays import Floats
 Shape = Literal["point", "sphere", "ellipsoid", "cuboid"]
 SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid")
 """The shapes of objects. A point has no size."""
+UNKNOWN_YAW = float(np.pi / np.sqrt(12))
+"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Body:
 
     shape: `cuboid`, `ellipsoid`, or `sphere` if the boxes fit a sphere as well as an ellipsoid. size: (3,) m, the full
     length, width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the
-    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most 0.91, which means an unknown yaw.
+    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most `UNKNOWN_YAW`, for an unknown yaw.
     """
 
     shape: Shape
