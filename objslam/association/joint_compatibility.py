@@ -12,7 +12,7 @@ from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
-_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds keep fewer.
+_MIN_ODDS = 4.5  # The least log odds of "the ray's landmark" over "an unknown object". Larger odds keep fewer rays.
 _MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 

@@ -121,7 +121,7 @@ class _Problem:
 
     offset: (N, 3) m, target: (M, 3) m: the landmarks `here` and `there` relative to the pivot. For each pair of them,
     information: (N, M, 3, 3) m^-2, the inverse covariance of their distance in x, y and z. spread: (N, M) m, its horizontal
-    standard deviation. peak: (N, M) the gain of a pair at distance 0. possible: (N, M) which may be the same landmark.
+    standard deviation. peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark.
     prior: (3, 3) covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) its inverse.
     """
 

@@ -1,7 +1,7 @@
 """Initialise poses and landmarks with a known association, by growing the graph along the path.
 
-From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes are added a few at a time, and a sliding
-window is solved each time. They start at the last solved pose plus odometry. A landmark is added when its rays determine it.
+From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes are added a few at a time, at the last
+solved pose plus odometry. Each time, a sliding window is solved. A landmark is added when its rays determine it.
 """
 
 from collections.abc import Callable

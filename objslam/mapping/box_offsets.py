@@ -22,10 +22,10 @@ from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
 _SHARES = 81
 """The number of values that `_share` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 4.0
-"""The largest share that `_share` tries, in standard deviations of its prior. A larger value admits worse detectors."""
+"""The largest share that `_share` tries, in standard deviations of its prior. A larger value allows worse detectors."""
 _LOOSE = 1.0
-"""The standard deviation (m) of the error of a solved position in `_share`, before its rays count. A larger value lets the
-error of the position explain more of what the rays miss."""
+"""The prior standard deviation (m) of the error of a solved position, in `_share`. With a larger value, the rays decide
+more."""
 _POOLED = 20.0
 """The number of an object's rays at which their scatter weighs as much as the scatter of all rays. With a larger number,
 objects differ less."""

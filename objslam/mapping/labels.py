@@ -98,7 +98,7 @@ def noise_explains(
 
 
 def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> None:
-    """Warn if the settings fix the noise at less than `estimate` found, an estimate in which each label is one object."""
+    """Warn if the settings fix the noise, and `estimate` found more. In `estimate`, each label is one object."""
     said = errors.with_unknown_noise().unknown_noise - errors.unknown_noise
     if estimate.noise is None or not said:
         return

@@ -28,11 +28,12 @@ _CENTRE = np.zeros(2)
 def bearings(
     keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
+    """Return a factor for each ray on the angle (rad) between the ray and L(landmark).
 
-    offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
-    with an offset. So a ray with an offset gets an equidistant camera of focal length 1 px that looks along the ray. The
-    distance of the landmark from the centre of its image is the angle. Behind the camera the error is larger and constant.
+    directions: (R, 3) in the frame of X(keyframe). offset: (R, 3) m, the origin of each ray in this frame. None means the
+    origin of the frame. GTSAM has no bearing factor with an offset. So a ray with an offset gets an equidistant camera of
+    focal length 1 px that looks along the ray. The distance of the landmark from the centre of its image is the angle.
+    Behind the camera the error is larger and constant.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
@@ -50,10 +51,10 @@ def bearings(
 def point_to_line(
     keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray on the distance (m, Eq. 1) between the ray and L(landmark).
 
-    The directions (R, 3) and the ray origins `offset` (R, 3), m, are in the frame of X(keyframe), which is a variable. If
-    `offset` is None, all rays begin at the origin of this frame.
+    directions: (R, 3) in the frame of X(keyframe). offset: (R, 3) m, the origin of each ray in this frame. None means the
+    origin of the frame.
     """
     origins = np.zeros_like(directions) if offset is None else offset
     make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(origins, directions)
@@ -64,9 +65,9 @@ def point_to_line(
 
 
 def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray with a known origin on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray on the distance (m, Eq. 1) between the ray and L(landmark), for fixed poses.
 
-    Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
+    origins, directions: (R, 3) in map. The norm of the residual is the distance.
     """
     make, camera = gtsam.TriangulationFactorCal3DS2, gtsam.PinholeCameraCal3DS2
     return [
@@ -76,9 +77,9 @@ def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noi
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a distant camera for each ray. It looks along the ray, which has an origin (R, 3) and a direction (R, 3).
+    """Return a camera for each ray, far behind its origin (R, 3) m, looking along its direction (R, 3).
 
-    The coordinates of a point in its image are the offset (m) of the point across the ray.
+    The coordinates of a point in the image are the offset (m) of the point across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     return _poses(origins - STANDOFF * n, n)
@@ -146,6 +147,6 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
 
 
 def _poses(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a camera for each ray. It is at the ray's origin (R, 3), m, and looks along its unit direction (R, 3)."""
+    """Return a camera pose for each ray: at its origin (R, 3), m, looking along its unit direction (R, 3)."""
     axes = np.concatenate([tangent_basis(directions), directions[:, :, None]], axis=2)
     return [gtsam.Pose3(pose) for pose in make_pose(axes, origins)]

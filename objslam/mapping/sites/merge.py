@@ -75,9 +75,10 @@ def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
 def _tree(
     left: list[int], edges: dict[tuple[int, int], Registration]
 ) -> tuple[list[int], list[tuple[int, Floats]], list[float]]:
-    """Return a spanning tree of the registrations `edges`, from the first session of `left`, the best log odds first (Prim).
+    """Return the spanning tree of the registrations `edges` with the best log odds, from the first session of `left` (Prim).
 
-    The lists are its sessions, the parent of each with the pose (4, 4) in the parent's frame, and the log odds of this tie.
+    The three lists are its sessions, the parent of each session with the pose (4, 4) in the parent's frame, and the log
+    odds.
     """
     order, starts, odds = [left[0]], [(left[0], np.eye(4))], [np.nan]
     while True:

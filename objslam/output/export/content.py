@@ -29,7 +29,7 @@ class Datum:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse the text "latitude,longitude,heading"; ConfigError if the text is malformed or out of range."""
+        """Parse the text "latitude,longitude,heading". ConfigError if the text is malformed or out of range."""
         try:
             latitude, longitude, heading = (float(part) for part in text.split(","))
         except ValueError as error:
@@ -64,11 +64,11 @@ class Datum:
 class Content:
     """A result to export."""
 
-    out: Path  # The result folder; error messages name it.
+    out: Path  # The result folder. Error messages name it.
     objects: ObjectMap
     path: Trajectory  # map_T_base at the stamp of each keyframe.
-    motions: Motions | None  # The odometry between consecutive poses of the path; None if the run used no odometry.
-    datum: Datum | None = None  # The position of the map on the earth; None if it is unknown.
+    motions: Motions | None  # The odometry between consecutive poses of the path. None without odometry.
+    datum: Datum | None = None  # The position of the map on the earth. None if unknown.
 
 
 def load_content(out: Path, datum: Datum | None = None) -> Content:

@@ -78,7 +78,7 @@ def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: f
 def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
     """Send an image for each stamp with an index in `shown` (n,), and return the number of unreadable images.
 
-    The other stamps get no image, because their boxes do not fit the image of another stamp.
+    All other stamps get an empty image. An older image would not fit their boxes.
     """
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
     for place, blob in zip(shown.tolist(), images, strict=True):
