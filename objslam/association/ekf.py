@@ -182,7 +182,7 @@ def update(f: Filter, expected: Expected) -> tuple[Floats, Floats]:
 
 
 def differences(f: Filter, one: Ints, two: Ints) -> tuple[Floats, Floats]:
-    """Return the offset (P, 3) m from one landmark to the other of each pair, and its covariance (P, 3, 3)."""
+    """Return the offsets (P, 3) m from landmarks `one` (P,) to landmarks `two` (P,), and their covariances (P, 3, 3)."""
     block = f.covariance[f.head :, f.head :].reshape(len(f), 3, len(f), 3)
     mixed = block[one, :, two]
     return f.position[two] - f.position[one], block[one, :, one] + block[two, :, two] - mixed - mixed.swapaxes(1, 2)

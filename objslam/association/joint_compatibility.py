@@ -1,6 +1,6 @@
 """Test the joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-After such a way, gates are wide and may contain unknown objects. So a single pose error must explain all residuals together.
+After a long way, gates are wide and may contain unknown objects. So a single pose error must explain all residuals together.
 """
 
 import numpy as np
@@ -55,9 +55,9 @@ def jointly_compatible(
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
     """Return the expected number (n,) of unknown objects with the label of the ray's landmark, per steradian along each ray.
 
-    Unknown objects are assumed to be spread evenly over the room, and visible to its end, or at most as far as a landmark
-    was seen. rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a
-    known one. It is taken for the ratio of unknown to known objects.
+    Unknown objects are assumed to be everywhere in the room, and to be visible as far as a landmark was seen. rows: (n,) the
+    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known one. It is taken for
+    the ratio of unknown to known objects.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -21,7 +21,7 @@ _CONCENTRATION = 5.0
 """How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
 distribution. A larger value makes many misses count more. Offline association finds values around this one."""
 _RATE = 0.5
-"""The share of looks that detect an object of which nothing is known. A larger value makes a miss count more."""
+"""The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0
 """`_RATE` counts as much as this number of looks at the object. A larger value needs more looks to change the rate."""
 _LEAST, _MOST = 1e-9, 1 - 1e-9

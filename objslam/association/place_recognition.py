@@ -119,10 +119,10 @@ def recognise_place(
 class _Problem:
     """The matching problem of `recognise_place`, with N landmarks `here` and M landmarks `there`.
 
-    offset: (N, 3) m, target: (M, 3) m: the landmarks `here` and `there` relative to the pivot. For each pair of them,
-    information: (N, M, 3, 3) m^-2, the inverse covariance of their distance in x, y and z. spread: (N, M) m, its horizontal
-    standard deviation. peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark.
-    prior: (3, 3) covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) its inverse.
+    offset: (N, 3) m, target: (M, 3) m: the landmarks `here` and `there` relative to the pivot. information: (N, M, 3, 3)
+    m^-2, the inverse covariance of the offset between two of them. spread: (N, M) m, its horizontal standard deviation.
+    peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark. prior: (3, 3)
+    covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) its inverse.
     """
 
     offset: Floats
@@ -148,7 +148,7 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the pairs (C,), (C,) of a landmark here and one there that may be the same within the drift. If there are more
+    """Return the pairs (C,), (C,) of landmarks here and there that may be one landmark within the drift. If there are more
     than `_CANDIDATES`, those remain whose landmark here has the fewest partners."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)

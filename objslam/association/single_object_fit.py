@@ -69,7 +69,7 @@ def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Flo
     tried = np.concatenate([middle, obs.origin[ranged] + obs.range[ranged, None] * obs.direction[ranged]])
     if not len(tried):
         return None
-    # The same residuals as in `refinement`, for all points and rays at once.
+    # Residuals as in `refinement`, but for all points and rays at once.
     to = tried[:, None] - obs.origin  # (H, R, 3)
     depth = np.einsum("hri,ri->hr", to, obs.direction)
     distance2 = np.einsum("hri,hri->hr", to, to)

@@ -31,8 +31,8 @@ class GrowingGraph(ABC):
         self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # Not in the estimate yet.
         self._rebuild: IncrementalRebuild | None = None
         self._newest, self._updates = -1, 0
-        self._touched: dict[int, int] = {}  # By landmark: the last update that involved it.
-        self._outgrown = False  # Whether a variable has a letter that the present iSAM2 does not know.
+        self._touched: dict[int, int] = {}  # The last update that involved each landmark.
+        self._outgrown = False  # Whether a variable's letter (of its symbol) is unknown to the present iSAM2.
 
     @abstractmethod
     def refresh(self) -> None:

@@ -49,7 +49,7 @@ class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
     correction: (4, 4) moves the current poses in map to where they should be. now: (P,) the recent landmarks. before: (P,)
-    the old landmark that each of them is. evidence: the log odds of the loop.
+    for each of these the old landmark. evidence: the log odds of the loop.
     """
 
     correction: Floats

@@ -104,7 +104,7 @@ def rejected_stretches(rays: Rays, association: Association, found: JointSolutio
 def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, association: Association) -> float:
     """Return the cost of camera poses (K, 4, 4) and positions (N, 3), to compare two solutions of the same rays.
 
-    An unknown position is NaN. A ray to such an object costs `STRAY_RAY`.
+    A ray to an object at an unknown position (NaN) costs `STRAY_RAY`.
     """
     placed = np.isfinite(positions[:, 0])
     owner = np.where((association.object >= 0) & placed[association.object], association.object, -1)

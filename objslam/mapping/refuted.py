@@ -32,11 +32,11 @@ _NOISE = 2.0
 """The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With more
 noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
-"""A finding stands only if a solve without the fault explains this share more. A larger share refutes more findings."""
+"""A finding stands only if a solve without the fault explains this share of the rays more. A larger share refutes more."""
 _IN_BOTH = 0.4
 """The halves of a log agree if, in each half, at least this share of the explained rays is of objects that both halves see
-(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs with such a finding have 0.63 and more. Logs of
-two recordings have at most 0.23, even if the solve explains the rays of both."""
+(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs have 0.63 and more. Logs of two recordings have
+at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:

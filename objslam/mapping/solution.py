@@ -22,9 +22,9 @@ class Solution:
     """The solved association and estimate, with the keyframes and rays that were solved.
 
     keyframes: all with at least one ray. rays: with indices into these keyframes. rounds: counts of each round of
-    association and solve. trace: the same rounds for the recording, empty without one. bodies: the body of each object, None
-    for a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of
-    half the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
+    association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
+    a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
+    the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
     body. The last three are None if no bodies were solved.
     """
 

@@ -22,7 +22,7 @@ _STEPS = 30
 _ROUNDS = 10
 """The most estimates of the maps' noise, each followed by a solve. More are slower, and hardly change the noise."""
 _SAME_NOISE = 0.02
-"""The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
+"""The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
 _FEWEST_MAPS = 3
 """The least number of maps for which the noise is estimated. The residuals of two maps do not tell which is worse."""
 _POOLED = 10.0
@@ -147,8 +147,8 @@ def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:
 def _reduced(
     measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, frames: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the system and the right side for the frames after the first, and the information (N, S, 3, 4) that ties each
-    object to each frame."""
+    """Return the matrix and the right side of the linear system of the frames after the first. Also the information
+    (N, S, 3, 4) between each object and each frame."""
     count = len(total)
     pull = information @ lever
     half = np.zeros((count, frames, 3, 4))

@@ -82,9 +82,9 @@ def register_maps(a: Constellation, b: Constellation) -> Registration:
     """Find the transform (yaw and translation) from the frame of a to the frame of b. Both maps use the same label numbers.
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
-    of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is the sum, over
-    the objects of a, of the local density of objects in b, times the area of the gate, times the share of the objects of b
-    with the same label and height.
+    of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
+    the objects of a. Each adds the local density of objects in b, times the area of the gate, times the share of the objects
+    of b that have its label and height.
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:

@@ -71,7 +71,7 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     x[:, :3] = (ends_b - move(x, ends_a[:, None])[:, 0]) / 2
     support = _support(problem, i[p], k[q], yaw, (var_a[p] + var_b[q]) / long_a[p] ** 2)
     best = np.argsort(-support, kind="stable")
-    # Proposals in one cell of a metre and 0.2 rad are one place. Only the best of them remains.
+    # Proposals in one cell of a metre and 0.2 rad are one place. Only the best one remains.
     cell = np.round(np.column_stack([x[:, :2], np.mod(yaw, 2 * np.pi) / 0.2]))[best]
     best = best[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
     return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair is in the list in both orders.

@@ -99,7 +99,7 @@ def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None
     """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
     In GTSAM's bearing factor (no offset, not metric), they are perpendicular to the line from the origin to the landmark. In
-    the other factors, they are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
+    all other factors, they are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
     """
     if metric:
         return tangent_basis(directions)
@@ -133,7 +133,7 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
     length = np.linalg.norm(to_landmark, axis=1)
     by_position = across / length[:, None, None]
     away = np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
-    if away.any():  # In the camera of `bearings`, the landmark has depth z and distance r from the axis.
+    if away.any():  # In the camera of `bearings`, the landmark has depth z, and distance r from the optical axis.
         flat = (across[away] @ to_landmark[away, :, None])[..., 0]
         r, z = np.linalg.norm(flat, axis=1), np.einsum("ri,ri->r", directions[away], to_landmark[away])
         outward = flat / np.maximum(r, 1e-300)[:, None]

@@ -34,7 +34,7 @@ _ITERATIONS = 50
 
 @dataclass(frozen=True)
 class MapObjects:
-    """M objects of an older map that the drive saw. index: (M,) the same objects in the drive.
+    """M objects of an older map that the drive saw. index: (M,) their indices in the drive.
 
     positions: (M, 3) m and covariance: (M, 3, 3) m^2, in the frame of the map.
     """

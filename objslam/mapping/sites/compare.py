@@ -68,7 +68,7 @@ def compare(a: Session, b: Session) -> Comparison:
 
 
 def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
-    """Return the probability (N,) that each object was in session `a` too, if `a` had its place in view and did not find
+    """Return the probability (N,) that each object was there in session `a`, which looked at its place and did not find
     it."""
     looks = a.looks(items, np.array([o.position for o in items]).reshape(-1, 3), np.eye(4))
     lives = np.array([(0, 0) if o.life is None else (o.life.looks, o.life.detections) for o in items]).reshape(-1, 2)

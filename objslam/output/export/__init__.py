@@ -21,7 +21,7 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
     Args:
         to: the name of a format in `FORMATS`.
-        file: the file to write; by default the format's usual file in `out`.
+        file: the file to write, by default the format's usual file in `out`.
         datum: the position of the map on the earth.
     Raises:
         ConfigError: the format does not exist, or it cannot use the given datum.

@@ -1,4 +1,4 @@
-"""Conversion of a map to ROS 2 messages (objects, markers, path), for MCAP files and for DDS; ROS is not needed.
+"""Convert a map to ROS 2 messages (objects, markers, path), for MCAP files and for DDS. ROS is not needed.
 
 Sources: https://docs.ros.org/en/rolling/p/vision_msgs, https://docs.ros.org/en/rolling/p/visualization_msgs.
 """

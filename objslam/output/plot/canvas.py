@@ -142,7 +142,7 @@ def text_width(text: str, size: float) -> int:
 def draw_text(
     image: Image, text: str, corner: tuple[float, float], size: float, colour: Colour, *, halo: bool = False
 ) -> None:
-    """Draw a text whose box has its upper left corner at x, y, px. size: of the font, px. halo: whether white surrounds
+    """Draw a text in a box with its upper left corner at x, y, px. size: of the font, px. halo: whether white is around
     it."""
     x, y = round(corner[0]), round(corner[1])
     wide, high = text_width(text, size), round(1.25 * size)
@@ -165,8 +165,7 @@ def draw_text(
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the content of a PNG file with 256 colours. It looks the same as with all, at a fifth of the
-    size."""
+    """Return an image as the content of a PNG file with 256 colours. It looks alike, and has a fifth of the size."""
     from PIL import Image as Picture
 
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(

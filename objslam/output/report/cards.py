@@ -46,7 +46,7 @@ class Card:
     seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
     rejected: int  # The number of rejected rays.
     promised_deg: float | None  # The rms residual, deg, expected by the sigmas of the used rays. None without used rays.
-    error: float | None  # The distance from the matching true object, m; None without a match.
+    error: float | None  # The distance from the matching true object, m. None without a match.
     matched: str | None  # A text that names the matching true object.
     histogram: Histogram | None
     timeline: Timeline | None

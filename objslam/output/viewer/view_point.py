@@ -28,7 +28,7 @@ class ViewPoint:
 
     position: Floats  # (3,) m in map.
     target: Floats  # (3,) m in map, at the centre of the view.
-    axes: Floats  # (3, 3); the rows point right, up and towards the target.
+    axes: Floats  # (3, 3), the rows point right, up and towards the target.
     focal: float  # The focal length, px.
     up: Floats  # (3,) the unit vector in map that points up in the world.
 
@@ -96,10 +96,10 @@ def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid
     A label without a free place hangs below its object.
 
     Args:
-        anchors: (N, 3) the objects, m in map; a label has the depth of its object.
+        anchors: (N, 3) the objects, m in map. A label has the depth of its object.
         avoid: (P, 3) points, m in map, that the labels should not cover.
     Returns:
-        The centres (N, 3) of the labels' upper edges, and the points (N, 3) at which leader lines meet the labels; m in map.
+        The centres (N, 3) of the labels' upper edges, and the points (N, 3) at which leader lines meet the labels, m in map.
     """
     if len(anchors) == 0:
         return anchors, anchors
@@ -120,7 +120,7 @@ def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, floa
         frame: (S,) the image of each dot.
         dots: (S, 2) px of the image.
         letters: (S,) the number of letters of each label.
-        size: width and height of the images, px; the viewer scales an image to its view.
+        size: width and height of the images, px. The viewer scales an image to its view.
     Returns:
         The positions (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
     """

@@ -68,7 +68,7 @@ class LiveView:
         """Start to log to a recording file, to the viewer at an address, or to both.
 
         Args:
-            file: the recording; it can be read at any time.
+            file: the recording. It can be read at any time.
             image: finds the images of camera frames. The thread of the view calls this function.
             server: a viewer to stop at the end.
         Raises:

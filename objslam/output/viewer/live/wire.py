@@ -26,10 +26,10 @@ _FRAME = ("stamp", "map_T_camera", "boxes", "objects", "rejected")  # The fields
 class ShownSnapshot:
     """The part of a snapshot that the view shows."""
 
-    stamp: float  # The stamp of the newest keyframe, s; NaN without keyframes.
+    stamp: float  # The stamp of the newest keyframe, s. NaN without keyframes.
     map: ObjectMap
     path: Floats  # (n, 3) positions of the base, m in map, evenly chosen.
-    base: Floats | None  # (4, 4) the newest map_T_base; None without keyframes.
+    base: Floats | None  # (4, 4) the newest map_T_base. None without keyframes.
     numbers: dict[str, float]  # Counts: keyframes, rebuilds, unseen snapshots. Times, s: lag; p50, p99 of an update.
     counters: dict[str, int]  # The number of accepted messages by kind.
     dropped: dict[str, int]  # The number of dropped messages by reason.
