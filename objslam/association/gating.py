@@ -75,8 +75,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of pairs that may be within the gate. Of at most `_FEW_PAIRS` pairs, these are all
-    with the landmark in front. Of more pairs, a lower bound of the deviation, by fast matrix products, leaves out most."""
+    """Return the rays and the landmarks of pairs that may be within the gate. The landmark of each pair is in front of the
+    camera. If there are more than `_FEW_PAIRS` pairs, a bound on the deviation, by fast matrix products, leaves out most."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)

@@ -33,7 +33,7 @@ _RECENT = 300
 """The number of frames after its first ray during which a landmark can be tied to an older one. A larger number is
 slower."""
 _SURE = 4.0
-"""The least log odds of a match against the best assignment without this match. Larger odds match fewer rays."""
+"""The least log odds of a sure match over the best assignment without it. Larger odds match fewer rays."""
 _NEW = 0.2
 """The prior probability that a ray belongs to no known landmark. A larger value accepts fewer matches."""
 _PAIRS = 40
@@ -128,7 +128,7 @@ class _Exploration:
         return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 
     def _see(self, rays: Ints, now: int) -> None:
-        """Assign the rays of a frame, and correct the filter. A free ray with a range makes a landmark unless doubtful."""
+        """Assign the rays of a frame, and correct the filter. A ray with a range and no match makes a landmark."""
         if len(self.filter) and len(rays):
             self._match(rays)
         free = rays[(self.owner[rays] < 0) & ~self.doubtful[rays] & np.isfinite(self.rays.range[rays])]
@@ -164,7 +164,7 @@ class _Exploration:
             self._learn(*ekf.update(f, expected.take(chosen)))
 
     def _learn(self, step: Floats, expected: Floats) -> None:
-        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with its expected covariance (3, 3)."""
+        """Adapt `roughness` to a correction `step` (3,) of yaw, x and y, with its expected covariance (3, 3)."""
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)

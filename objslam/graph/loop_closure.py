@@ -122,8 +122,8 @@ def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
     """Return covariances (3, 3) of the x, y (m) and yaw (rad) of keyframe `now` relative to each anchor, in the axes of map.
 
-    anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`, none if it is not finite. The
-    variance of `POSE_FLOOR` is added before the factor.
+    anchors: keyframes. Each anchor before `now` with a finite covariance gives one for each factor in `_SLIPS`. They include
+    `POSE_FLOOR`.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]

@@ -78,7 +78,7 @@ def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
 
 def _change(item: MapObject, seen_by: tuple[int, ...], *, new: bool) -> Change:
     """Return the change of one object. seen_by: the sessions that found it, 0 for the earlier and 1 for the later one. new:
-    whether it is new if only the later session found it. It is not if the earlier session looked at its place too rarely."""
+    whether an object that only the later session found counts as new. If not, it is `unseen`."""
     assert item.life is not None
     p = item.life.probability
     if item.life.state == "gone":

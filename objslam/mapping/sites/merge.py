@@ -26,8 +26,8 @@ from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
 _REMEMBERED = 5
-"""The largest number of sessions as which an object of a site counts in the next solve. With a larger number, the position
-averages more sessions, and follows a nudged object more slowly."""
+"""In a solve, an object of a site weighs as much as its number of sessions, up to this number. With a larger number, its
+position averages more sessions, and follows a nudged object more slowly."""
 _YOUNG = 2
 """An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
 takes more added objects for moved ones."""
@@ -226,7 +226,7 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return the tracks without such gone ones.
+    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return the tracks except these gone ones.
 
     The new track takes the number of the gone one. begun: the tracks so far. came: the tracks that a later site brought.
     They count as new, however many sessions of that site saw them.
