@@ -9,19 +9,19 @@ from objslam.core.types import Rays
 
 _GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
 _MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y. A larger value costs time.
-_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m). Later association corrects the rest.
+_FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m). Finer corrections are left to association.
 _LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
-_MIN_LEVEL = 0.1  # The least cosine of a ray's elevation by which its heading noise is divided.
+_MIN_LEVEL = 0.1  # Heading noise is a ray's noise over the cosine of its elevation. This is the least cosine.
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
-_MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations, because the range may be wrong.
+_MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations. Some ranges are wrong.
 
 
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
     """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
 
-    Each ray costs its squared deviation from the best landmark of its label, but no more than `STRAY_RAY`. positions,
-    labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
-    standard deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
+    The cost of a ray is its squared deviation from the best landmark of its label, at most `STRAY_RAY`. positions, labels:
+    (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,) standard
+    deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -41,7 +41,7 @@ def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, cen
 def _misfit(
     rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
 ) -> Floats:
-    """Return the sum (H,) of the costs of all rays under each correction (H, 3)."""
+    """Return the cost (H,) of all rays together under each of the corrections (H, 3)."""
     origin, direction = rays.in_map(map_T_camera)
     offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
     cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])
@@ -60,6 +60,6 @@ def _misfit(
 
 
 def _steps(sigma: float, finest: float, most: int) -> Floats:
-    """Return the grid values along one axis, which include 0. finest: the least step. most: the most steps."""
+    """Return the grid values along one axis, 0 among them. finest: the least step. most: the largest number of values."""
     half = int(min(np.ceil(_GRID_SIGMAS * sigma / finest), most // 2))
     return np.linspace(-_GRID_SIGMAS * sigma, _GRID_SIGMAS * sigma, 2 * half + 1) if half else np.zeros(1)

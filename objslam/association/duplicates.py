@@ -5,13 +5,12 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 TOGETHER = 0.03
-"""If two objects are seen together in more than this share of frames, they differ. A larger share merges separate
-objects."""
+"""Objects that are seen together in more than this share of frames differ. With a larger share, different objects merge."""
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
-    """Return the pairs a < b (P,) of objects with one label that are less than `farthest` m apart, and the offsets (P, 3) m
-    from b to a."""
+    """Return the pairs a < b (P,) of objects of one label that are less than `farthest` m apart. Also the offsets (P, 3) m,
+    a - b."""
     a, b = np.triu_indices(len(position), 1)
     apart = position[a] - position[b]
     near = (label[a] == label[b]) & (np.linalg.norm(apart, axis=1) < farthest)
@@ -19,5 +18,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. `frames` frames show the rarer one, and `together` of them show both."""
+    """Return whether two objects differ. frames: how many frames show the rarer one. together: how many show both."""
     return together > TOGETHER * frames

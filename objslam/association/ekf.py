@@ -17,16 +17,16 @@ from objslam.core.types import Rays
 POSE = 3
 """The number of state entries of the pose: its errors in yaw (rad), x and y (m), along the axes of map."""
 _LEAST = 1e-12
-"""The variance added in each correction. It keeps covariances positive definite. A larger variance forgets sooner."""
+"""The variance added to each state entry in each correction, to keep the covariance positive definite. With a larger
+variance, the filter trusts older rays less."""
 _LEAST_DISTANCE = 1e-3
-"""The least distance (m) of a landmark by which a residual is divided. With a larger value, landmarks right in front count
-less."""
+"""The least distance (m) by which a residual is divided. With a larger value, landmarks right at the camera count less."""
 
 
 @dataclass
 class Filter:
     """The state of the filter. map_T_base: (4, 4). shared: (S,) errors that all motions share. position: (N, 3) m of
-    landmarks. covariance: of the errors of yaw, x and y, of the shared errors, and of all positions, in this order."""
+    landmarks. covariance: (3 + S + 3N)^2, of yaw, x and y, then the shared errors, then the positions."""
 
     map_T_base: Floats
     shared: Floats
@@ -53,8 +53,8 @@ class Filter:
 
 @dataclass(frozen=True)
 class Sight:
-    """R rays relative to the base. offset: (R, 3) m, the origins of the rays, and direction: (R, 3), both in the base frame.
-    sigma: (R,) rad. range, range_sigma: (R,) m, NaN if unknown."""
+    """R rays relative to the base. offset: (R, 3) m, the origins, and direction: (R, 3), in the base frame. sigma: (R,) rad.
+    range, range_sigma: (R,) m, NaN if unknown."""
 
     offset: Floats
     direction: Floats
@@ -74,7 +74,7 @@ class Expected:
 
     residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
     by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements. Without a range, the last
-    variance is such that it does not change a likelihood. ranged: (P,) whether there is a range.
+    variance is 1 / (2 pi), which makes a likelihood factor of 1. ranged: (P,) whether there is a range.
     """
 
     landmark: Ints
@@ -103,7 +103,7 @@ class Expected:
         return cls(landmark, residual, by_pose, by_landmark, variance, ranged)
 
     def take(self, pairs: Ints) -> Self:
-        """Select pairs."""
+        """Select pairs by their indices."""
         return type(self)(*(getattr(self, each.name)[pairs] for each in fields(self)))
 
     def jacobian(self, f: Filter) -> Floats:
@@ -115,7 +115,7 @@ class Expected:
 
 
 def predict(f: Filter, motion: Floats, by_shared: Floats, noise: Floats) -> None:
-    """Move the base by a measured motion (4, 4), corrected for its shared errors.
+    """Move the base by a measured motion (4, 4), corrected by the estimated shared errors.
 
     by_shared: (3, S) the derivative of the motion's yaw, x and y by the shared errors. noise: (3, 3) the covariance of the
     motion's yaw, x and y. Both are in the base frame after the motion.
@@ -145,10 +145,9 @@ def individual_covariances(f: Filter, expected: Expected) -> Floats:
 
 
 def within_reach(f: Filter, sight: Sight, ray: Ints, gate: float) -> Bools:
-    """Return a mask (n, N) of the rays (n,) and all landmarks, without pairs whose squared deviation must exceed the gate.
+    """Return which pairs (n, N) of a ray (n,) and a landmark may have a squared deviation within the gate.
 
-    The trace of a landmark's covariance relative to the base is at least its variance in any direction. So no pair within
-    the gate is left out.
+    This quick test leaves no such pair out: it uses the trace of a landmark's covariance, the most that a variance can be.
     """
     turn, centre = f.map_T_base[:3, :3], f.map_T_base[:3, 3]
     moved = _carried(f.position - centre)
@@ -165,7 +164,7 @@ def within_reach(f: Filter, sight: Sight, ray: Ints, gate: float) -> Bools:
 
 
 def joint_covariance(f: Filter, expected: Expected) -> Floats:
-    """Return the covariance (P, 3, P, 3) of all residuals. Their noise is independent, because at most one pair of a ray is
+    """Return the covariance (P, 3, P, 3) of all residuals. Pairs of one ray count as independent: at most one of them is
     true."""
     jacobian = expected.jacobian(f).reshape(-1, len(f.covariance))
     total = jacobian @ f.covariance @ jacobian.T
@@ -183,15 +182,15 @@ def update(f: Filter, expected: Expected) -> tuple[Floats, Floats]:
 
 
 def differences(f: Filter, one: Ints, two: Ints) -> tuple[Floats, Floats]:
-    """Return the offset (P, 3) m from one landmark to the other of each pair, and its covariance (P, 3, 3)."""
+    """Return the offsets (P, 3) m from landmarks `one` (P,) to landmarks `two` (P,), and their covariances (P, 3, 3)."""
     block = f.covariance[f.head :, f.head :].reshape(len(f), 3, len(f), 3)
     mixed = block[one, :, two]
     return f.position[two] - f.position[one], block[one, :, one] + block[two, :, two] - mixed - mixed.swapaxes(1, 2)
 
 
 def joint_differences(f: Filter, one: Ints, two: Ints, sigma: float) -> tuple[Floats, Floats]:
-    """Return the offsets as `differences` does, with the covariance (P, 3, P, 3) of all pairs. sigma: m, an additional error
-    of each pair."""
+    """Return the offsets (P, 3) m of `differences`, and their joint covariance (P, 3, P, 3). sigma: m, an additional
+    error."""
     jacobian = _apart(f, one, two)
     total = jacobian @ f.covariance @ jacobian.T
     total[np.diag_indices(len(total))] += sigma**2
@@ -199,12 +198,12 @@ def joint_differences(f: Filter, one: Ints, two: Ints, sigma: float) -> tuple[Fl
 
 
 def tie(f: Filter, one: Ints, two: Ints, sigma: float) -> None:
-    """Correct the state so that the landmarks of each pair (P,), (P,) have the same position, up to `sigma` (m)."""
+    """Correct the state as if landmarks `one` (P,) and `two` (P,) were measured to coincide, with the noise `sigma` (m)."""
     _correct(f, _apart(f, one, two), (f.position[two] - f.position[one]).ravel(), np.full(3 * len(one), sigma**2))
 
 
 def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
-    """Return the Jacobian (3P, D) of the positions of `one` minus those of `two` by the state."""
+    """Return the Jacobian (3P, D) by the state of the positions of `one` minus the positions of `two`."""
     jacobian = np.zeros((len(one), 3, len(f.covariance)))
     for which, sign in ((one, 1.0), (two, -1.0)):
         jacobian[np.arange(len(one))[:, None], np.arange(3), f.columns(which)] = sign
@@ -212,7 +211,7 @@ def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
 
 
 def _carried(arm: Floats) -> Floats:
-    """Return the derivative (P, 3, 3) of points at offsets (P, 3) m from the base by its yaw, x and y."""
+    """Return the derivative (P, 3, 3) by yaw, x and y of the base of points at offsets `arm` (P, 3) m from it."""
     moved = np.zeros((len(arm), 3, POSE))
     moved[:, 0, 0], moved[:, 1, 0], moved[:, 0, 1], moved[:, 1, 2] = -arm[:, 1], arm[:, 0], 1.0, 1.0
     return moved

@@ -22,8 +22,8 @@ _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables ar
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of an area ratio: the image area in which the landmark may appear, divided by the area
-    of the ray's own noise. cost: the sum of deviation, vague and the range cost."""
+    degrees of freedom). vague: 2 ln of the area in the image where the landmark may appear, divided by the area of the ray's
+    own noise. cost: deviation + vague + the cost of the range."""
 
     ray: Ints
     landmark: Ints
@@ -46,9 +46,9 @@ def tangent_basis(direction: Floats) -> Floats:
 def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
     """Return the possible matches of a ray and a landmark.
 
-    The landmark lies ahead of the camera and accepts the label of the ray. The squared bearing deviation of the match is at
-    most `gate`. pose: (R, 6, 6) covariance of the camera pose of each ray. Its first three rows are rotations about the map
-    axes (rad), its last three the position (m).
+    The landmark must be in front of the camera and accept the label of the ray. The squared deviation of the bearing must be
+    at most `gate`. pose: (R, 6, 6) covariance of the camera pose of each ray. Its first three rows are rotations about the
+    map axes (rad), its last three the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]
@@ -75,9 +75,8 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of the pairs that may be within the gate. A few pairs are all returned if the
-    landmark lies ahead. Of many pairs, a lower bound on the deviation leaves out most. It takes only matrix products, which
-    are fast."""
+    """Return the rays and the landmarks of pairs that may be within the gate. The landmark of each pair is in front of the
+    camera. If there are more than `_FEW_PAIRS` pairs, a bound on the deviation, by fast matrix products, leaves out most."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -85,7 +84,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn, move = np.zeros((2, len(obs.label)))
-    if pose is not None:  # Twice the diagonal blocks of a covariance bound it, whatever their correlation.
+    if pose is not None:  # Whatever rotation and position correlate, twice their own blocks bound the covariance.
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
@@ -100,7 +99,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
             depth = n @ p.T - (m * n).sum(axis=1)[:, None]
             distance2 = (m * m).sum(axis=1)[:, None] + p2 - 2 * m @ p.T
             limit = distance2 * ((obs.sigma[r] ** 2)[:, None] * noise2 + turn[r, None]) + obs.position_sigma**2 * noise2
-            limit += spread[which] + move[r, None] + 1e-9  # The constant covers rounding of the products.
+            limit += spread[which] + move[r, None] + 1e-9  # The constant covers rounding errors.
             a, b = np.nonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
             rays.append(r[a])
             found.append(which[b])
@@ -110,10 +109,9 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
 def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -> Ints:
     """Return the landmark (R,) of each ray, or -1, in the assignment with the least total cost.
 
-    A landmark gets at most one ray per frame. Each frame is solved separately. So are parts of a frame that share no ray and
-    no landmark. In most parts, the best edge of each ray, or of each landmark, is the solution. The Hungarian method solves
-    the rest.
-    cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
+    A landmark gets at most one ray per frame. A frame falls into parts that share no ray and no landmark, and each part is
+    solved alone. In most parts, each ray (or each landmark) simply takes its best edge. The Hungarian method solves the
+    rest. cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -147,11 +145,10 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 
 
 def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
-    """Return the best edge of each value of `one`, and (E,) whether the edges belong to a part without conflicts.
+    """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
-    one, other: (E,) the rays and the places of the edges, or the places and the rays. landmark, gain, part: (E,) of the
-    edges. A part has no conflict if the best edges of its values of `one` differ in `other`. Then these edges are the best
-    assignment of the part, because no assignment can gain more. If gains are equal, the lowest landmark is taken.
+    one, other: (E,) the ray and the place of each edge, or the place and the ray. In a part without conflicts, no two best
+    edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the lowest landmark wins.
     """
     order = np.lexsort((landmark, -gain, one))
     best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
@@ -177,9 +174,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
         first, second = linear_sum_assignment(dense, maximize=True)
         real = dense[first, second] > 0
         return first[real], second[real]
-    # Every row of the sparse table needs a pair. So each row also gets its own extra column, which stands for no pair.
+    # The sparse method pairs every row. So each row gets an extra column of its own, which means no pair.
     each = np.arange(rows)
-    value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # Entries of 0 would not count as possible pairs.
+    value = np.concatenate([gain, np.zeros(rows)]) + 1.0  # The sparse method ignores entries of 0.
     entries = (np.append(row, each), np.append(column, columns + each))
     table = csr_array((value, entries), (rows, columns + rows))
     one, other = (np.asarray(found, dtype=np.int64) for found in min_weight_full_bipartite_matching(table, maximize=True))
@@ -187,11 +184,10 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """Return the cost reduction (E,) of each edge. It is `TRACK_GAIN` if the other boxes of the ray's track support the
-    edge, and 0 if they do not.
+    """Return the cost reduction (E,) of each edge: `TRACK_GAIN` if the other boxes of the ray's track support it, else 0.
 
-    They support it if at least two of them, and most of those with a landmark, have the landmark of the edge. track,
-    matched: (R,) the track and the previous landmark of each ray, -1 for none.
+    The track supports an edge if at least two of its other boxes, and most of those with a landmark, have the landmark of
+    the edge. track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))

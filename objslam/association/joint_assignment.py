@@ -1,8 +1,8 @@
 """Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
 
-One error of the pose shifts all measurements of a frame. So each accepted pairing predicts the others. A hypothesis grows
-from its first pairing by the best further pairing, one after the other. The odds of a hypothesis compare it with "all
-measurements are of new things".
+A pairing is a measurement and a landmark that may be the same, a hypothesis is a set of pairings. One error of the pose
+shifts all measurements of a frame, so each accepted pairing predicts the others. A hypothesis grows from one pairing, always
+by the best further one. Its odds compare it with "all measurements are of new things".
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 
 _SEEDS = 6
-"""The number of first pairings from which a hypothesis grows. A larger number is slower, and finds rarer hypotheses."""
+"""The number of pairings from each of which a hypothesis grows. A larger number is slower, and finds rarer hypotheses."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Pairings:
 
 @dataclass(frozen=True)
 class JointAssignment:
-    """The best hypothesis. chosen: (n,) its pairings. margin: (n,) the log odds of the best hypothesis minus the log odds of
-    the best hypothesis without this pairing. rival: (n,) whether this other hypothesis pairs the measurement with another
-    landmark. odds: the log odds of the best hypothesis over "everything is new"."""
+    """The best hypothesis. chosen: (n,) its pairings. odds: its log odds over "everything is new". margin: (n,) these log
+    odds minus those of the second hypothesis, which is the best one without this pairing. rival: (n,) whether the second
+    hypothesis pairs the measurement with another landmark."""
 
     chosen: Ints
     margin: Floats
@@ -75,8 +75,8 @@ def _is_unambiguous(pairings: Pairings, allowed: Bools) -> bool:
 def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     """Return the hypothesis that has all pairings `which` (n,).
 
-    None if one of them is outside the gate given the others, or if the hypothesis is better without it. One inverse of the
-    joint covariance gives the deviation of every residual given all others, so no hypothesis has to grow pairing by pairing.
+    None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This takes one inverse
+    of the joint covariance, instead of one for each step of growth.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape
@@ -95,7 +95,7 @@ def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
 
 
 def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float]:
-    """Return the best hypothesis (n,) of allowed pairings and its log odds, which are 0 if no pairing is likely."""
+    """Return the best hypothesis (n,) of allowed pairings and its log odds: empty and 0 if no pairing is likely."""
     best, most = np.zeros(0, dtype=np.int64), 0.0
     seeds = np.flatnonzero(allowed)
     seeds = seeds[np.argsort(-odds[seeds], kind="stable")][:_SEEDS]
@@ -104,14 +104,14 @@ def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float
         if tried[seed]:
             continue
         chosen, total = _grow(pairings, odds, allowed, seed)
-        tried[chosen] = True  # Its other pairings would grow much the same hypothesis.
+        tried[chosen] = True  # From these pairings, nearly the same hypothesis would grow.
         if total > most:
             best, most = chosen, total
     return best, most
 
 
 def _grow(pairings: Pairings, odds: Floats, allowed: Bools, seed: int) -> tuple[Ints, float]:
-    """Return the hypothesis (n,) that grows from a pairing, and its log odds."""
+    """Return the hypothesis (n,) that grows from the pairing `seed`, and its log odds."""
     size, dimension = pairings.residual.shape
     residual, covariance = pairings.residual.copy(), pairings.covariance.reshape(size * dimension, -1).copy()
     left, total, chosen, current = allowed.copy(), 0.0, list[int](), odds

@@ -1,7 +1,6 @@
 """Test the joint compatibility (after Neira & Tardos, JCBB, 2001) of landmarks that reappear after a long way.
 
-The gates of such landmarks are wide and may contain unknown objects. So a single pose error must explain the offsets of all
-landmarks together.
+After a long way, gates are wide and may contain unknown objects. So a single pose error must explain all residuals together.
 """
 
 import numpy as np
@@ -13,7 +12,7 @@ from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
-_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds keep fewer.
+_MIN_ODDS = 4.5  # The least log odds of "the ray's landmark" over "an unknown object". Larger odds keep fewer rays.
 _MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
@@ -23,9 +22,9 @@ def jointly_compatible(
 ) -> Bools:
     """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
-    A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay. doubt: (6, 6)
-    covariance of the camera's pose relative to the landmarks, in camera coordinates, rotation first. unknown: (n,) expected
-    number of unknown objects per steradian along each ray that have the label of the ray.
+    The least likely ray is removed until each is much more likely of its landmark than of an unknown object, given all rays
+    left. doubt: (6, 6) covariance of the camera's pose relative to the landmarks, in camera coordinates, rotation first.
+    unknown: (n,) expected number of unknown objects per steradian along each ray, with the label of the ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)
@@ -56,9 +55,9 @@ def jointly_compatible(
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
     """Return the expected number (n,) of unknown objects with the label of the ray's landmark, per steradian along each ray.
 
-    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. It is
-    taken for the ratio of unknown to known objects. Unknown objects are spread evenly over the room. They are visible up to
-    the end of the room, but not beyond the greatest distance at which a landmark was seen.
+    Unknown objects are assumed to be everywhere in the room, and to be visible as far as a landmark was seen. rows: (n,) the
+    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known one. It is taken for
+    the ratio of unknown to known objects.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

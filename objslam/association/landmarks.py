@@ -44,10 +44,9 @@ class Landmarks:
 @dataclass(frozen=True)
 class PredictedLandmarks:
     """The n landmarks and candidates that the next frame of a live session may show. The landmarks come first. landmarks:
-    the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped
-    by label alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift up to
-    the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was
-    seen."""
+    their number. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped by label
+    alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift up to the last
+    observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was seen."""
 
     landmarks: int
     id: Ints
@@ -63,7 +62,7 @@ class PredictedLandmarks:
 class State:
     """Landmarks and their observations. matched: (R,) the landmark of each observation, or -1. view: the observed frames.
 
-    Derived values are computed on first use and cached. P of the R rays have a landmark.
+    Properties are computed on first use and cached. R is the number of rays, P the number of rays with a landmark.
     """
 
     obs: Observations
@@ -93,7 +92,7 @@ class State:
 
     @cached_property
     def variance(self) -> Floats:
-        """Variance (P,) m^2 per perpendicular axis of each landmark's offset from its assigned ray."""
+        """Variance (P,) m^2 of the distance between each assigned ray and its landmark, along one axis across the ray."""
         return variance(self.obs, self.distance, self.landmarks.noise[self.owner], self.assigned)
 
     @cached_property
@@ -166,7 +165,7 @@ class State:
         return replace(self, landmarks=self.landmarks.take(which), matched=matched)
 
     def merge(self, target: Ints) -> State:
-        """Merge each landmark into landmark `target` (N,), or leave it unchanged if that is its own index."""
+        """Merge each landmark into the landmark `target` (N,). A landmark whose target is its own index stays."""
         accepts = np.zeros_like(self.landmarks.accepts)
         np.logical_or.at(accepts, target, self.landmarks.accepts)
         landmarks, matched = replace(self.landmarks, accepts=accepts), np.append(target, -1)[self.matched]

@@ -1,4 +1,4 @@
-"""Associate rays with known landmarks by predicted bearing (nearest neighbour), or each label with one object."""
+"""Match rays to known landmarks by their predicted bearings (nearest neighbour), or make one object of each label."""
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def assign(
 def associate_by_label(rays: Rays) -> Association:
     """Make one object for each label with a ray, in the order of label_names.
 
-    In each frame, the box with the highest score of its label gets the object. If scores are equal, it is the first box. All
+    In each frame, the box with the highest score of its label gets the object. Of equal scores, the first box wins. All
     other boxes get no object.
     """
     labels = np.unique(rays.label)

@@ -13,19 +13,17 @@ LIFETIME = 60.0
 """The mean time (days) that an object stays where it is. A larger value needs more misses before an object is gone. At 60
 days, a tenth of the objects change in a week, which is a lived-in place."""
 _OVERLOOKED = 0.03
-"""The probability that a session misses an object in view however often it looks, because of an error of the map, bad light,
-or a person in the way. A larger value needs more misses before an object is gone."""
+"""The probability that all looks of a session miss an object in view for one reason: an error of the map, bad light, or a
+person in the way. A larger value needs more misses before an object is gone."""
 _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0
 """How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
-distribution. A larger value makes many misses count more. It is in the middle of the range that offline association
-finds."""
+distribution. A larger value makes many misses count more. Offline association finds values around this one."""
 _RATE = 0.5
-"""The share of looks that detect an object of which nothing is known. A larger value makes a miss count more."""
+"""The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0
-"""The number of looks as which `_RATE` counts beside the looks at the object. A larger value needs more looks to change the
-rate."""
+"""`_RATE` counts as much as this number of looks at the object. A larger value needs more looks to change the rate."""
 _LEAST, _MOST = 1e-9, 1 - 1e-9
 """The limits of a probability. They let an object come back after any number of misses."""
 
@@ -49,7 +47,7 @@ def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_lo
 
 
 def missed_by_all(looks: Ints, past_looks: Ints, past_detections: Ints) -> Floats:
-    """Return the probability (N,) that none of the looks at an object that is there detects it (beta-binomial)."""
+    """Return the probability (N,) that all `looks` miss an object that is there (beta-binomial)."""
     from scipy.special import betaln
 
     rate = np.clip((past_detections + _RATE * _LOOKS) / (past_looks + _LOOKS), 0.01, 0.99)

@@ -19,11 +19,11 @@ MIN_LANDMARKS = 2
 POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
 _BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot.
-_MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
+_MARGIN = 2.0  # The margin (m) around the landmarks that is part of the area for their density.
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
-_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Two such pairs form a hypothesis.
-_HYPOTHESES = 2000  # The most hypotheses from two pairs, with the longest bases. A larger number costs time.
-_VERIFIED = 20  # The number of hypotheses, by quick score, that get a best assignment. A larger number costs time.
+_CANDIDATES = 3000  # The most pairs of a landmark here and one there. Two pairs form a hypothesis.
+_HYPOTHESES = 2000  # The most hypotheses of two pairs, those with the longest bases. A larger number costs time.
+_VERIFIED = 20  # The number of hypotheses with the best quick scores that get an assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
 _MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
@@ -40,9 +40,9 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Make a constellation of landmarks. Their covariances get larger, because a neighbourhood may be deformed.
+    """Make a constellation of landmarks. Drift deforms a neighbourhood, so the covariances get larger with the distance.
 
-    The added standard deviation grows with the horizontal distance from the pivot (2,) m.
+    pivot: (2,) m, the point from which the horizontal distance counts.
     """
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
@@ -59,8 +59,8 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the best other place.
-    Negative evidence of the other place counts as 0.
+    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place,
+    which counts as at least 0.
     """
 
     correction: Floats
@@ -69,7 +69,7 @@ class Recognition:
     lead: float
 
     def is_sure(self, settings: AssociationSettings) -> bool:
-        """Return whether the match may close a loop."""
+        """Return whether evidence, lead and number of landmarks are enough to close a loop."""
         enough = self.evidence >= settings.loop_evidence and self.lead >= settings.loop_lead
         return enough and len(self.pairs) >= MIN_LANDMARKS
 
@@ -101,7 +101,7 @@ def recognise_place(
         return None
     x = _solve_seeds(problem, _seeds(problem, a, b))
     x = x[np.einsum("hi,ij,hj->h", x, problem.weight, x) <= POSSIBLE_MOTION]
-    # The quick score ignores that a landmark has one partner. Only the best hypotheses get a one-to-one assignment.
+    # In the quick score, several landmarks may share a partner. Only the best hypotheses get a one-to-one assignment.
     order = np.argsort(-_quick_score(problem, a, b, x), kind="stable")[:_VERIFIED]
     evidence, x, pairs = _assigned(problem, a, b, x[order])
     if not len(evidence):
@@ -119,10 +119,10 @@ def recognise_place(
 class _Problem:
     """The matching problem of `recognise_place`, with N landmarks `here` and M landmarks `there`.
 
-    offset: (N, 3) m, the landmarks `here` relative to the pivot. target: (M, 3) m, the landmarks `there` relative to the
-    pivot. A pair is a landmark here and a landmark there. information: (N, M, 3, 3) m^-2, the inverse covariance of the
-    position difference of a pair. spread: (N, M) m, the horizontal standard deviation of this difference. peak: (N, M) the
-    gain of a pair without a difference. weight: (3, 3) inverse of the prior. prior, possible: as in `recognise_place`.
+    offset: (N, 3) m, target: (M, 3) m: the landmarks `here` and `there` relative to the pivot. information: (N, M, 3, 3)
+    m^-2, the inverse covariance of the offset between two of them. spread: (N, M) m, its horizontal standard deviation.
+    peak: (N, M) the gain of a pair at distance 0. possible: (N, M) whether both may be one landmark. prior: (3, 3)
+    covariance of the correction in x, y (m) and yaw (rad). weight: (3, 3) its inverse.
     """
 
     offset: Floats
@@ -148,8 +148,8 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the C pairs (C,), (C,) of landmarks that may be the same within the drift. If there are too many, the most
-    distinctive pairs remain: the landmark here has the fewest partners."""
+    """Return the pairs (C,), (C,) of landmarks here and there that may be one landmark within the drift. If there are more
+    than `_CANDIDATES`, those remain whose landmark here has the fewest partners."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -161,7 +161,7 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2) of two candidates each: every candidate paired with itself, and every two that fit."""
+    """Return hypotheses (H, 2, 2) of two pairs each: all two pairs with fitting distances, and each pair alone (twice)."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])
@@ -182,7 +182,7 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
     a, b = seeds[:, :, 0], seeds[:, :, 1]
     information = problem.information[a, b]
     alone = a[:, 0] == a[:, 1]
-    information[alone] /= 2  # A single candidate is in its seed twice.
+    information[alone] /= 2  # A pair alone is in its hypothesis twice.
     # Two landmarks give the heading in closed form, so Gauss-Newton starts near the solution.
     base, other = problem.offset[a[:, 1]] - problem.offset[a[:, 0]], problem.target[b[:, 1]] - problem.target[b[:, 0]]
     angle = np.arctan2(other[:, 1], other[:, 0]) - np.arctan2(base[:, 1], base[:, 0])
@@ -210,8 +210,7 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, begin: Ints, information:
 
 
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) the candidates, sorted
-    by a."""
+    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) pairs, sorted by a."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
     first = np.flatnonzero(np.diff(a, prepend=-1))
     size = max(1, _GAINS_AT_ONCE // len(a))
@@ -223,24 +222,23 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the log likelihood ratios (H, C) of "one landmark" over "a new one" for each pair under corrections (H, 3).
+    """Return the gains (H, C) of pairs a, b (C,) under corrections (H, 3). A gain is -inf outside the gate.
 
-    a, b: (C,) the pairs. A ratio is -inf for a pair outside a gate.
+    It is the log likelihood ratio of "both are one landmark" over "the landmark here is new".
     """
     return _gain(problem, a, b, problem.target[b] - _moved(problem.offset, x)[0][:, a])
 
 
 def _gain(problem: _Problem, a: Ints, b: Ints, miss: Floats) -> Floats:
-    """Return the log likelihood ratios (..., C) of pairs (C,) whose positions differ by (..., C, 3) m."""
+    """Return the gains (..., C) of pairs (C,) whose positions differ by `miss` (..., C, 3) m."""
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
 def _assigned(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[Floats, Floats, list[Ints]]:
-    """Refine corrections (H, 3). Return their log Bayes factors (G,), the corrections (G, 3), and their best assignments.
+    """Refine corrections (H, 3) with the best assignments (P, 2). Return evidence (G,), corrections (G, 3) and assignments.
 
-    A correction is left out if no pair gains, or if a pair leaves its gate. one, two: (C,) the candidates. An assignment has
-    the shape (P, 2).
+    G <= H: a correction is left out if no pair gains, or if a pair leaves its gate. one, two: (C,) the possible pairs.
     """
     gain = np.zeros(problem.possible.shape)
     hessian = np.zeros((len(x), 3, 3))
@@ -261,7 +259,7 @@ def _assigned(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[Float
         x, hessian = _gauss_newton(problem, a, b, begin, problem.information[a, b], x[kept])
     at = _moved(problem.offset[a][:, None], np.repeat(x, [len(p) for p in pairs], axis=0))[0][:, 0]
     final = np.add.reduceat(_gain(problem, a, b, problem.target[b] - at), begin)
-    # Laplace's approximation multiplies the prior density at x with the volume that the landmarks leave open.
+    # Laplace's approximation: the prior density at x times the volume that the landmarks leave open.
     occam = 0.5 * (np.linalg.slogdet(problem.weight)[1] - np.linalg.slogdet(hessian)[1])
     evidence = final - 0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x) + occam
     inside = np.isfinite(final)

@@ -1,6 +1,6 @@
-"""Triangulate one object of a live session by RANSAC, as `triangulation` does for all objects of a log.
+"""Triangulate one object of a live session by RANSAC, from pairs of rays.
 
-Both find a consensus by pairs of rays. This module uses numpy, because a call of torch takes too long for a frame.
+The room `triangulation` does this for all objects of a log. Its calls of torch take too long for one frame.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from objslam.core.statistics import OUTLIER_RAY
 _MOST_PAIRS = 300  # The most ray pairs that are tried. A larger value costs time.
 _MOST_RAYS = 60  # The most rays from which pairs and the parallax are taken.
 _MIN_ANGLE = np.radians(1.0)  # The least angle (rad) between the two rays of a pair.
-_FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis, so that unobserved directions are known to 100 m.
+_FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis: a prior of 100 m, for directions that no ray fixes.
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class PointFit:
 
 
 def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -> PointFit | None:
-    """Fit the point on which most rays agree. None if no two rays agree. slack: m, standard deviation added to the
-    origins."""
+    """Fit the point on which most rays agree. None if no two rays agree. slack: m, the standard deviation of the origins."""
     start = _consensus(obs, rng, slack)
     if start is None:
         return None
@@ -56,8 +55,8 @@ def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -
 
 
 def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Floats | None:
-    """Return the point (3,) with the least robust cost, among the midpoints of ray pairs and the ends of ranges. None if no
-    pair of rays meets and no ray has a range."""
+    """Return the point (3,) with the least robust cost: the midpoint of two rays, or the end of a range. None without
+    both."""
     count = len(obs)
     some = np.arange(count) if count <= _MOST_RAYS else np.sort(rng.permutation(count)[:_MOST_RAYS])
     a, b = (some[i] for i in np.triu_indices(len(some), 1))
@@ -70,7 +69,7 @@ def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Flo
     tried = np.concatenate([middle, obs.origin[ranged] + obs.range[ranged, None] * obs.direction[ranged]])
     if not len(tried):
         return None
-    # These are the residuals of `refinement`, computed for all points and rays at once.
+    # Residuals as in `refinement`, but for all points and rays at once.
     to = tried[:, None] - obs.origin  # (H, R, 3)
     depth = np.einsum("hri,ri->hr", to, obs.direction)
     distance2 = np.einsum("hri,hri->hr", to, to)

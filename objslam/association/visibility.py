@@ -1,4 +1,4 @@
-"""Determine in which frames each object should be detected, and in which frames it is."""
+"""Find in which frames each object should be detected, and in which it is."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,8 +16,8 @@ from objslam.core.statistics import grouped_median, grouped_quantile, grouped_qu
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
 _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
 _CORE_SHARE = 0.8
-"""The share of a class's boxes that sets its usual distances. They are the boxes of the objects with the most boxes, because
-the other objects may be phantoms. A larger share lets phantoms widen the usual distances."""
+"""The usual distances of a class come from this share of its boxes: those of the objects with the most boxes. Objects with
+few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
 _FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
@@ -31,8 +31,8 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 @dataclass(frozen=True)
 class CameraFrames:
     """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
-    (F, 4, 4). The distance of a usable box from the image edge is at least `margin` px, and at least `margin_share` of the
-    box's size. A negative margin allows any box."""
+    (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
+    With a negative margin, each box counts."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -52,8 +52,8 @@ class CameraFrames:
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains the box of each object. A frame does
-    not count if it is farther away than the greatest usual distance of the class and than all boxes of the object.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, near enough for a
+    detection: within the usual distances of the class, or as near as a box of the object was.
     """
 
     object: Ints
@@ -77,10 +77,9 @@ def detection_history(
 ) -> DetectionHistory:
     """Return in which frames the objects are or should be detected.
 
-    An object should be detected under four conditions. Its box lies in the image. Its distance is within the usual distances
-    of its class, which are widened to include the median distance of its own boxes. No closer box hides it. The camera sees
-    its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,),
-    of the objects.
+    An object should be detected under four conditions. Its box lies in the image. Its distance is in the usual range of its
+    class, extended to the median distance of its own boxes. No closer box hides it. The camera sees its front, if it has
+    one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,), of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
@@ -128,11 +127,11 @@ def thinned(directions: Floats) -> Floats:
 def count_looks(
     position: Floats, extent: Floats, known: list[SeenFrom], view: CameraFrames, obs: Observations, distance: Floats
 ) -> Ints:
-    """Return in how many frames (N,) each object of a map should be detected if it is where the map says.
+    """Return in how many frames (N,) each object of a map should be detected if it is at its position (N, 3) m.
 
-    Its box lies in the image, it is seen from a distance and from a side from which it was detected before, and no closer
-    box covers it. extent: (N, 2) m, NaN where unknown. known: for each object from where it was detected, with the sides in
-    the frame of the positions. obs: the boxes of the frames. distance: (R,) m to the object of each box, NaN where unknown.
+    This takes four conditions: its box lies in the image, distance and side are as in earlier detections, and no closer box
+    covers it. extent: (N, 2) m, NaN where unknown. known: from where each object was detected, with the sides in the frame
+    of the positions. obs: the boxes of the frames. distance: (R,) m to the object of each box, NaN where unknown.
     """
     near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
     found = np.zeros(len(position), dtype=np.int64)
@@ -183,8 +182,8 @@ def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
 def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
     """Return whether a camera at (V, 3) sees the front of its object (V,). A screen, for example, has a front.
 
-    An object has a front if nearly all its boxes come from one half space. Misses from the other half space then tell
-    nothing. origin, index: (P, 3) m and (P,), the camera position and the object of each box.
+    An object has a front if nearly all its boxes come from one half space. Misses from behind then tell nothing. origin,
+    index: (P, 3) m and (P,), the camera position and the object of each box.
     """
     count, toward = len(position), origin - position[index]
     toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
@@ -197,14 +196,14 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box that lies inside an image. reach:
-    (N,) m, the distance up to which each object counts."""
+    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m, up
+    to which distance each object counts."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]
     distance2 = (origin**2).sum(axis=1)[:, None] + (point**2).sum(axis=1) - 2 * origin @ point.T
     depth = ahead @ point.T - (ahead * origin).sum(axis=1)[:, None]
-    # Most objects lie outside this cone and need no projection.
+    # Most objects are outside the cone of view and need no projection.
     bound = np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
     in_cone = (depth > 0) & (depth * depth >= bound) & (distance2 > MIN_DEPTH**2)
     f, n = np.nonzero(in_cone & (distance2 <= (reach + 1e-6) ** 2))

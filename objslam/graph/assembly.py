@@ -1,4 +1,4 @@
-"""Choose the factors of a log's measurements. The initialisations, outlier rejection and the final solve use them."""
+"""Turn the measurements of a log into factors, for the initialisation, the outlier rejection and the final solve."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,9 +29,9 @@ from objslam.graph.variables import make_values
 class Measurements:
     """The measurements of a log, as P multiframes.
 
-    images: the K keyframes before they were joined. keyframes: the first keyframe of each multiframe. The graph has only
-    their poses. rays: in the camera frames of `keyframes`. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions
-    by odometry, None without odometry. tags: the fiducials whose corners are landmarks, None if there are none.
+    images: all K keyframes. keyframes: the first keyframe of each multiframe. Only these have a pose in the graph. rays: in
+    the camera frames of `keyframes`. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions by odometry, None
+    without odometry. tags: the fiducials whose corners are landmarks, None if there are none.
     """
 
     multiframes: Multiframes
@@ -52,7 +52,7 @@ class Measurements:
         multiframes: Multiframes | None = None,
         tags: TagCorners | None = None,
     ) -> Self:
-        """Collect the measurements of keyframes and rays. Without multiframes, each keyframe has its own pose."""
+        """Compute the measurements from keyframes and rays. Without multiframes, each keyframe has its own pose."""
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
         motion, covariance = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
@@ -131,7 +131,7 @@ def fixed_pose_factors(
 ) -> list[gtsam.NonlinearFactor]:
     """Return the factors of rays at fixed poses: first the distance of each ray from its landmark, then the measured ranges.
 
-    The loss `l1` is Eq. 1, which has neither noise nor ranges.
+    With the loss `l1`, this is Eq. 1 of Staszak & Belter, without noise and without ranges.
 
     Args:
         origins, directions: (n, 3), (n, 3) the rays in map.

@@ -1,10 +1,10 @@
 """Find poses, landmarks, and the landmark of each ray by an extended Kalman filter, from odometry and rays.
 
-The filter keeps all correlations between errors. The errors include those that all motions share, such as the one of a
-lagging clock. So the filter knows in each frame where each landmark may appear. The rays of a frame are assigned together,
-because one error of the pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
-After a long way, a landmark that seems new may be an old one. Recent landmarks are tied to old ones if one drift explains
-all pairs much better than chance. The time for a frame grows with the number of landmarks, hardly with that of frames.
+The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance tells where
+in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all of
+them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look new.
+So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame grows
+with the number of landmarks, hardly with the number of frames.
 """
 
 from collections.abc import Callable
@@ -27,30 +27,30 @@ from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
 """A landmark with too few rays is dropped after this number of frames without a ray, or sooner if the heading drifted by
-`HORIZON` since its last ray. Recent landmarks are compared with old ones until this number of frames after the last new
-landmark or tie. A larger number keeps false landmarks longer, and is slower."""
+`HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number keeps
+false landmarks longer."""
 _RECENT = 300
-"""The number of frames after its first ray in which a landmark can be tied to an old one. A larger number is slower."""
+"""The number of frames after its first ray during which a landmark can be tied to an older one. A larger number is
+slower."""
 _SURE = 4.0
-"""The least log odds of a match over the best explanation without this match. Larger odds match fewer rays."""
+"""The least log odds of a sure match over the best assignment without it. Larger odds match fewer rays."""
 _NEW = 0.2
-"""The expected share of rays that belong to no known landmark. A larger share accepts fewer matches."""
+"""The prior probability that a ray belongs to no known landmark. A larger value accepts fewer matches."""
 _PAIRS = 40
-"""The most pairs that are assigned together. The likeliest pairs are taken. A larger number is slower and finds rarer
-assignments."""
+"""The largest number of pairs that are assigned together. A larger number finds rarer assignments, and is slower."""
 _BENT = 0.07
-"""The standard deviation (m) between two estimates of one landmark beyond what the filter expects. A larger value ties more
-landmarks, and confuses neighbours more often."""
+"""The standard deviation (m) of the distance between two estimates of one landmark, in addition to what the filter expects.
+A larger value ties more landmarks, and confuses neighbours more often."""
 _TIED = 0.02
 """The standard deviation (m) of the distance between tied landmarks. A larger value ties them less closely."""
 _EXPLAINED = 0.8
-"""An exploration is reliable if at least this share of the rays has a sure landmark. With ranges, it is 0.86 to 1 in
-simulated rooms and among the posts of Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM robots, whose landmarks stand
-0.18 m apart. With a larger share, fewer explorations are used."""
+"""An exploration is reliable if at least this share of the rays has a landmark. With ranges, the share is 0.86 to 1 in
+simulated rooms and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart.
+With a larger limit, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""How the factors on the motion's variances adapt: the share by which one correction changes a factor, the largest factor,
-and the largest counted ratio of a squared correction to its expectation. Larger values adapt sooner to rough odometry, and
-also to outliers."""
+"""How the factors on the motion's variances adapt to the ratio of a squared correction to its expectation. `_GAIN` is how
+far one ratio moves a factor, `_MOST` the largest factor, `_LARGEST` the largest ratio that counts. Larger values adapt
+sooner to rough odometry, and also to outliers."""
 
 
 def explore(
@@ -60,10 +60,10 @@ def explore(
     progress: Callable[[int, int], None],
     errors: CalibratedMeasurements | None = None,
 ) -> InitialEstimate:
-    """Return poses, landmarks and an association. A ray has no landmark if its match is not sure.
+    """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
-    errors: the same keyframes and rays as a function of shared errors. The filter estimates these errors, starting from
-    their mean. progress(done, total) is called with numbers of keyframes.
+    errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
+    from their mean. progress(done, total) is called with numbers of keyframes.
     """
     if errors is not None:
         keyframes, rays, settings = errors.at(errors.mean)
@@ -73,16 +73,15 @@ def explore(
 def is_sure(start: InitialEstimate) -> bool:
     """Return whether an exploration explains enough rays for a solve to start from it.
 
-    If not, landmarks of one label probably stand closer together than the error of the odometry, and a single frame cannot
-    tell them apart.
+    If not, landmarks of one label probably stand closer together than the error of the odometry.
     """
     return bool((start.association.object >= 0).mean() >= _EXPLAINED)
 
 
 class _Exploration:
-    """The filter at the present frame. label, first, last, hits: (N,) of its landmarks: label, first and last frame, and
-    number of rays. owner: (R,) the landmark of each ray. doubtful: (R,) rays that may belong to a known landmark, and so
-    give no new one. path: (P, 4, 4) the base at each frame."""
+    """The filter at the present frame. label, first, last, hits: (N,) the label, the first and last frame, and the number of
+    rays of each landmark. owner: (R,) the landmark of each ray. doubtful: (R,) whether a ray may belong to a known landmark,
+    so that it makes no new one. path: (P, 4, 4) map_T_base at each frame."""
 
     def __init__(
         self,
@@ -129,7 +128,7 @@ class _Exploration:
         return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 
     def _see(self, rays: Ints, now: int) -> None:
-        """Assign a frame's rays, and correct the filter. A free ray with a range gives a landmark, unless it is doubtful."""
+        """Assign the rays of a frame, and correct the filter. A ray with a range and no match makes a landmark."""
         if len(self.filter) and len(rays):
             self._match(rays)
         free = rays[(self.owner[rays] < 0) & ~self.doubtful[rays] & np.isfinite(self.rays.range[rays])]
@@ -156,7 +155,7 @@ class _Exploration:
         found = assign_jointly(Pairings(row, column, expected.residual, total, rarity, SAME_POINT_WIDE))
         sure = found.margin >= _SURE
         chosen = found.chosen[sure]
-        # A ray is doubtful if two landmarks compete for it, or if it would be a sure match of a free landmark by itself.
+        # A ray is doubtful if two landmarks compete for it, or if alone it would surely match a landmark without a ray.
         could = rarity - 0.5 * np.linalg.slogdet(2 * np.pi * alone[near])[1] >= _SURE
         could &= ~np.isin(column, column[chosen]) & ~np.isin(row, row[chosen])
         self.doubtful[rays[np.concatenate([row[found.chosen[~sure & found.rival]], row[could]])]] = True
@@ -165,14 +164,14 @@ class _Exploration:
             self._learn(*ekf.update(f, expected.take(chosen)))
 
     def _learn(self, step: Floats, expected: Floats) -> None:
-        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with its expected covariance (3, 3)."""
+        """Adapt `roughness` to a correction `step` (3,) of yaw, x and y, with its expected covariance (3, 3)."""
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first of the last `_STRETCH` frames from which on the drift of the heading is below `HORIZON`."""
+        """Return the first of the last `_STRETCH` frames since which the heading has drifted by less than `HORIZON`."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
@@ -188,7 +187,7 @@ class _Exploration:
         self._keep(kept, np.arange(len(kept)))
 
     def _keep(self, kept: Bools, into: Ints) -> None:
-        """Keep some landmarks. into: (N,) the landmark that gets the rays of each landmark."""
+        """Keep the landmarks `kept` (N,). into: (N,) the landmark that gets the rays of each landmark."""
         if not kept.all():
             number = np.append(np.where(kept, np.cumsum(kept) - 1, -1)[into], -1)
             self.owner = number[self.owner]
@@ -196,7 +195,7 @@ class _Exploration:
             self.label, self.first, self.last, self.hits = (a[kept] for a in (self.label, self.first, self.last, self.hits))
 
     def _close(self, now: int) -> None:
-        """Tie recent landmarks to older ones if they are certainly the same."""
+        """Close loops: tie recent landmarks to older ones if they are certainly the same."""
         if now - self.birth > _STRETCH:
             return
         f, recent = self.filter, self.first >= now - _RECENT
@@ -222,7 +221,7 @@ class _Exploration:
         self.path[begin : now + 1] = f.map_T_base @ inverse(before) @ self.path[begin : now + 1]
         into = np.arange(len(f))
         into[one] = two
-        while (into[into] != into).any():  # A landmark may be tied to a landmark that is itself tied to another.
+        while (into[into] != into).any():  # Follow chains of ties to their end.
             into = into[into]
         np.add.at(self.hits, into[one], self.hits[one])
         np.maximum.at(self.last, into[one], self.last[one])
@@ -231,14 +230,14 @@ class _Exploration:
 
 
 def _likeliest(squared: Floats) -> Ints:
-    """Return the increasing indices (p,) of the least squared deviations (P,): at most `_PAIRS`, all within the gate."""
+    """Return the sorted indices (p,) of the smallest squared deviations (P,): at most `_PAIRS`, all within the gate."""
     near = np.flatnonzero(squared <= SAME_POINT_WIDE)
     return np.sort(near[np.argsort(squared[near], kind="stable")[:_PAIRS]])
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the area or volume over which rays to new landmarks spread, estimated from all rays. The unit
-    is rad^2, or rad^2 m with a range."""
+    """Return the log (R,) of the area (rad^2), or with a range the volume (rad^2 m), over which rays to new landmarks
+    spread. All rays together are taken as an example of such rays."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

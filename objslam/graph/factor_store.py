@@ -51,7 +51,7 @@ class FactorStore:
             self.kinds[kind] = {number: one for number, one in stored.items() if one.keys.isdisjoint(keys)}
 
     def variables(self) -> set[int]:
-        """Return the keys of the variables in the factors of all kinds that the caller numbers."""
+        """Return the keys of the variables in the factors of all kinds beyond `_OWN_KINDS`."""
         numbered = (stored for kind, stored in self.kinds.items() if kind not in _OWN_KINDS)
         return {key for stored in numbered for one in stored.values() for key in one.keys}
 

@@ -1,4 +1,4 @@
-"""Keep the variables and all factors of a growing graph. A measurement gives the same factors as offline."""
+"""Keep the variables and factors of a graph that grows with each measurement. The factors are the same as offline."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -31,8 +31,8 @@ class GrowingGraph(ABC):
         self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()  # Not in the estimate yet.
         self._rebuild: IncrementalRebuild | None = None
         self._newest, self._updates = -1, 0
-        self._touched: dict[int, int] = {}  # By landmark: the last update that involved it.
-        self._outgrown = False  # Whether a variable has a letter that the present iSAM2 does not know.
+        self._touched: dict[int, int] = {}  # The last update that involved each landmark.
+        self._outgrown = False  # Whether a variable's letter (of its symbol) is unknown to the present iSAM2.
 
     @abstractmethod
     def refresh(self) -> None:
@@ -116,7 +116,7 @@ class GrowingGraph(ABC):
             self._at.poses.pop(k, None)
 
     def drop_kind(self, kind: str) -> None:
-        """Remove all factors of a kind of `add`, and the variables of `add_variable` that are left without a factor."""
+        """Remove all factors of one kind, and the variables of `add_variable` that are left without a factor."""
         self._rebuild = None
         self._store.kinds.pop(kind, None)
         self._drop_free_variables()
@@ -128,7 +128,7 @@ class GrowingGraph(ABC):
     def move(self, new_T_old: Floats) -> None:
         """Move the whole estimate by a pose (4, 4). The caller must remove the absolute poses before.
 
-        A prior map stays where it is. So the pose F of this graph's frame in the prior map changes too.
+        A prior map does not move. So the pose F of the graph's frame in the prior map changes too.
         """
         self.refresh()
         at, weak = self._at, self._settings.joint.prior_sigma

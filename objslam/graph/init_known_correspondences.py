@@ -1,8 +1,7 @@
 """Initialise poses and landmarks with a known association, by growing the graph along the path.
 
-From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes are added a few at a time, at poses that
-continue the solved path by odometry, and a sliding window is solved. A landmark is added when its rays so far determine its
-position.
+From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes are added a few at a time, at the last
+solved pose plus odometry. Each time, a sliding window is solved. A landmark is added when its rays determine it.
 """
 
 from collections.abc import Callable
@@ -19,27 +18,26 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The most iterations of each solve during growth. Few are enough, because each solve starts close to its optimum, and the
-next solve continues from its result. A larger number is slower."""
+"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum and the next
+one goes on from there. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
-"""The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
-doubles. Above the second limit, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3
-to 5 and 15 degrees converge to the same map. With iSAM2 in place of a window, robot 1 or 5 did not converge."""
+"""The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
+step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all
+limits from 1 and 3 to 5 and 15 degrees lead to the same map."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
-median angle of the step. Larger values accept more false boxes. Both are well above the odometry's drift in one step."""
+median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both."""
 _MORE_RAYS = 1
-"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks are added
-later. With fewer rays, false boxes agree by chance too often."""
+"""A new landmark needs this number of agreeing rays more than association.min_rays. With a larger number, landmarks are
+added later. With a smaller one, false boxes agree by chance too often."""
 _SHORTEST = 4
 """The shortest step is joint.grow_step divided by this number, and at least 2. A larger number allows slower growth."""
 _AGAIN = 1.05
 """A landmark that is not yet in the graph is triangulated again when its number of rays has grown by this factor. A larger
-factor is faster, but landmarks come into the graph later. With a factor of 1, the time would grow with the square of the
-number of rays."""
+factor is faster, but landmarks are added later. With a factor of 1, the time grows with the square of the rays."""
 _RECORDED = 1.02
-"""The trace records a step when the graph has grown by this factor. A larger factor records fewer steps. With a factor of 1,
-the trace of a long drive would take gigabytes, because each step records the whole path."""
+"""The trace records a step when the graph has grown by this factor. A larger factor records fewer steps. Each step records
+the whole path, so with a factor of 1 the trace of a long drive would take gigabytes."""
 
 
 def initialize_known(
@@ -53,7 +51,7 @@ def initialize_known(
     window = SlidingWindow(measured, owner, association.count, _ITERATIONS)
     map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    # The rays without a landmark, and how many of them each object had when it was last triangulated.
+    # The rays whose object is not in the graph yet, and the number of these rays at the last triangulation of each object.
     waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)
     begin, step, recorded = 1, settings.joint.grow_step, 0
     shortest = max(2, step // _SHORTEST)
@@ -62,7 +60,7 @@ def initialize_known(
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
-        known = np.append(np.isfinite(window.positions[:, 0]), False)  # The last entry is for object -1.
+        known = np.append(np.isfinite(window.positions[:, 0]), False)  # The last entry is for rays without an object (-1).
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
         fresh, unknown = new[known[owner[new]]], new[(owner[new] >= 0) & ~known[owner[new]]]
         off = _off(rays, association, map_T_camera, window.positions, fresh)
@@ -104,8 +102,10 @@ def _off(rays: Rays, association: Association, map_T_camera: Floats, positions: 
 def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
 ) -> tuple[Ints, Floats, Floats, Ints]:
-    """Return the landmarks (n,) that the rays `waiting` now determine, their positions (n, 3), their covariances (n, 3, 3)
-    at the camera poses (K, 4, 4), and the rays (m,) that agree with them."""
+    """Triangulate landmarks from the rays `waiting` (w,) at the camera poses (K, 4, 4).
+
+    Return the determined landmarks (n,), their positions (n, 3) and covariances (n, 3, 3), and the rays (m,) that agree.
+    """
     waiting = waiting[_may_have_parallax(rays.take(waiting), association.object[waiting], map_T_camera, settings)]
     if len(waiting) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), waiting
@@ -118,10 +118,10 @@ def _new_landmarks(
 
 
 def _may_have_parallax(rays: Rays, owner: Ints, map_T_camera: Floats, settings: Settings) -> Bools:
-    """Return a mask (R,) of the rays whose landmark can have enough parallax, or has a ray with a range.
+    """Return a mask (R,) of the rays whose landmark may have enough parallax, or has a ray with a range.
 
-    This quick test avoids slow triangulations. Two rays of a landmark differ by at most twice the largest angle between one
-    of its rays and their mean direction.
+    This quick test saves triangulations that must fail. Two rays differ by at most twice the largest angle between a ray of
+    the landmark and the mean direction of its rays.
     """
     _, directions = rays.in_map(map_T_camera)
     mean = np.zeros((owner.max(initial=-1) + 1, 3))

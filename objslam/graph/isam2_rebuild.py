@@ -13,8 +13,8 @@ _RELINEARISE = (0.02, 0.05)
 """The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact. A
 change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
-"""The number of updates between two automatic relinearisations. It is so large that none happens. The caller asks for a
-relinearisation when it has time. A smaller number would relinearise without a request."""
+"""The number of updates between two automatic relinearisations, so large that none happens. The caller asks for one when it
+has time. A smaller number relinearises without a request."""
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
@@ -35,11 +35,11 @@ def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
 
 
 class IncrementalRebuild:
-    """A new iSAM2 that gets the stored factors keyframe by keyframe, and the later additions at the end.
+    """A new iSAM2. It gets the stored factors keyframe by keyframe, and at the end what the old graph got in the meantime.
 
-    order: the keyframes in the order of adding. The keyframe at the start of a motion comes before the one at its end.
-    variables: the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after the start
-    of the rebuild. later: the factors that came after the start.
+    order: the keyframes as they are added. The keyframe at the start of a motion comes before the one at its end. variables:
+    the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after the start of the
+    rebuild. later: the factors that came after the start.
     """
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:

@@ -14,14 +14,13 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The largest number of past epochs that are searched for a loop. The latest epochs are searched. An epoch is `_EPOCH`
-successive keyframes. A larger number is slower and closes longer loops."""
+"""A loop is searched in this number of the latest epochs (`_EPOCH`). A larger number is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
-"""The factors that multiply the standard deviations of the drift in the search for a loop, because wheels slip more than a
-Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
+"""The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
+more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The number of keyframes in an epoch. The drift since an epoch is computed for only one of its keyframes. So a larger
-number is faster and less exact. A landmark counts as new if it was first seen within this number of keyframes."""
+"""The number of keyframes in a row that are an epoch. The drift since an epoch is computed from only one of its keyframes,
+so a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 
 @dataclass
@@ -49,8 +48,8 @@ class Landmarks:
 class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
-    correction: (4, 4) the motion in map that corrects the current poses. now: (P,) the recent landmarks. before: (P,) the
-    old landmark for each recent one. evidence: log odds of the loop.
+    correction: (4, 4) moves the current poses in map to where they should be. now: (P,) the recent landmarks. before: (P,)
+    for each of these the old landmark. evidence: the log odds of the loop.
     """
 
     correction: Floats
@@ -72,8 +71,8 @@ def find_closure(
 ) -> tuple[Closure | None, int]:
     """Return the loop with the most evidence, None if no loop is certain, and the number of compared pairs.
 
-    The search has two cases. After a long drift, recently observed landmarks (`active`, (N,)) are matched with the others.
-    After a slip or a push, new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
+    There are two searches. For a long drift, the recently seen landmarks (`active`, (N,)) are matched with all others. For a
+    slip or a push, only the new ones (first seen in the last `_EPOCH` keyframes) are matched with all others.
 
     A pair is a recent and an old landmark of one label. It counts once for each tried drift.
 
@@ -127,8 +126,8 @@ def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
     """Return covariances (3, 3) of the x, y (m) and yaw (rad) of keyframe `now` relative to each anchor, in the axes of map.
 
-    anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`, none if it is not finite. The
-    variance of `POSE_FLOOR` is added before the factor.
+    anchors: keyframes. Each anchor before `now` with a finite covariance gives one for each factor in `_SLIPS`. They include
+    `POSE_FLOOR`.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
@@ -146,8 +145,8 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
 def distribute_correction(map_T_camera: Floats, correction: Floats, begin: int, end: int, drift: Floats) -> Floats:
     """Return a path (K, 4, 4) with a correction (4, 4) spread over the keyframes from `begin` to `end`.
 
-    drift: (K,) accumulated along the path. A keyframe gets a share of the correction that is proportional to the drift since
-    `begin`. Earlier keyframes get nothing. Later ones get all of it.
+    drift: (K,) accumulated along the path. A keyframe gets a share of the correction in proportion to its drift since
+    `begin`: nothing before `begin`, all of it after `end`.
     """
     gathered = drift - drift[begin]
     share = np.clip(gathered / max(float(gathered[end]), 1e-12), 0.0, 1.0)

@@ -21,7 +21,7 @@ OnIteration = Callable[[float, gtsam.Values], None]
 class Optimum:
     """The result of an optimisation. SolveError if its cost is not finite.
 
-    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weight of each factor by GNC, else None.
+    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weights of the factors from GNC, else None.
     """
 
     values: gtsam.Values
@@ -55,9 +55,9 @@ def optimize(
     tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """Minimise from `start` by `graduated` for the loss `gnc`, by `levenberg_marquardt` for the other losses.
+    """Minimise from `start`, by `graduated` for the loss `gnc` and by `levenberg_marquardt` for all other losses.
 
-    Only `gnc` uses known_inliers. Only the other losses use tolerance and on_iteration.
+    known_inliers is for `gnc` only. tolerance and on_iteration are for all other losses only.
     """
     if loss == "gnc":
         return graduated(graph, start, settings.joint.max_iterations, known_inliers)
@@ -83,7 +83,7 @@ def levenberg_marquardt(
 
     def hook(number: Any, _: Any, after: Any) -> None:
         nonlocal last
-        if int(number) > last and on_iteration is not None:  # If a step fails, GTSAM repeats the last number.
+        if int(number) > last and on_iteration is not None:  # After a failed step, GTSAM gives the last number again.
             on_iteration(float(after), optimizer.values())
         last = int(number)
 
@@ -103,8 +103,8 @@ def graduated(
 ) -> Optimum:
     """Minimise by graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas, Carlone 2020).
 
-    Levenberg-Marquardt solves each of its steps. known_inliers: indices of the factors that are never rejected (odometry,
-    priors). SolveError if the linear system is indeterminate, or if the cost is not finite.
+    Each step is a solve by Levenberg-Marquardt. known_inliers: indices of the factors that are never rejected
+    (odometry, priors). SolveError if the linear system is indeterminate, or if the cost is not finite.
     """
     inner = gtsam.LevenbergMarquardtParams()
     inner.setMaxIterations(max_iterations)

@@ -1,4 +1,4 @@
-"""Reject outliers: the joint solve and a test of every ray alternate until the set of inliers is stable."""
+"""Reject outliers: solve, test every ray, and repeat until the inliers stay the same."""
 
 from dataclasses import dataclass, replace
 
@@ -16,25 +16,25 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""A rejected ray is restored if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after it are
-rejected, because the poses may be wrong there. A larger share restores fewer rays. With a larger number on each side, only
-longer stretches are restored. A few false boxes in a row restore no ray."""
+"""A rejected ray gets a second chance if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after
+it are rejected. Perhaps the poses are wrong there. A few false boxes in a row get none. Larger values restore fewer rays."""
 ROUNDS = 4
-"""The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
+"""The most rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
-"""If the inliers are tested next, a solve ends when the cost decreases by less than this share. A larger value ends it
-sooner. Robust weights converge slowly, and the last digits of a solution hardly change an inlier."""
+"""A solve before a test of inliers ends when its cost decreases by less than this share. Robust losses converge slowly, and
+a more exact solution hardly changes an inlier. A larger value is faster."""
 _SURE = 0.95
 """The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
 corrects more objects at wrong positions."""
 _FEWEST = 6
-"""The least number of rays from which the noise of an object is measured. An object with fewer rays has the nominal noise. A
-larger number rejects more rays of noisy objects. A live session has no such limit."""
+"""The least number of inliers from which the noise of an object's rays is measured. With fewer, the noise is that of the
+settings. A larger number rejects more rays of noisy objects."""
 
 
 @dataclass(frozen=True)
 class JointSolution:
-    """A solution for poses and objects. map_T_camera: (K, 4, 4). positions: (N, 3) m. used: (R,) True for inliers."""
+    """A solution for poses and objects. map_T_camera: (K, 4, 4). positions: (N, 3) m. used: (R,) whether a ray is an
+    inlier."""
 
     map_T_camera: Floats
     positions: Floats
@@ -55,11 +55,11 @@ def reject_outliers(
     tolerance: float = 1e-6,
     rounds: int = ROUNDS,
 ) -> JointSolution:
-    """Solve, and test which rays agree with their objects, until the set of inliers is stable, or at most `rounds` times.
+    """Solve, and test which rays agree with their objects, until the inliers stay the same, or at most `rounds` times.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
-    solve, or all False. back: (R,) rays that count as inliers in the first solve. tolerance: the relative decrease of the
-    cost below which the last solve ends. The solves before it may end at `_COARSE`.
+    solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
+    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
@@ -70,7 +70,7 @@ def reject_outliers(
         if optimum is None:
             agreeing = agreeing | back
         elif (agreeing == used).all():
-            break  # The positions stay as in the last solve.
+            break  # These inliers are solved already.
         positions, used = moved, agreeing
         graph, values = measured.whole(association.object, used, map_T_camera, positions, loss)
         landmarks, others = np.flatnonzero(np.isfinite(positions[:, 0])), range(int(used.sum()), graph.size())
@@ -104,7 +104,7 @@ def rejected_stretches(rays: Rays, association: Association, found: JointSolutio
 def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, association: Association) -> float:
     """Return the cost of camera poses (K, 4, 4) and positions (N, 3), to compare two solutions of the same rays.
 
-    An unknown position is NaN. A ray whose object has no position counts `STRAY_RAY`.
+    A ray to an object at an unknown position (NaN) costs `STRAY_RAY`.
     """
     placed = np.isfinite(positions[:, 0])
     owner = np.where((association.object >= 0) & placed[association.object], association.object, -1)
@@ -117,9 +117,8 @@ def second_opinion(
 ) -> tuple[Floats, Bools]:
     """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
-    The corners of fiducials stay, because rays to four separate points say less than rays to one square.
-
-    Return the positions (N, 3), and which rays (R,) agree with them.
+    Corners of fiducials stay, because four corners of one square are better known than four separate points. Return the
+    positions (N, 3) m, and whether each ray (R,) agrees with its object.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
@@ -133,7 +132,7 @@ def second_opinion(
         return positions, agreeing
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
-    if used.any():  # Solved poses do not have the noise of the localisation.
+    if used.any():  # Solved poses no longer have the noise of the localisation.
         keyframes = replace(keyframes, localized_every=0.0)
     placed = triangulate_at(map_T_camera, keyframes, rays.take(which), some, measured.settings)
     other = positions.copy()
@@ -147,8 +146,7 @@ def second_opinion(
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
     """Return which rays (R,) agree with their object, given the noise of the object's inliers.
 
-    used: (R,) the inliers. If no ray of any object is one yet, all rays count. An object with few inliers (`_FEWEST`) has
-    the nominal noise.
+    used: (R,) the inliers. If there are none at all, all rays count as inliers.
     """
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
@@ -162,8 +160,9 @@ def supported(rays: Rays, association: Association, map_T_camera: Floats, positi
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays exceed their nominal noise.
+    """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays miss it by more than their
+    noise.
 
-    It is the squared ratio of the measured to the nominal noise. residual: (R,) whitened by the nominal noise.
+    The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) divided by the latter.
     """
     return noise_factors(residual, landmark, count, _FEWEST) ** 2

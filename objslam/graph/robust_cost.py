@@ -1,4 +1,4 @@
-"""Compute the information of rays, and the cost of a solution, to compare solutions with different inliers."""
+"""The cost of a solution, for a comparison of solutions with different inliers. Also the information of rays."""
 
 import numpy as np
 
@@ -8,18 +8,17 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
 FLOOR = 0.02
-"""The least standard deviation (m) of a landmark, because the centre of a box is not a point of the object. A larger value
-lets rays miss nearby landmarks by more."""
+"""The standard deviation (m) by which rays miss a landmark because the centres of boxes are not one point of the object. A
+larger value lets rays miss near landmarks by more."""
 
 
 def truncated_cost(
     rays: Rays, owner: Ints, positions: Floats, map_T_camera: Floats, motion: Floats, covariance: Floats
 ) -> float:
-    """Return the sum of the squared deviations of the rays and of the odometry. A ray counts `STRAY_RAY` at most.
+    """Return the sum of the squared deviations of the rays and of the odometry. A ray costs `STRAY_RAY` at most.
 
-    owner: (R,) index into positions (N, 3), or -1 for a ray that does not count. map_T_camera: (K, 4, 4) the first K
-    keyframes. Rays and motions of later keyframes do not count. motion, covariance: (M, 4, 4), (M, 6, 6) camera motions by
-    odometry.
+    owner: (R,) index into positions (N, 3), or -1 for a ray that does not count. map_T_camera: (K, 4, 4) of the first K
+    keyframes. Later keyframes do not count. motion, covariance: (M, 4, 4), (M, 6, 6) camera motions by odometry.
     """
     held = np.flatnonzero((owner >= 0) & (rays.keyframe < len(map_T_camera)))
     some = rays.take(held)

@@ -1,7 +1,7 @@
 """Solve a graph that grows along the path, over a window of its last keyframes. Priors replace the rest of the graph.
 
 If each step solved the whole graph, the time would grow with the square of the path. So a step solves only the window. The
-whole graph is solved each time that its size has doubled. All these solves together take twice the time of the last one.
+whole graph is solved each time its size has doubled. All whole solves together take twice the time of the last one.
 """
 
 import gtsam
@@ -19,9 +19,9 @@ _GROWTH = 2.0
 """The whole graph is solved when it has grown by this factor since its last whole solve. A larger factor is faster. A
 smaller factor corrects sooner what a window ignores: the errors of its priors are correlated, and a loop bends old poses."""
 _AT_CAMERA = 1e-3
-"""A landmark within this distance (m) of a camera is at the camera. No object is there. The information of a bearing grows
-with the inverse square of the distance, so such landmarks make the linear system singular. A larger distance also removes
-real landmarks. On real drives whose clocks were 0.2 s apart, the solver put landmarks there."""
+"""A landmark within this distance (m) of a camera is wrong and leaves the graph. So near to a camera, the information of a
+bearing is so large that the linear system becomes singular. The solver moved landmarks there on real drives whose clocks
+were 0.2 s apart. A larger distance also removes real landmarks."""
 
 
 class SlidingWindow:
@@ -39,18 +39,18 @@ class SlidingWindow:
         self._weak: dict[int, gtsam.NonlinearFactor] = {}  # The weak prior of each landmark, by its key.
         self._held: dict[int, gtsam.NonlinearFactor] = {}  # By key: the prior in place of factors outside the window.
         self._values = gtsam.Values()
-        self._begin, self.end, self._solved = 0, 0, 0  # The window's ends, and the end at the last whole solve.
+        self._begin, self.end, self._solved = 0, 0, 0  # The window's ends, and `end` at the last whole solve.
         nothing = np.zeros(0, dtype=np.int64)
         self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
 
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
         """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
 
-        covariance: (m, 3, 3) m^2, of the landmarks by their rays. It replaces the rays of keyframes before the window.
+        covariance: (m, 3, 3) m^2 of the landmarks. It is the prior of a landmark with rays from before the window.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
-            last = max(factor.keys())  # The keys of keyframes are above the keys of landmarks.
+            last = max(factor.keys())  # A keyframe if there is one, because its key is above those of landmarks.
             if _is_landmark(last):
                 self._weak[last] = factor
             else:
@@ -67,8 +67,8 @@ class SlidingWindow:
     def solve(self) -> Optimum:
         """Solve the window, or the whole graph if it has grown enough or is complete. Then move the window on.
 
-        A landmark that ends up at a camera leaves the graph. Its position becomes NaN, and new rays may find it again.
-        SolveError if the linear system is indeterminate, or if the cost is not finite.
+        A landmark that ends at a camera (`_AT_CAMERA`) leaves the graph, its position becomes NaN, and new rays may find it
+        again. SolveError if the linear system is indeterminate, or if the cost is not finite.
         """
         if self.end >= _GROWTH * self._solved or self.end == len(self.map_T_camera):
             self._begin, self._solved, self._held = 0, self.end, {}
@@ -103,10 +103,10 @@ class SlidingWindow:
         return graph
 
     def _move(self, begin: int) -> None:
-        """Let the window begin at another keyframe. The marginals of the removed part become priors of the window.
+        """Let the window begin at a later keyframe. The marginals of the removed part become priors of the window.
 
         A landmark that leaves the window keeps its marginal for when it is seen again. If the marginals are indeterminate,
-        the window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve raises SolveError.
+        nothing changes.
         """
         if begin == self._begin:
             return
@@ -117,7 +117,7 @@ class SlidingWindow:
         try:
             marginals = gtsam.Marginals(leaving, self._values.extract(keys))
             self._held |= {key: _prior(key, self._values, marginals.marginalCovariance(key)) for key in kept}
-        except RuntimeError:  # GTSAM has no other sign of an indeterminate system.
+        except RuntimeError:  # The system is indeterminate.
             return
         self._begin = begin
 

@@ -1,7 +1,7 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
-X(k) belongs to the camera of keyframe k. If images share a pose, X(k) belongs to the first camera of multiframe k. Y(t) is
-the pose of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present one.
+In X(k), k is a keyframe. If images share a pose, k is a multiframe, and X(k) the pose of its first camera. Y(t) is the pose
+of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present value.
 
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """
@@ -118,5 +118,5 @@ def _points(values: gtsam.Values, keys: Ints) -> Floats:
 
 
 def _at(values: gtsam.Values, key: int, like: object) -> object:
-    """Return the variable with this key, which has the same type as the variable `like`."""
+    """Return the variable with this key: a pose if `like` is a pose, else a point."""
     return values.atPoint3(key) if isinstance(like, np.ndarray) else getattr(values, f"at{type(like).__name__}")(key)

@@ -1,7 +1,7 @@
-"""Errors that the boxes of an object share. The centre of a box is not the centre of the object, and from one side all boxes
+"""Errors that the boxes of an object share. The centre of a box is off the centre of the object. From one side, all boxes
 have about the same offset.
 
-More rays from the same side do not average such an error out. Therefore many rays count as few (Kish 1965).
+Many rays from one side do not average this offset out, so they count as few (Kish 1965).
 """
 
 from dataclasses import dataclass, replace
@@ -20,15 +20,15 @@ from objslam.mapping.solution import Solution
 from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
 
 _SHARES = 81
-"""The number of tried values of the error of a box as a share of its size, from 0 to `_WIDEST` times the prior. A larger
-number is finer and slower."""
+"""The number of values that `_share` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 4.0
-"""The largest tried value of this share, in standard deviations of its prior. A larger value admits worse detectors."""
+"""The largest share that `_share` tries, in standard deviations of its prior. A larger value allows worse detectors."""
 _LOOSE = 1.0
-"""The standard deviation (m) of an object's position before its rays count. A larger value leaves more to the rays."""
+"""The prior standard deviation (m) of the error of a solved position, in `_share`. With a larger value, the rays decide
+more."""
 _POOLED = 20.0
-"""The number of an object's rays at which their scatter weighs as much as the scatter of all rays. A larger number gives the
-scatter of all rays more weight."""
+"""The number of an object's rays at which their scatter weighs as much as the scatter of all rays. With a larger number,
+objects differ less."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Sides:
     """C sides from which one object was seen.
 
     alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
-    side miss the object along A axes, in azimuth and elevation. white: (C,) rad, the standard deviation of this mean if the
-    rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset:
-    (C, A, 3) rad, the derivative of the mean by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3)
-    m, how far such an offset moves the object.
+    side miss the object, along A axes (azimuth and elevation). white: (C,) rad, the standard deviation of this mean if the
+    rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset: (C, A,
+    3) rad, the derivative of the mean by an offset that all boxes of the side have, as a share of the object's size. pull:
+    (C, 3, 3) m, the derivative of the object's position by this offset.
     """
 
     alike: Floats
@@ -58,8 +58,9 @@ class Sides:
 class SizedRays:
     """R rays of boxes that show the size of their objects.
 
-    landmark: (R,) the object of each ray. origin, direction: (R, 3) in map. distance: (R,) m to the object. noise: (R,) rad.
-    size: (R,) rad, the angular size of the boxes. along: (R,) 1/m, one over the noise of the range, 0 without a range.
+    landmark: (R,) the object of each ray. origin, direction: (R, 3) in map. distance: (R,) m to the object. noise: (R,) rad,
+    the standard deviation of the direction. size: (R,) rad, the angular size of the box. along: (R,) 1/m, one over the
+    standard deviation of the range, 0 without a range.
     """
 
     landmark: Ints
@@ -72,11 +73,12 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return a solution whose covariances contain the errors that boxes share.
+    """Return the solution with the errors that boxes share added to its covariances.
 
-    The centre of an object's boxes is off by a share of the object's size. One offset is equal from all sides, and another
-    depends on the side. `rays.box_sigma` is the prior of the share. The share is estimated from the rays if `noise.rays` is
-    true, or if it is auto and the prior has its default value. In joint mode, the path must also be planar.
+    The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
+    the object's size. `rays.box_sigma` is the standard deviation of this share, and the prior of its estimate. The share is
+    estimated from the rays if `noise.rays` is true, or if `noise.rays` is auto and `rays.box_sigma` has its default value.
+    In joint mode, the path must also be planar.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
@@ -86,7 +88,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
     learnt = prior == type(settings.rays)().box_sigma if told == "auto" else told
-    # Solved poses follow the boxes. A planar pose cannot follow them up and down, so the elevation shows the error.
+    # Solved poses move until the boxes fit. A planar pose cannot move up or down, so the offsets show in elevation.
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base)
     share = (
@@ -103,16 +105,16 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
 def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
     """Return the covariance (3, 3) m^2 that the offsets of boxes add to the covariance of an object.
 
-    extent: (2,) m, its width and height. share: the standard deviation of an offset, as a share of the size.
+    extent: (2,) m, width and height of the object. share: the standard deviation of an offset, as a share of the size.
     """
     by_side = np.einsum("cik,cd,djk->ij", sides.pull, sides.alike, sides.pull)
     return np.asarray(share**2 * (by_side + np.nan_to_num(extent.prod()) * np.eye(3)))
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
-    """Return the used rays of objects with a position, if their boxes show a size.
+    """Return the rays with a weight above 0 of objects with a position, for cameras whose boxes show a size.
 
-    Fiducials whose corners were used have no such ray, because their position does not come from boxes.
+    Fiducials whose corners were used are left out, because their positions do not come from boxes.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
@@ -130,10 +132,10 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 
 
 def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict[int, Sides]:
-    """Return the sides of each object (N, 3) m that has rays.
+    """Return the sides of each object that has rays, by its index.
 
-    plain: whether Eq. 1 gave the positions. Eq. 1 adds up unit vectors, so a ray pulls with the inverse of its standard
-    deviation. In the other solves it pulls with the inverse of its variance.
+    positions: (N, 3) m. plain: whether Eq. 1 gave them. In Eq. 1, a ray has the inverse of its standard deviation as its
+    weight. In all other solves, its weight is the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
     lattice = evenly_spread(SIDES)
@@ -178,17 +180,17 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
 
 
 def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
-    """Return the weighted sums (C, 2, D) of values (R, 3, D) in each cell (R,), along the two axes (C, 3, 2) of the cell."""
+    """Return the weighted sum (C, 2, D) of the values (R, 3, D) of each side `cell` (R,), along its two axes (C, 3, 2)."""
     sums = np.zeros((len(axes), *values.shape[1:]))
     np.add.at(sums, cell, weight[:, None, None] * values)
     return np.einsum("cia,cid->cad", axes, sums)
 
 
 def _share(seen: list[Sides], prior: float) -> float:
-    """Return the share of their size by which boxes err together: the root mean square of the share, given the rays.
+    """Return the share of the object's size by which the boxes of one side are off: the root mean square over its posterior.
 
-    The positions of the objects are unknown, so the restricted likelihood is used (Patterson and Thompson 1971). The prior
-    is a half-normal distribution (Gelman 2006). So the share can be 0 if the sides agree.
+    seen: the sides of each object. prior: the standard deviation of a half-normal prior (Gelman 2006). The positions have
+    errors too, so the likelihood is the restricted one (Patterson and Thompson 1971).
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = -0.5 * (shares / prior) ** 2
@@ -209,7 +211,7 @@ def _share(seen: list[Sides], prior: float) -> float:
 
 
 def _azimuth_elevation(directions: Floats) -> Floats:
-    """Return the unit axes (n, 3, 2) of azimuth and elevation across each direction (n, 3). No direction may be vertical."""
+    """Return unit axes (n, 3, 2) of azimuth and elevation, across each direction (n, 3). No direction may be vertical."""
     azimuth = np.cross([0.0, 0.0, 1.0], directions)
     azimuth /= np.linalg.norm(azimuth, axis=1, keepdims=True)
     return np.stack([azimuth, np.cross(directions, azimuth)], axis=2)

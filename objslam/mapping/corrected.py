@@ -10,10 +10,10 @@ from objslam.mapping.solution import Solution, with_noise_of
 
 
 def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple[Solution, Log]:
-    """Return a solution and the log without its shared errors. Warn of large errors.
+    """Return a solution and its log without the shared errors, for example clock offsets. Warn of large errors.
 
-    The calibration of the solution gets the prior of the shared errors. Its keyframes get the drift at their stamps. errors:
-    the errors that the solve estimated.
+    errors: the errors that the solve estimated. The returned solution also has the prior of these errors in its calibration,
+    and the odometry's drift at each keyframe.
     """
     calibration = solution.estimate.calibration
     if calibration is None:

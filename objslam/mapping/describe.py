@@ -1,4 +1,4 @@
-"""Describe a solution: each object with its evidence, and the summary of the run."""
+"""Turn a solution into a result: the map of the objects, and the summary of the run."""
 
 import importlib.metadata
 import platform
@@ -28,9 +28,9 @@ from objslam.mapping.solution import Solution
 def make_result(
     solution: Solution, objects: ObjectMap, residual: Floats, summary: dict[str, Any], settings: Settings, **more: Any
 ) -> RunResult:
-    """Return the result of a solution with the map by `describe`, and add the judgement to the summary.
+    """Return the result of a run, and add the assessment of its quality to the summary.
 
-    residual: (R,) rad, by `describe`. more: the fields of the result that are not in the solution.
+    objects, residual: from `describe`. more: the fields of `RunResult` that the solution does not have.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -60,9 +60,8 @@ def describe(
 ) -> tuple[ObjectMap, Floats]:
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
-    The map counts the rays and frames of an object without its rejected rays. If all its rays are rejected, it counts all.
-    The position of an object with a body may be the centre of the body (`PlacedBody`). trusted: whether positions are
-    reliable. If not, all objects are unresolved.
+    The counts of rays and frames leave out rejected rays, unless all rays of the object are rejected. The position of an
+    object with a body may be the centre of the body (`PlacedBody`). trusted: if false, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
@@ -136,11 +135,11 @@ def summarise(
     objects: ObjectMap,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
+    """Return the content of summary.json.
 
-    seconds: the time of each stage. The entry `map_frame` says what fixed the frame of the map: `localization`, or
-    `odometry` without an absolute measurement. The entry `planar` says whether the measured path has one height, roll and
-    pitch. The entry `up` names the axis of the map that points up.
+    counts: the numbers of images, frames and boxes in the log. seconds: the time of each stage. The entry `map_frame` is
+    `localization` if absolute poses fixed the frame of the map, else `odometry`. `planar` is true if the measured path has
+    one height, roll and pitch. `up` is the axis of the map that points up, for example "z".
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]
@@ -180,7 +179,7 @@ def summarise(
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that decide a result, without those that are not installed."""
+    """Return the versions of Python and of the installed packages that can change a result."""
     found = {"python": platform.python_version()}
     for package in ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d"):
         with suppress(importlib.metadata.PackageNotFoundError):

@@ -1,4 +1,4 @@
-"""Objects that a drift of the poses shows twice."""
+"""Merge objects that are in the map twice, because the poses drifted between two visits."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
     """Merge pairs of objects of one label whose positions agree within their covariances, and that share no frame.
 
-    If poses drift between two visits, an object appears twice. Each copy keeps the poses of its visit where they are. So an
-    association at these poses cannot find the error, but a merge closes the loop. The nearest pairs by Mahalanobis distance
-    merge first. An object merges at most once in one call. farthest: the largest distance (m) of a pair.
+    Each of the two copies fits the drifted poses of its visit, so a new association at these poses keeps both. The merge
+    closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call.
+    farthest: the largest distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
@@ -44,7 +44,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
     number = np.searchsorted(kept, into)
     weights, existence = association.label_weights, association.existence
     return Association(
-        object=np.append(number, -1)[association.object],  # The index -1 (no object) gives the last entry.
+        object=np.append(number, -1)[association.object],  # The index -1 (no object) reads the last entry, -1.
         label=association.label[kept],
         label_weights=None if weights is None else weights[kept],
         existence=None if existence is None else existence[kept],

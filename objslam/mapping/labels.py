@@ -1,4 +1,4 @@
-"""Judge whether each label belongs to a single object."""
+"""Judge whether each label names a single object. Then the labels alone tell which rays belong together."""
 
 from collections.abc import Callable
 
@@ -14,28 +14,29 @@ from objslam.core.types import Association, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
-"""A label has a second object if at least this number, and more than this share, of its rays disagree with the first one.
-Larger values accept fewer second objects."""
+"""A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
+find fewer."""
 _JUDGEMENTS = 2
-"""How often labels are judged again with the noise of the last solve. Rejected rays hide noise, so the second judgement
-finds more noise. More judgements are slower."""
+"""How often `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays finds too
+little noise, so a second one finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which labels are not judged again. A larger value ends sooner."""
+"""The relative change of the noise below which `noise_explains` does not solve again. A larger value ends sooner."""
 
 _CLOCKS = (-1.0, 1.0, -2.0, 2.0)
-"""The tried clock offsets, in standard deviations of their prior. A solve finds a clock within one standard deviation, so
-closer values are slower and find nothing new. Farther values find clocks that the prior excludes."""
+"""The clock offsets that `clock_explains` tries, in standard deviations of their prior. A solve converges from one standard
+deviation away, so a denser grid is slower and finds nothing new. A wider grid finds clocks that the prior excludes."""
 _SHORT = 500
-"""Clock offsets are tried only for a log with at most this many keyframes. Longer logs determine the clock by themselves."""
+"""The largest number of keyframes of a log for which `clock_explains` tries clock offsets. A longer log has enough rays to
+find its clock in one solve. A larger number is slower."""
 
 _LARGER = 1.5
-"""A warning names noise that is larger than the settings by more than this factor. A larger factor names less."""
+"""The factor on the noise of the settings above which `warn_of_noise` names it. A larger factor names less noise."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     """Return whether to try one object for each label.
 
-    association.method decides. With `auto`, the answer is yes if no keyframe has two rays of one label.
+    association.method decides: `by_label` is yes. `auto` is yes if no keyframe has two rays of one label.
     """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
@@ -44,9 +45,9 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:
-    """Return whether every label is one object, because no label has many rejected rays.
+    """Return whether every label is one object: no label has many rejected rays (`MANY`).
 
-    A label whose object has no position is ignored, because its rays may have too little parallax. False if no object has a
+    An object without a position is ignored, because its rays may only have too little parallax. False if no object has a
     position.
     """
     placed = np.isfinite(estimate.positions[:, 0])
@@ -57,10 +58,10 @@ def labels_tell(association: Association, estimate: Estimate) -> bool:
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
-    """Return shared errors (P,) from which a solve of a short log ends with one object for each label. None if none do.
+    """Return shared errors (P,) from which a solve finds one object for each label. None if there are none.
 
-    With a wrong clock, the start of a solve rejects true rays. A short log has too few other rays to find the clock. So a
-    solve starts from each clock of a coarse grid. solve: solves once, from shared errors.
+    A solve that starts with a wrong clock offset rejects true rays. In a short log, too few rays are left to find the clock.
+    So the solve is tried from each clock offset in `_CLOCKS`. solve: solves once, from the given shared errors (P,).
     """
     clocks = np.array([kind(name) == "clock" for name in errors.names], dtype=bool)
     if not clocks.any() or len(errors.keyframes) > _SHORT:
@@ -76,13 +77,12 @@ def clock_explains(association: Association, errors: SharedErrors, solve: Callab
 def noise_explains(
     association: Association, estimate: Estimate, errors: SharedErrors, solve: Callable[[SharedErrors], Estimate]
 ) -> Estimate | None:
-    """Return the solution with one object for each label if larger noise makes all labels agree. None if it does not.
+    """Return an estimate with larger noise in which each label is one object. None if larger noise does not help.
 
-    With too little noise in the settings, poses cannot move far enough. Then rays of one object look like rays of several
-    objects. So all noise is estimated, even if the settings fix it, and the labels are judged with this noise.
+    With too little noise in the settings, poses cannot move far enough. Then the rays of one object look like rays of
+    several. So the noise is estimated, even if the settings fix it, and the labels are judged again.
 
-    estimate: the solution in which labels disagree. errors: the shared errors at the start of the first solve. solve: solves
-    once.
+    estimate: in which some label has many rejected rays. errors: the shared errors of the log. solve: solves once.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise
@@ -98,7 +98,7 @@ def noise_explains(
 
 
 def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> None:
-    """Warn if the settings have less noise than an estimate in which the labels agree."""
+    """Warn if the settings fix the noise, and `estimate` found more. In `estimate`, each label is one object."""
     said = errors.with_unknown_noise().unknown_noise - errors.unknown_noise
     if estimate.noise is None or not said:
         return

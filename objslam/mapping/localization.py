@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PriorMap:
-    """The map of another day. name: how messages call it. objects: in its own frame."""
+    """The map of another day. name: as shown in messages. objects: in the frame of this map."""
 
     name: str
     objects: ObjectMap
 
     @property
     def first_free_id(self) -> int:
-        """The largest id in the map plus 1. The objects that are gone count too."""
+        """The largest id in the map plus 1, including objects that are gone."""
         return max((o.id for o in (*self.objects.objects, *self.objects.gone)), default=-1) + 1
 
 
@@ -44,9 +44,9 @@ class PriorMap:
 class Localization:
     """A drive in the frame of an older map, or the reason why it is not there.
 
-    registration: of the drive to the map. told: the entry of summary.json. solution: the drive in the frame of the map, with
-    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects, with the map's
-    objects as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
+    registration: the match of the drive's objects to the map's. told: the entry of summary.json. The other fields are None
+    for a drive that was not found. solution: the drive in the frame of the map, with objects positioned by rays alone.
+    positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects by rays and map together. map_T_drive: (4, 4).
     """
 
     registration: Registration
@@ -62,10 +62,10 @@ def localize(
 ) -> Localization:
     """Register a drive to an older map, and solve it once more with the matched objects as priors.
 
-    objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
-    the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
+    objects: the map of the drive. known: the older map. errors: the shared errors of the drive, None if none were estimated.
+    If the registration is refused, or the solve fails, the ledger gets a warning, and the drive stays in its own frame.
     """
-    # These functions import scipy.optimize, which takes longer than the map of a small log.
+    # This module imports scipy.optimize, and that import takes longer than the whole map of a small log.
     from objslam.association.registration.object_maps import placed, reason, register
 
     found = register(objects, known.objects)
@@ -106,7 +106,7 @@ def localize(
 
 
 def _with_covariances(solution: Solution, objects: ObjectMap) -> Solution:
-    """Return the solution with the covariances of its map, which include the errors that checks found after the solve."""
+    """Return the solution with the covariances of its map. Checks of the result may have widened them."""
     widened = objects.covariances
     covariance = np.where(np.isfinite(widened), widened, solution.estimate.covariance)
     return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
@@ -134,18 +134,18 @@ def _solve(
     from objslam.graph.multiframes import Multiframes
 
     ours, theirs = found.matches.T
-    # The graph of the drive has the points where rays meet. The map has the centres of bodies, where there are bodies.
+    # The graph of the drive has the points where rays meet, and the map may have centres of bodies.
     beside = found.b_T_a[:3, :3] @ (objects.positions - at_ray_points(objects).positions)[ours][..., None]
     matched = MapObjects(ours, known.positions[theirs] - beside[..., 0], known.covariances[theirs])
     measured = None
     if settings.mode == "joint":
         estimate, images, keyframes, rays = solution.estimate, solution.keyframes, solution.keyframes, solution.rays
         if errors is not None and estimate.calibration is not None:
-            # Inside a solve, lengths are corrected for its shrinkage. The lengths of the solution are as measured.
+            # A solve takes lengths corrected for its shrinkage (`NoiseFactors`). The solution has them as measured.
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
-            rays = replace(rays, direction=solution.rays.direction)  # They may point to the centres of bodies.
+            rays = replace(rays, direction=solution.rays.direction)  # In the solution they may point to centres of bodies.
         rays = share_bias(rays, solution.association, settings)
         measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)
@@ -161,9 +161,9 @@ def describe_in_map(
     *,
     trusted: bool = True,
 ) -> tuple[Solution, ObjectMap, Floats]:
-    """Return the solution of a drive that was found in a map, its objects there, and its residuals by `describe`.
+    """Return the solution of a drive in the frame of the map, its objects, and the residuals (R,), rad, of its rays.
 
-    ids: (N,) of the objects in the drive, their indices by default. trusted: whether positions are reliable.
+    ids: (N,) the ids of the objects in the drive, by default 0 to N - 1. trusted: whether positions are reliable.
     """
     assert where.solution is not None
     solution = with_bodies(where.solution, cameras, settings)
@@ -174,17 +174,16 @@ def describe_in_map(
 
 
 def at_ray_points(objects: ObjectMap) -> ObjectMap:
-    """Return a map with each object where its rays meet, also if its position is the centre of a body."""
+    """Return a map in which the position of each object is the point where its rays meet, never the centre of its body."""
     found = (o if o.ray_point is None else replace(o, position=o.ray_point) for o in objects.objects)
     return replace(objects, objects=tuple(found))
 
 
 def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
-    """Return the objects of a drive that was found in a map, with the ids of the map. The map's objects count as priors of
-    their positions.
+    """Return the objects of a drive with the ids of the map, and at the positions in `where`.
 
-    objects: of the drive, described in the frame of the map. An object without a covariance keeps its position. Objects that
-    the map does not have get the first free id of the map, plus their id in the drive.
+    objects: of the drive, in the frame of the map. An object without a covariance keeps its position. An object that the map
+    does not have gets the first free id of the map plus its id in the drive.
     """
     assert where.positions is not None
     assert where.covariance is not None
@@ -196,7 +195,7 @@ def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> Object
         if item.covariance is None:
             moved.append(replace(item, id=number))
             continue
-        point = where.positions[j]  # Where its rays meet.
+        point = where.positions[j]  # The point where its rays meet.
         position = point if item.ray_point is None else point + item.position - item.ray_point
         ray_point = None if item.ray_point is None else point
         moved.append(replace(item, id=number, position=position, covariance=where.covariance[j], ray_point=ray_point))
@@ -219,8 +218,7 @@ def moved_object(item: MapObject, map_T_drive: Floats) -> MapObject:
 
 
 def moved_log(log: Log, map_T_drive: Floats) -> Log:
-    """Return the log with its poses in the frame of the map. The ground truth stays, because its place in the map is
-    unknown."""
+    """Return the log with odometry and localization in the frame of the map. The ground truth stays in its own frame."""
     odometry, localization = (
         None if path is None else Trajectory(path.stamps, map_T_drive @ path.poses)
         for path in (log.odometry, log.localization)
@@ -251,7 +249,7 @@ def _number(value: float) -> float | None:
 
 
 def _line(told: dict[str, Any]) -> str:
-    """Return the sentence that terminal and report show."""
+    """Return the sentence about the localisation that the terminal and the report show."""
     if not told["localised"]:
         return f"not localised in {told['map']}: {told['reason']}"
     at, sigma = told["transform"], told["sigma"]

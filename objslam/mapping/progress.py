@@ -3,4 +3,4 @@
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int], None]
-"""A function of the stage's name, the work done, and the total work (0 if the total is unknown)."""
+"""A function of the stage's name, the number of steps done, and the total number of steps (0 if unknown)."""

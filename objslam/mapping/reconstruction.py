@@ -31,21 +31,21 @@ _BLOCK = 6
 """The number of voxels along the edge of a block. Compared with 8, a value of 6 takes a tenth less time and a quarter less
 memory. A larger number is slower: 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""The number of blocks for which the grid has room at first. It is enough for a room. A larger number takes more memory in a
-small scene. The grid doubles its room when it is full."""
+"""The number of blocks for which the grid has memory at first, enough for one room of a house. A full grid doubles its
+memory. A larger number takes more memory in a small scene."""
 _SPARE = 1024
-"""The number of blocks in the grid that stay free. A larger number takes more memory. If one call touches more blocks than
-are free, Open3D itself enlarges the grid. It counts even the touched blocks that exist already."""
+"""The number of blocks in the grid that always stay free. Open3D would enlarge a grid on its own, past the limit, if one
+call touches more blocks than are free. A larger number takes more memory."""
 _AHEAD = 4
 """The number of images that are decoded ahead. A larger number takes more memory."""
 _TOUCH = 4
-"""The step (px) at which Open3D samples a depth image to find the touched blocks. It must equal Open3D's own step. A larger
-step wrongly drops images as out of reach."""
+"""The step (px) at which Open3D itself samples a depth image to find the blocks that it touches. An image without depth at
+these pixels is dropped. A larger step would drop images that Open3D can use."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image to fuse, its colour image (None without colour), and the camera pose (4, 4). camera: its index."""
+    """A depth image to fuse. camera: its index. rgb: the colour image, None without colour. map_T_camera: (4, 4)."""
 
     camera: int
     depth: Path
@@ -56,12 +56,11 @@ class Shot:
 def reconstruct(
     log: Log, path: Trajectory, settings: Settings, ledger: Ledger, progress: Progress = lambda stage, done, total: None
 ) -> Surface | None:
-    """Fuse the depth images of a log, at the poses of a path (map_T_base), into a surface.
+    """Fuse the depth images of a log into a surface. None, with a warning in the ledger, if there is no surface.
 
-    Depth images contain z at the pixels of the camera image. The ledger counts unused depth images: without a pose, without
-    a colour image within 20 ms, without depth in reach, damaged, or of another size than the camera's. Blocks beyond
-    reconstruction.max_blocks are left out with a warning. If there is no surface, or if Open3D fails or cannot be imported,
-    the ledger gets a warning and the result is None.
+    A pixel of a depth image is the z coordinate in the camera frame. path: the poses map_T_base. The ledger counts unused
+    depth images: without a pose, without a colour image within 20 ms, without depth up to reconstruction.max_depth, damaged,
+    or of another size than the camera's. Blocks beyond reconstruction.max_blocks are left out with a warning.
     """
     shots = choose_shots(log, path, settings, ledger)
     if not shots:
@@ -71,8 +70,8 @@ def reconstruct(
         return _fuse(shots, tuple(c.camera for c in log.cameras), settings, ledger, progress)
     except ImportError as error:
         ledger.warn(f'no reconstruction: Open3D cannot be imported ({error}); pip install "objslam[open3d]"')
-    except RuntimeError as error:  # Open3D raises it, for example if a GPU is out of memory.
-        reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # Without colour codes and signature.
+    except RuntimeError as error:  # For example a GPU without enough memory.
+        reason = str(error).strip().splitlines()[-1].rpartition("): ")[2][:200]  # Without colour codes and C++ signature.
         ledger.warn(f"no reconstruction: Open3D failed ({reason})")
     return None
 
@@ -80,7 +79,7 @@ def reconstruct(
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
     """Choose depth images that have a pose, in the order of time. If all cameras have colour, they also need a colour image.
 
-    Every reconstruction.stride-th image is chosen. If more than reconstruction.max_frames are left, they are thinned evenly.
+    Of these images, one in reconstruction.stride is taken. More than reconstruction.max_frames are thinned evenly.
     """
     chosen = settings.reconstruction
     colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)
@@ -117,11 +116,11 @@ def _fuse(
 
     chosen = settings.reconstruction
     grid: Grid | None = None
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):  # no warnings on stdout
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):  # Open3D warns on stdout.
         lenses = [Lens.of(camera) for camera in cameras]
 
         def load(shot: Shot) -> tuple[Shot, NDArray[np.float32] | None, NDArray[np.float32] | None, Ledger]:
-            noted = Ledger()  # Threads cannot share a ledger.
+            noted = Ledger()  # Threads cannot write to one ledger.
             return shot, *load_shot(shot, cameras[shot.camera], lenses[shot.camera], chosen.max_depth, noted), noted
 
         for done, (shot, depth, colour, noted) in enumerate(ahead(load, shots, _AHEAD)):
@@ -153,7 +152,7 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
-        """Make the maps that turn the camera's images into those of a pinhole camera with the same matrix."""
+        """Make the maps that turn the camera's images into images of a pinhole camera with the same matrix."""
         import cv2
 
         fisheye = camera.distortion_model == "equidistant"
@@ -175,15 +174,15 @@ class Lens:
 def load_shot(
     shot: Shot, camera: Camera, lens: Lens, max_depth: float, ledger: Ledger
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Read the undistorted depth (H, W), m, and the undistorted RGB (H, W, 3) in [0, 1] of a shot. Depth out of reach is 0.
+    """Return the undistorted depth (H, W), m, and the undistorted RGB image (H, W, 3) in [0, 1] of a shot.
 
-    Both are None if one of the two images cannot be used. The colour is None if the shot has no colour image.
+    Depth beyond `max_depth` is 0. Both are None if one of the two images cannot be used. Without colour, RGB is None.
     """
     raw = read_depth(shot.depth, camera, ledger)
     if raw is None:
         return None, None
     depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
-    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # Comparisons with NaN are False.
+    depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # NaN becomes 0 too.
     if not depth[::_TOUCH, ::_TOUCH].any():
         ledger.drop("depth images without a depth in reach", where=str(shot.depth))
         return None, None
@@ -202,7 +201,7 @@ def load_shot(
 class Grid:
     """A voxel block grid that grows up to reconstruction.max_blocks blocks. A voxel takes 20 bytes (8 without colour).
 
-    left_out: how many times a depth image touched a new block for which the grid had no room.
+    left_out: how many blocks the grid had no room for. A block counts again for each image that touches it.
     """
 
     def __init__(self, settings: Settings, *, coloured: bool) -> None:
@@ -241,7 +240,8 @@ class Grid:
             self._grid.integrate(part, *images, *[k] * len(images), camera_T_map, *reach)
 
     def _with_room(self, touched: Any) -> Iterator[Any]:
-        """Yield the touched blocks (M, 3) that exist or find room, in small portions, so that Open3D does not add room."""
+        """Yield the touched blocks (M, 3) that exist or still fit, in portions for which Open3D does not enlarge the
+        grid."""
         hashmap = self._grid.hashmap()
 
         def room() -> int:
@@ -260,10 +260,10 @@ class Grid:
             yield touched[self._core.Tensor(kept[start : start + _SPARE], device=self._device)]
 
     def surface(self, min_views: int) -> Surface | None:
-        """Return the triangles between voxels that at least `min_views` depth images saw, or None without triangles."""
+        """Return the surface through voxels that at least `min_views` depth images saw, or None if it has no triangles."""
         if not self.blocks:
             return None
-        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D requires a weight above its limit.
+        mesh = self._grid.extract_triangle_mesh(min_views - 0.5).cpu()  # Open3D keeps weights above the limit.
         if not len(mesh.triangle.indices):
             return None
         colours = None

@@ -1,8 +1,8 @@
-"""Remove findings that the solve refutes. A quick check of the boxes may report wrong input that a joint solve corrects.
+"""Remove findings about wrong input that a joint solve refutes.
 
-The quick check keeps odometry and calibration fixed within windows of some seconds. If a camera is turned by some degrees
-and late by a tenth of a second, few boxes fit. Then several hypotheses fit the few boxes by chance. Objects with little
-parallax in one half of a log get no point there. So the solved map repeats the test.
+A finding comes from a quick check before the solve (`mapping/checks`). The check keeps odometry and calibration fixed within
+windows of some seconds. So it also reports errors that the joint solve corrects, such as a camera that is turned by some
+degrees and late by 0.1 s. So the solved map repeats the test.
 """
 
 from dataclasses import replace
@@ -26,21 +26,21 @@ from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something
 
 _EXPLAINED = 0.85
-"""A solve explains the boxes if it explains at least this share of the rays in each half of a log. A larger share refutes
-fewer findings. Clean simulated logs have 0.92 and more. Logs with one of 20 faults of boxes or cameras have at most 0.76."""
+"""A solve explains the boxes if at least this share of the rays in each half of a log agrees with its objects. A larger
+share refutes fewer findings. Clean simulated logs have at least 0.92, logs with one of 20 faults at most 0.76."""
 _NOISE = 2.0
-"""The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With enough
-noise, everything fits. Corrected simulated logs have at most 1.6."""
+"""The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With more
+noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
-"""A finding stands only if its corrected log explains more rays by this share. A larger share refutes more findings."""
+"""A finding stands only if a solve without the fault explains this share of the rays more. A larger share refutes more."""
 _QUIETER = 0.5
 """If a solve explains the boxes, but only with noisy odometry, a finding stands if its corrected log needs at most this
 share of the noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with
 mirrored images, because with these the path must turn the other way."""
 _IN_BOTH = 0.4
-"""The halves of a log agree if at least this share of a half's explained rays belongs to objects in both halves
-(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs with such a finding have 0.63 and more. Logs of
-two recordings have at most 0.23, even if the solve explains the rays of both."""
+"""The halves of a log agree if, in each half, at least this share of the explained rays is of objects that both halves see
+(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs have 0.63 and more. Logs of two recordings have
+at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
@@ -68,7 +68,7 @@ def _refuted(
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
-        # Without rounds, each label is one object. With rounds, two copies of an object could explain both halves.
+        # With rounds of association, an object may be in the map twice, once for each half.
         return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
     loud = _noise(solution) > _NOISE
     if explained and not loud:
@@ -105,19 +105,19 @@ def _explained(solution: Solution) -> Bools:
 
 
 def _late(solution: Solution) -> Bools:
-    """Return a mask (R,) of the rays in the second half of the log."""
+    """Return a mask (R,) of the later half of the rays."""
     stamps = solution.keyframes.stamps[solution.rays.keyframe]
     return np.asarray(stamps > np.median(stamps))
 
 
 def _least_explained(solution: Solution) -> float:
-    """Return the share of explained rays in the half with the smaller share."""
+    """Return the share of explained rays in each half of the log, the smaller of the two."""
     explained, late = _explained(solution), _late(solution)
     return float(min(explained[mask].mean() if mask.any() else 0.0 for mask in (late, ~late)))
 
 
 def _noise(solution: Solution, *, rays_only: bool = False) -> float:
-    """Return the largest factor on the noise of rays and odometry."""
+    """Return the largest factor on the noise of rays and odometry (only of rays if `rays_only`)."""
     found = solution.estimate.noise
     if found is None:
         return 1.0

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Solution:
-    """The association, the estimate, and counts of each round.
+    """The solved association and estimate, with the keyframes and rays that were solved.
 
-    keyframes: the solved keyframes, which have at least one ray. rays: their rays, with indices into these keyframes. trace:
-    the rounds for the recording, empty without a recording. bodies: the body of each object, None for a point. The tuple is
-    None if no bodies were solved. body_share: the standard deviation of the error that the boxes of one side of a body
-    share, as a share of half their size. to_centre: (R, 3) what to add to the direction of each ray, in the camera frame, so
-    that it points to the centre of its body. None without bodies.
+    keyframes: all with at least one ray. rays: with indices into these keyframes. rounds: counts of each round of
+    association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
+    a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
+    the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
+    body. The last three are None if no bodies were solved.
     """
 
     keyframes: Keyframes
@@ -40,25 +40,22 @@ class Solution:
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
-    """Return the keyframes and rays that belong to an estimate: without its shared errors, and with its noise."""
+    """Return the keyframes and rays with the shared errors of an estimate removed, and with the noise of the estimate."""
     values = errors.mean if estimate.calibration is None else estimate.calibration.values
     keyframes, rays, _ = with_noise_of(errors, estimate).at(values)
     return keyframes, rays
 
 
 def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
-    """Return shared errors with the noise of an estimate.
+    """Return shared errors with the noise of an estimate, but no shrinkage.
 
-    Lengths keep their measured scale. The shrinkage is corrected only inside a solve.
+    The shrinkage is an effect of a solve on lengths (`NoiseFactors`). Outside a solve, lengths stay as measured.
     """
     noise = errors.noise if estimate.noise is None else estimate.noise
     return errors.with_noise(replace(noise, shrinkage=0.0))
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
-    """Return the keyframes that have a ray, and the rays with indices into them.
-
-    Keyframes without a ray are left out, because they measure no object.
-    """
+    """Return the keyframes that have a ray, and the rays with indices into these keyframes."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))

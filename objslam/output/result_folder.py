@@ -1,4 +1,4 @@
-"""The result folder: the functions that write its files, clear it, and replace an older result by a new result."""
+"""The result folder: write its files, clear it, and replace an older result by a new one."""
 
 import json
 import shutil
@@ -35,11 +35,11 @@ from objslam.sources.log_folder import resembles_log
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
 """The files that a new result replaces or deletes. They include the exports of the older result."""
 _ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
-"""The files of an older result that a live session deletes. objects.json is not among them, because it is replaced."""
+"""The files of an older result that a live session deletes: all but objects.json, which it replaces."""
 
 
 def prepare_output(out: Path) -> None:
-    """Make the folder for a result and try to write there; call this function before a long computation.
+    """Make the folder for a result and try to write there. Call this before a long computation.
 
     Raises:
         OutputError: the folder cannot be written, or the result would replace files that no run wrote: files of a log, files
@@ -63,7 +63,7 @@ def prepare_output(out: Path) -> None:
 
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
-    """Call `prepare_output`, then run the `with` block; if the block fails, delete the new folder if it is empty."""
+    """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty."""
     with no_empty_folders(out):
         prepare_output(out)
         yield
@@ -72,7 +72,7 @@ def output_folder(out: Path) -> Iterator[None]:
 def write_result(
     result: RunResult, out: Path, truth: Truth | None = None, *, detected: tuple[CameraLog, ...] = ()
 ) -> tuple[str, ...]:
-    """Write a result into the folder `out` and replace an older result there; other files stay.
+    """Write a result into the folder `out` and replace an older result there. Other files stay.
 
     A run that is killed leaves no partial file and no mix of two results. summary.json exists only if all other
     files of its result exist.
@@ -101,7 +101,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
     A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
-    process is killed meanwhile, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
+    process is killed here, the next `prepare_output` deletes the rest. OutputError as in `write_result`.
     """
     return replace_files(out, _ALL_BUT_OBJECTS, {})
 
@@ -182,7 +182,7 @@ def _existing_files(out: Path) -> list[str]:
 
 
 def _is_result(out: Path, names: list[str]) -> bool:
-    """Return whether the named files belong to a result, or to a live session that has not ended."""
+    """Return whether these files belong to a result, or to a live session that has not ended."""
     if out.resolve().name == files.GROUNDTRUTH:
         return False
     try:

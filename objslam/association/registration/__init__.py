@@ -1,4 +1,4 @@
-"""Registers two maps if the transform between their frames is unknown.
+"""Register two maps if the transform between their frames is unknown.
 
-Pairs of objects propose transforms. Fits make them precise, and the number of false alarms judges them.
+Pairs of objects propose transforms. Fits make the transforms precise, and the number of false alarms judges them.
 """

@@ -9,15 +9,15 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import HUBER_K, SAME_POINT
 
 _FLOOR = 0.01
-"""The least standard deviation (m) of a position. It also allows maps without noise to be registered."""
+"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more."""
 _DENSITY_NEIGHBOURS = 8
-"""The number of neighbours that measure the local density of objects. A larger number smooths the density more."""
+"""The number of nearest objects from which the local density of objects is computed. A larger number smooths it more."""
 
 
 class Problem:
-    """Both maps relative to their centres, with values that are computed only once.
+    """Maps a and b, each relative to its centre, with values that are computed only once.
 
-    spread_a, spread_b: (N,) and (M,) horizontal variance of a position, m^2. apart: m, more than the distance of any two
+    spread_a, spread_b: (N,) and (M,) m^2, the horizontal variance of each position. apart: m, more than any distance of two
     objects.
     """
 
@@ -31,7 +31,7 @@ class Problem:
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
     def nearest(self, moved: Floats, index: Ints) -> Ints:
-        """Return the nearest object of b with an equal label, for points (H, P, 3) of the objects `index` (H, P) of a."""
+        """Return the nearest object of b with the same label, for objects `index` (H, P) of a at `moved` (H, P, 3)."""
         at = np.concatenate([moved, self.a.label[index][..., None] * self.apart], axis=-1)
         return np.asarray(self._labelled.query(at.reshape(-1, 4))[1]).reshape(index.shape)
 
@@ -60,14 +60,13 @@ def move(x: Floats, points: Floats) -> Floats:
 
 
 def covariances(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
-    """Return the covariances (H, P, 3, 3) of the offsets from objects `a` (H, P), under transforms x (H, 4), to objects
-    `b`."""
+    """Return the covariances (H, P, 3, 3) of the offsets between objects `a` (H, P) moved by x (H, 4) and objects `b`."""
     rotation = lift_se2(np.stack([x[:, 0], x[:, 1], x[:, 3]], axis=1))[:, None, :3, :3]
     return rotation @ problem.a.covariance[a] @ np.swapaxes(rotation, -1, -2) + problem.b.covariance[b]
 
 
 def jacobian_of(x: Floats, moved: Floats) -> Floats:
-    """Return the Jacobians (H, P, 3, 4) of moved points (H, P, 3) by x, y, z and yaw."""
+    """Return the Jacobians (H, P, 3, 4) of points `moved` (H, P, 3) by x, y, z and yaw of the transforms x (H, 4)."""
     jacobian = np.zeros((*moved.shape, 4))
     jacobian[..., [0, 1, 2], [0, 1, 2]] = 1.0
     jacobian[..., 0, 3] = -(moved[..., 1] - x[:, None, 1])
@@ -76,9 +75,10 @@ def jacobian_of(x: Floats, moved: Floats) -> Floats:
 
 
 def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Return for objects of a (H, P) their nearest objects of b, the offsets, covariances, Jacobians, and which match.
+    """Match objects `index` (H, P) of a to the nearest objects of b, under transforms x (H, 4).
 
-    hessian: (H, 4, 4) the information of the transforms, NaN before the first fit. Its inverse widens the gates.
+    Return these partners (H, P), the offsets, covariances and Jacobians, and which match. hessian: (H, 4, 4) the information
+    of the transforms, NaN before the first fit. Its inverse widens the gates.
     """
     moved = move(x, problem.a.position[index])
     partner = problem.nearest(moved, index)
@@ -90,14 +90,14 @@ def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Int
     doubt[known] = np.linalg.inv(hessian[known])
     total = covariance + jacobian @ doubt[:, None] @ np.swapaxes(jacobian, -1, -2)
     squared = (miss * np.linalg.solve(total, miss[..., None])[..., 0]).sum(axis=-1)
-    limit = np.where(known, SAME_POINT, 2 * SAME_POINT)[:, None]  # The heading by a single pair is not precise.
+    limit = np.where(known, SAME_POINT, 2 * SAME_POINT)[:, None]  # Before the first fit, the heading is not precise.
     return partner, miss, covariance, jacobian, squared <= limit
 
 
 def fit(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Floats, Floats]:
     """Return transforms (H, 4) after one robust Gauss-Newton step on the matches of objects (H, P), and their information.
 
-    A transform that its matches do not fix stays unchanged, and its information is NaN. Fewer than two never fix it.
+    A transform that its matches do not determine stays, and its information is NaN. One match is never enough.
     """
     _, miss, covariance, jacobian, good = gate(problem, index, x, hessian)
     return robust_step(x, miss, covariance, jacobian, good)

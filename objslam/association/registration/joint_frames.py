@@ -1,12 +1,12 @@
 """Solve the frames of many maps and the positions of their objects together.
 
 Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
-frame is the frame of the result. Each Gauss-Newton step eliminates the objects first, because each object is a block of its
-own (Schur complement). So its time grows with the number of measurements, and with the cube of the number of frames, which
-are few. Cauchy's weights limit the influence of an object that a map has at another place.
+frame is the frame of the result. Each Gauss-Newton step eliminates the objects first (Schur complement). So its time grows
+with the number of measurements, and with the cube of the small number of frames. Cauchy's weights limit what moved objects
+do.
 
-A map may be worse than it says. Where at least three maps overlap, the residuals tell: the noise of each map is estimated
-against that of the others (variance components; Helmert 1907, Foerstner 1979), and a worse map counts less.
+A map may have larger errors than its covariances say. With at least three maps, the residuals show this. The variance of
+each map is estimated against that of all others (variance components; Helmert 1907, Foerstner 1979).
 """
 
 from dataclasses import dataclass, replace
@@ -22,12 +22,12 @@ _STEPS = 30
 _ROUNDS = 10
 """The most estimates of the maps' noise, each followed by a solve. More are slower, and hardly change the noise."""
 _SAME_NOISE = 0.02
-"""The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
+"""The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
 _FEWEST_MAPS = 3
-"""The least number of maps whose residuals tell which of them is worse. The residuals of two maps are alike."""
+"""The least number of maps for which the noise is estimated. The residuals of two maps do not tell which is worse."""
 _POOLED = 10.0
-"""The claimed covariances of a map count as this number of coordinates of residuals. A larger number trusts the claims
-longer. At 10, a map of a few objects keeps its claims, and one of a few dozen is judged by its residuals."""
+"""The covariances that a map comes with count as this number of coordinates of residuals. A larger number trusts them
+longer. At 10, a map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _STILL = 1e-9
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
 
@@ -48,7 +48,7 @@ class JointFrames:
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
     (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1]. noise: (S,) the factor on
-    the variance of each map against that of all maps, 1 for fewer than three maps.
+    the covariances of each map, relative to the mean of all maps. 1 for fewer than three maps.
     """
 
     site_T_map: Floats
@@ -63,7 +63,7 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFra
     """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has a
     measurement.
 
-    Each frame must share at least two objects with the others, directly or through other frames. If one does not, the
+    Each frame must share at least two objects with the first, directly or through other frames. If one does not, the
     covariances of all frames after the first are NaN.
     """
     noise = np.ones(len(site_T_map))
@@ -79,7 +79,7 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFra
 
 
 def _noise(measured: Measured, found: JointFrames) -> Floats:
-    """Return the factor (S,) on the variance of each map, from its residuals and its share in the objects (redundancy)."""
+    """Return the factor (S,) on the covariances of each map: its squared residuals over their expectation."""
     rotation = found.site_T_map[measured.map, :3, :3]
     moved = (rotation @ measured.position[..., None])[..., 0] + found.site_T_map[measured.map, :3, 3]
     claimed = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
@@ -90,7 +90,7 @@ def _noise(measured: Measured, found: JointFrames) -> Floats:
     squares = found.weight * np.einsum("ri,rij,rj->r", miss, claimed, miss)
     maps = len(found.noise)
     free, own = np.bincount(measured.map, 3 - share, maps), np.bincount(measured.map, squares, maps)
-    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # The factor by which all maps claim too small variances.
+    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # The mean factor over all maps.
     return np.asarray((own / level + _POOLED) / (free + _POOLED))
 
 
@@ -123,7 +123,7 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats) ->
         held = np.linalg.cond(system) < 1e14
         spread[4:, 4:] = np.linalg.inv(system) if held else np.nan
     covariance = np.linalg.inv(total)
-    gain = covariance[:, None] @ half  # (N, S, 3, 4): how each object moves with each frame.
+    gain = covariance[:, None] @ half  # (N, S, 3, 4): the derivative of each object by each frame.
     flat = np.swapaxes(gain, 1, 2).reshape(count, 3, 4 * frames)
     covariance = covariance + flat @ np.nan_to_num(spread) @ np.swapaxes(flat, 1, 2)
     poses = lift_se2(x[:, [0, 1, 3]])
@@ -147,8 +147,8 @@ def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:
 def _reduced(
     measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, frames: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the system and the right side for the frames after the first, and the information (N, S, 3, 4) that ties each
-    object to each frame."""
+    """Return the matrix and the right side of the linear system of the frames after the first. Also the information
+    (N, S, 3, 4) between each object and each frame."""
     count = len(total)
     pull = information @ lever
     half = np.zeros((count, frames, 3, 4))

@@ -1,8 +1,8 @@
 """Register two maps whose frames are unknown to each other, by the relative positions of their objects.
 
-Pairs of objects with equal labels and equal distances propose transforms. The fit of the best proposals grows from the
-neighbourhood of their pair to the whole map. The evidence is a number of false alarms (a-contrario; Desolneux, Moisan &
-Morel 2000): the expected number of equally good proposals from two maps of unrelated places.
+Two objects of each map with equal labels and equal distances propose a transform. The best proposals are fitted first to the
+objects around their pair, at last to the whole map. The evidence is a number of false alarms (a-contrario; Desolneux, Moisan
+& Morel 2000): how many equally good proposals two maps of unrelated places would give.
 """
 
 from dataclasses import dataclass
@@ -35,12 +35,12 @@ MIN_LOG_ODDS = 9.2
 """The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
 refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""For each stage of growth, the number of objects around its pair to which a proposal is fitted, and the number of the best
-proposals that are fitted. Larger numbers find smaller overlaps and take longer."""
+"""The stages of the fit: (number of objects around its pair to which a proposal is fitted, number of best proposals that are
+fitted). Larger numbers find smaller overlaps and take longer."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms nearer than this (m at the centre of the map, rad) are one place. Larger values hide a near repetition."""
+"""Two transforms that differ by less (m at the centre of the map, rad) are one place. Larger values hide repetitions."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Registration:
 
     b_T_a: (4, 4) takes points from the frame of map a to the frame of b. It turns about z only. NaN if no transform fits.
     covariance: (4, 4) of the x, y, z (m) and yaw (rad) of b_T_a. matches: (P, 2) indices of one object in a and in b.
-    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: the same
-    for the best other place, None and -inf if there is none.
+    log_odds: evidence against chance, -ln of the expected number of false alarms. second_b_T_a, second_log_odds: transform
+    and log odds of the second-best place, None and -inf if there is none.
     """
 
     b_T_a: Floats
@@ -62,13 +62,12 @@ class Registration:
 
     @property
     def lead(self) -> float:
-        """The log odds minus the log odds of the best other place. Negative odds of the other place count as 0."""
+        """The log odds minus the log odds of the second-best place, which count as at least 0."""
         return self.log_odds - max(self.second_log_odds, 0.0)
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the log odds are enough for the transform, and if so, whether the lead over the best other place is enough
-        too."""
+        """The transform is accepted if both the log odds and the lead are at least `MIN_LOG_ODDS`."""
         if self.log_odds < MIN_LOG_ODDS:
             return "too little evidence"
         return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"
@@ -82,10 +81,10 @@ class Registration:
 def register_maps(a: Constellation, b: Constellation) -> Registration:
     """Find the transform (yaw and translation) from the frame of a to the frame of b. Both maps use the same label numbers.
 
-    Both maps have z up. The log odds are -ln(T * P(X >= m - 2)): T proposals were tried, m objects match, and X is Poisson
-    distributed. Its mean is the sum of the chances of all objects of a to have a match. This chance is the local density of
-    objects in b, times the area of the gate, times the share of the objects of b with the same label and height. The two
-    objects of the proposing pair do not count.
+    Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
+    of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
+    the objects of a. Each adds the local density of objects in b, times the area of the gate, times the share of the objects
+    of b that have its label and height.
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:
@@ -110,7 +109,7 @@ def register_maps(a: Constellation, b: Constellation) -> Registration:
         return transform
 
     b_T_a = whole(fitted)
-    lever = np.eye(4)  # The translation of b_T_a is the moved centre of a, minus its turned centre.
+    lever = np.eye(4)  # Takes the covariance at the centre of a to the origin of a.
     turned = b_T_a[:3, :3] @ centre_a
     lever[0, 3], lever[1, 3] = turned[1], -turned[0]
     return Registration(
@@ -129,8 +128,8 @@ def _nothing() -> Registration:
 
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
-    """Return the best transforms (H, 4). Each is fitted first to the objects around its pair, then to more, then to all.
-    first: the object of a in the pair of each transform."""
+    """Fit the best transforms to the objects around their pair, then to more, then to all (`_STAGES`). Return those left
+    (H, 4). first: the first object of a in the pair of each transform."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)
@@ -154,7 +153,7 @@ def _everything(problem: Problem, x: Floats) -> Ints:
 
 
 def _differ(x: Floats, other: Floats) -> Bools:
-    """Return which transforms (H, 4) mean another place than one transform (4,)."""
+    """Return which transforms (H, 4) are another place than the transform `other` (4,)."""
     turn = (x[:, 3] - other[3] + np.pi) % (2 * np.pi) - np.pi
     return np.asarray((np.hypot(*(x[:, :2] - other[:2]).T) > _SAME_SHIFT) | (np.abs(turn) > _SAME_TURN))
 
@@ -179,7 +178,7 @@ def _log_odds(problem: Problem, index: Ints, x: Floats, tried: int) -> Floats:
 def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
     """Match all objects one-to-one under a transform (4,) and fit it to the matches.
 
-    Returns the transform, its covariance (4, 4), and the matches (P, 2).
+    Return the transform, its covariance (4, 4), and the matches (P, 2).
     """
     a = b = np.zeros(0, dtype=np.int64)
     hessian = np.eye(4)[None]

@@ -1,4 +1,4 @@
-"""Register the map of one drive to the map of another, if the transform between their frames is unknown."""
+"""Register two object maps to each other, if the transform between their frames is unknown."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def register(a: ObjectMap, b: ObjectMap) -> Registration:
     """Find the transform b_T_a from the frame of map a to the frame of map b, from the relative positions of their objects.
 
     Both frames have z up. The transform turns about z and shifts along x, y and z. Only resolved objects count. `matches`
-    are indices into the objects of a and b. Use the transform only if `accepted` is true. If not, `verdict` says why.
+    are indices into the objects of a and b. Use the transform only if `accepted` is true.
     """
     names = sorted({o.label for m in (a, b) for o in m})
     number = {name: k for k, name in enumerate(names)}
@@ -37,7 +37,7 @@ def placed(objects: ObjectMap) -> list[int]:
 
 
 def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
-    """Return in a few words why the registration of a to b was accepted or refused. names: how the reason calls a and b."""
+    """Return in a few words why the registration of a to b was accepted or refused. names: of a and b, for this text."""
     for name, objects in zip(names, (a, b), strict=True):
         if len(placed(objects)) < 2:
             return f"too little evidence, because {name} has {len(placed(objects))} resolved objects"

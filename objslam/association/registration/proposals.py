@@ -8,27 +8,27 @@ from objslam.association.registration.fitting import Problem, move
 from objslam.core.arrays import Array, Floats, Ints
 
 _PAIRS = 6000
-"""The most ordered pairs of one map that propose transforms. But each object has at least `_MIN_PARTNERS` partners. A larger
-number finds smaller overlaps and takes longer. Chosen for time, not by a sweep."""
+"""The most pairs of objects of one map that propose transforms. Each order of a pair counts. A larger number finds smaller
+overlaps and takes longer. Chosen for time, not by a sweep."""
 _MIN_PARTNERS = 6
-"""Each object has at least this number of partners in the pairs. A larger number takes longer on large maps."""
+"""Each object is in pairs with at least this number of others, even beyond `_PAIRS`. A larger number takes longer."""
 _MIN_BASE = 6.0
 """The least distance between the two objects of a pair, in standard deviations of their difference. A larger value gives
 better headings and fewer pairs. At 6, the heading of a pair has a standard deviation below 1/6 rad in each map."""
 _GATE = 3.0
 """The largest difference of two pairs' lengths, in standard deviations. A larger value proposes more wrong transforms."""
 _MAX_PROPOSALS = 60_000
-"""The most proposals that are compared by the neighbours of their pair. A larger number takes longer."""
+"""The most proposals that are compared. Pairs with few similar pairs come first. A larger number takes longer."""
 _NEIGHBOURS = 12
-"""The number of neighbours by which a proposal is compared. A larger number ranks better and takes longer."""
+"""The number of nearest objects by which proposals are compared. A larger number ranks better and takes longer."""
 _AT_ONCE = 1 << 20
 """The most differences of neighbours computed together. A larger number needs more memory."""
 
 
 def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
-    """Return the ordered pairs (P,), (P,) of each object and its nearest partners that give a heading.
+    """Return the pairs (P,), (P,) of each object and its nearest partners that are far enough for a heading (`_MIN_BASE`).
 
-    spread: (N,) m^2, as in `Problem`.
+    spread: (N,) m^2, the horizontal variance of each object.
     """
     count = len(m.label)
     partners = min(count - 1, max(_MIN_PARTNERS, _PAIRS // count))
@@ -41,8 +41,7 @@ def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
 def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     """Return H proposals: the first object (H,) of each pair in a, the transforms (H, 4), and the number of tried proposals.
 
-    A transform is the position of the centre of a in b: x, y, z (m), and yaw (rad). If there are too many proposals, the
-    most distinctive ones remain. Their pairs have the fewest similar pairs.
+    A transform is x, y, z (m) and yaw (rad) of a in b, both relative to their centres. H is at most `_MAX_PROPOSALS`.
     """
     a, b = problem.a, problem.b
     (i, j), (k, n) = _pairs(a, problem.spread_a), _pairs(b, problem.spread_b)
@@ -72,14 +71,14 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     x[:, :3] = (ends_b - move(x, ends_a[:, None])[:, 0]) / 2
     support = _support(problem, i[p], k[q], yaw, (var_a[p] + var_b[q]) / long_a[p] ** 2)
     best = np.argsort(-support, kind="stable")
-    # Proposals in one cell of a metre and 0.2 rad are one place. Only the best of them remains.
+    # Proposals in one cell of a metre and 0.2 rad are one place. Only the best one remains.
     cell = np.round(np.column_stack([x[:, :2], np.mod(yaw, 2 * np.pi) / 0.2]))[best]
     best = best[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
-    return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair proposes in both orders.
+    return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair is in the list in both orders.
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
-    """Return the number (H,) of neighbours of object i (H,) of a that fall on a neighbour of object k (H,) of b.
+    """Return how many neighbours (H,) of object i (H,) of a fall on a neighbour of object k (H,) of b with the same label.
 
     yaw, turn_variance: (H,) rad and rad^2, the heading of each proposal and its variance.
     """
@@ -106,7 +105,7 @@ def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Flo
 
 
 def _offsets(m: Constellation) -> tuple[Ints, Array]:
-    """Return the neighbours (N, K) of each object and their horizontal offsets (N, K), m, as complex numbers."""
+    """Return the neighbours (N, K) of each object, and their horizontal offsets (N, K) from it as x + iy, m."""
     plane = m.position[:, 0] + 1j * m.position[:, 1]
     near = around(m, np.arange(len(plane)), _NEIGHBOURS + 1)[:, 1:]
     return near, plane[near] - plane[:, None]

@@ -28,12 +28,12 @@ _CENTRE = np.zeros(2)
 def bearings(
     keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
+    """Return a factor for each ray on the angle (rad) between the ray and L(landmark).
 
-    offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
-    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. In its
-    image, the distance of the landmark from the centre is the angle. Behind this camera the error is constant, and larger
-    than in front of it.
+    directions: (R, 3) in the frame of X(keyframe). offset: (R, 3) m, the origin of each ray in this frame. None means the
+    origin of the frame. GTSAM has no bearing factor with an offset. So a ray with an offset gets an equidistant camera of
+    focal length 1 px that looks along the ray. The distance of the landmark from the centre of its image is the angle.
+    Behind the camera the error is larger and constant.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
@@ -51,10 +51,10 @@ def bearings(
 def point_to_line(
     keyframe: Ints, directions: Floats, landmark: Ints, noise: Noise, offset: Floats | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray on the distance (m, Eq. 1) between the ray and L(landmark).
 
-    The directions (R, 3) and the ray origins `offset` (R, 3), m, are in the frame of X(keyframe), which is a variable. If
-    `offset` is None, all rays begin at the origin of this frame.
+    directions: (R, 3) in the frame of X(keyframe). offset: (R, 3) m, the origin of each ray in this frame. None means the
+    origin of the frame.
     """
     origins = np.zeros_like(directions) if offset is None else offset
     make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(origins, directions)
@@ -65,9 +65,9 @@ def point_to_line(
 
 
 def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each ray with a known origin on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray on the distance (m, Eq. 1) between the ray and L(landmark), for fixed poses.
 
-    Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
+    origins, directions: (R, 3) in map. The norm of the residual is the distance.
     """
     make, camera = gtsam.TriangulationFactorCal3DS2, gtsam.PinholeCameraCal3DS2
     return [
@@ -77,9 +77,9 @@ def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noi
 
 
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a distant camera for each ray. It looks along the ray, which has an origin (R, 3) and a direction (R, 3).
+    """Return a camera for each ray, far behind its origin (R, 3) m, looking along its direction (R, 3).
 
-    The coordinates of a point in its image are the offset (m) of the point across the ray.
+    The coordinates of a point in the image are the offset (m) of the point across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     return _poses(origins - STANDOFF * n, n)
@@ -98,8 +98,8 @@ def tangent_basis(directions: Floats) -> Floats:
 def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:
     """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
-    The axes of GTSAM's bearing factor are perpendicular to the way to the landmark. The axes of the other factors are
-    perpendicular to the ray. The parameters are those of `bearings` and `ray_residuals`.
+    In GTSAM's bearing factor (no offset, not metric), they are perpendicular to the line from the origin to the landmark. In
+    all other factors, they are perpendicular to the ray. directions, to_landmark, offset: (R, 3).
     """
     if metric:
         return tangent_basis(directions)
@@ -133,7 +133,7 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
     length = np.linalg.norm(to_landmark, axis=1)
     by_position = across / length[:, None, None]
     away = np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
-    if away.any():  # In the camera of `bearings`, the landmark has depth z and distance r from the axis.
+    if away.any():  # In the camera of `bearings`, the landmark has depth z, and distance r from the optical axis.
         flat = (across[away] @ to_landmark[away, :, None])[..., 0]
         r, z = np.linalg.norm(flat, axis=1), np.einsum("ri,ri->r", directions[away], to_landmark[away])
         outward = flat / np.maximum(r, 1e-300)[:, None]
@@ -147,6 +147,6 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
 
 
 def _poses(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
-    """Return a camera for each ray. It is at the ray's origin (R, 3), m, and looks along its unit direction (R, 3)."""
+    """Return a camera pose for each ray: at its origin (R, 3), m, looking along its unit direction (R, 3)."""
     axes = np.concatenate([tangent_basis(directions), directions[:, :, None]], axis=2)
     return [gtsam.Pose3(pose) for pose in make_pose(axes, origins)]

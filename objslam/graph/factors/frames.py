@@ -12,8 +12,8 @@ F0 = gtsam.symbol("f", 0)
 P0 = gtsam.symbol("p", 0)
 """The key of P(0), the true position of object 0 in the map. The key of P(j) is P0 + j."""
 _UPRIGHT = 1e-5
-"""The standard deviation (rad) of roll and pitch between two frames with z up. A larger value lets frames tilt. It was
-chosen far below what a map can tell, and large enough to keep the linear system well conditioned."""
+"""The standard deviation (rad) of roll and pitch between two frames with z up. A larger value lets frames tilt. This value
+is far below any tilt that a map can show, and keeps the linear system well conditioned."""
 _FREE = 100.0
 """The standard deviation (rad, m) of the yaw and the shift of a frame in its prior. A larger value leaves more freedom, and
 conditions the linear system worse."""
@@ -26,7 +26,7 @@ def frame_prior(map_T_drive: Floats) -> gtsam.NonlinearFactor:
 
 
 def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]:
-    """Return the factors F * L(j) = P(j) of objects (n,), with covariances (n, 3, 3) m^2 in the axes of the map."""
+    """Return the factors F * L(j) = P(j) of objects (n,). covariance: (n, 3, 3) m^2 of the difference, in map."""
     make = gtsam.noiseModel.Gaussian.Covariance
     return [
         gtsam.ReferenceFrameFactorPoint3Pose3(L0 + j, F0, P0 + j, make(c))

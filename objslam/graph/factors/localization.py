@@ -16,8 +16,8 @@ def localizations(
 ) -> list[gtsam.NonlinearFactor]:
     """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
-    The priors have Huber's loss, because a localisation may jump. Keyframes that share one measurement share its information
-    in equal parts. on_plane: whether the path is planar. If it is None, the poses decide.
+    The priors have Huber's loss, because a localisation may jump. If one measurement gives the poses of several keyframes,
+    each gets an equal part of its information. on_plane: whether the path is planar. If it is None, the poses decide.
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [
@@ -29,7 +29,7 @@ def localizations(
 def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> Floats:
     """Return the covariances (K, 6, 6) of the keyframes' absolute poses, in their camera frames, rotation first.
 
-    on_plane: as in `localizations`.
+    on_plane: whether the path is planar. If it is None, the poses decide.
     """
     of, planar = settings.localization, settings.planar
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane

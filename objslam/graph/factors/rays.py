@@ -15,10 +15,11 @@ from objslam.graph.factors.range import ranges
 
 @dataclass(frozen=True)
 class Bearings:
-    """Rays of a live session, in the form that the live graph takes.
+    """Rays that a live session adds to its graph.
 
     number: (n,) the number of each ray. keyframe: (n,) the k of X(k). landmark: (n,) the j of L(j). direction: (n, 3) in the
-    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. offset: as in `Rays`.
+    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. offset: (n, 3) m, the
+    origins of the rays in the camera frame, None if all begin at the camera.
     """
 
     number: Ints
@@ -34,14 +35,12 @@ class Bearings:
 def ray_factors(
     rays: Rays | Bearings, landmark: Ints, loss: Loss, settings: Settings
 ) -> list[tuple[Ints, list[gtsam.NonlinearFactor]]]:
-    """Return for each kind of factor the indices (m,) of the rays that have it, and one factor for each of these rays.
+    """Return two groups of factors, each with the indices (m,) of its rays and one factor for each of these rays.
 
-    The first kind is the bearing, which every ray has. If joint.factor is `point_to_line`, the distance of Eq. 1 takes the
-    place of the bearing. The second kind is the range, which only rays with a measured range have.
+    The first group has the bearings of all rays, or their distances of Eq. 1 if joint.factor is `point_to_line`. The second
+    group has the ranges of the rays with a measured range.
 
-    Args:
-        landmark: (n,) the landmark of each ray.
-        loss: the loss of the first kind. Ranges have Cauchy's loss.
+    landmark: (n,) the landmark of each ray. loss: the loss of the first group. Ranges have Cauchy's loss.
     """
     if settings.joint.factor == "bearing":
         noise = robust(loss, rays.sigma, 2, L1_RADIANS)

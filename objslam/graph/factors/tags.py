@@ -8,8 +8,8 @@ from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 TIE = 1e-3
 """The standard deviation of the tie between a corner and the pose of its tag, as a share of their distance. A larger share
-lets a square bend. A smaller share conditions the linear system worse. The noise of corners is at least a hundred times
-larger, and printed tags are no better."""
+lets a square bend. A smaller share conditions the linear system worse. Printed tags are about this exact. The noise of
+detected corners is at least a hundred times larger."""
 
 
 def tag_ties(
@@ -17,8 +17,8 @@ def tag_ties(
 ) -> list[gtsam.NonlinearFactor]:
     """Return the factors that make four landmarks the corners of one square, for each of the tags.
 
-    In the frame of the tag's pose, each corner is in a known direction, at half the diagonal of the tag. If the side is not
-    known, this distance is a variable too: Z(t) is its first value minus its present value.
+    In the frame of the tag, each corner is in a known direction, at half the diagonal. If the side is not known, half the
+    diagonal is a variable too: Z(t) (m) is its first value minus its present value.
 
     Args:
         tags: (n,) the numbers of the tags.

@@ -1,7 +1,6 @@
 """Tie a growing graph to an older map: the frame F of the graph in the map, and the objects that both have.
 
-The variables and factors are those of `prior_map`. The graph keeps its own frame, so localisations, odometry and rays stay
-as they are. Only F says where the frame is in the map.
+The variables and factors are those of `prior_map`. The graph keeps its own frame. F tells where it is in the map.
 """
 
 import gtsam
@@ -18,7 +17,7 @@ _FRAME, _OBJECT = "map frame", "map object"  # The kinds of these factors in the
 
 
 def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
-    """Add F at map_T_graph (4, 4), with a prior. The solve may turn the frame about z, and shift it."""
+    """Add F at map_T_graph (4, 4), with a prior that leaves its yaw and shift nearly free."""
     graph.add_variable(F0, gtsam.Pose3(map_T_graph))
     graph.add(_FRAME, [0], [[frame_prior(map_T_graph)]])
 
@@ -26,8 +25,8 @@ def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
 def tie_objects(graph: IncrementalGraph, landmarks: Ints, own: Floats, position: Floats, covariance: Floats) -> None:
     """Tie landmarks (n,) to objects of the map with positions (n, 3) m and covariances (n, 3, 3) m^2.
 
-    F must be in the graph. own: (n, 3, 3) m^2, the covariance of the landmarks' errors that the graph does not know, in the
-    frame of the graph.
+    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of errors of the landmarks that the
+    graph does not contain, such as the offsets of boxes.
     """
     frame = map_T_graph(graph)
     assert frame is not None

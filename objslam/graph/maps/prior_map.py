@@ -1,13 +1,13 @@
 """Solve a drive once more, with objects of an older map as priors: its poses, its objects, and its frame in the map.
 
-The drive keeps its graph in its own frame. One more variable is that frame in the map, F. Each object has two points: L(j),
-to which the rays of the drive point, and P(j) = F * L(j) + e(j), where it is in the map. The error e(j) is what the graph of
-the drive does not know, such as the offsets of boxes. An object that the map has gets the map's estimate as prior on P(j).
+The graph of the drive stays in its own frame. The pose of this frame in the map is one more variable, F. Each object has two
+points. The rays of the drive point to L(j), in the frame of the drive. P(j) = F * L(j) + e(j) is in the map. The error e(j)
+is what the graph of the drive does not contain, such as the offsets of boxes. If the map has the object, its estimate is the
+prior of P(j).
 
-The registration gives the start and the matches, and no factor, so that the map counts once. The objects of the map may
-share errors, and the file of the map does not say which. The priors count as independent in the estimate. The covariance of
-the frame also contains the largest error that all objects can share, so that many objects of a drifted map do not make the
-frame look sure.
+The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share
+errors, but the map does not tell which. The priors count as independent. So the largest error that all objects can share is
+added to the covariance of the frame. Else many objects would make the frame look too exact.
 """
 
 from dataclasses import dataclass
@@ -26,17 +26,17 @@ from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marqu
 from objslam.graph.variables import L0, make_values, read_poses, with_points
 
 LEAST = 1e-3
-"""The least standard deviation (m) of an error of an object. A larger value makes exact maps less exact. It was chosen far
+"""The least standard deviation (m) of an error of an object. A larger value makes exact maps less exact. This value is far
 below the errors of real maps, and keeps the linear system well conditioned."""
 _ITERATIONS = 50
-"""The most iterations of the solve. More are slower. A handful is usual, because the registration is a close start."""
+"""The most iterations of the solve. Usually a handful is enough, for the registration is a close start. More are slower."""
 
 
 @dataclass(frozen=True)
 class MapObjects:
-    """M objects of an older map that the drive saw, with M indices (M,) of the same objects in the drive.
+    """M objects of an older map that the drive saw. index: (M,) their indices in the drive.
 
-    positions: (M, 3) m. covariance: (M, 3, 3) m^2, both in the frame of the map.
+    positions: (M, 3) m and covariance: (M, 3, 3) m^2, in the frame of the map.
     """
 
     index: Ints
@@ -48,10 +48,10 @@ class MapObjects:
 class MappedDrive:
     """A drive with N objects and K keyframes in the frame of an older map.
 
-    map_T_drive: (4, 4) the drive's own frame in the map. It turns about z only. covariance: (4, 4) of the shift (m) in x, y
-    and z at the middle of the matched objects, and of the yaw (rad). map_T_base: (K, 4, 4). seen: (N, 3) m, where the rays
-    of the drive see the objects. positions: (N, 3) m, where they are if the older map counts too. object_covariance: (N, 3,
-    3) m^2 of `positions`. Unknown values are NaN.
+    map_T_drive: (4, 4) the frame of the drive in the map, turned about z only. covariance: (4, 4) of x, y and z (m) at the
+    middle of the matched objects, and of the yaw (rad). map_T_base: (K, 4, 4). seen: (N, 3) m, the objects by the rays
+    alone, L(j). positions: (N, 3) m, the objects by rays and map, P(j). object_covariance: (N, 3, 3) m^2 of `positions`.
+    Unknown values are NaN.
     """
 
     map_T_drive: Floats
@@ -72,8 +72,8 @@ def solve_in_map(
 ) -> MappedDrive:
     """Solve a drive in an older map, from the drive's own solution and its registration map_T_drive (4, 4).
 
-    there: (n,) the resolved objects of the drive. The other objects are moved into the frame of the map, without a
-    covariance. measured: the measurements of the joint solve, None where the poses of the drive are fixed in its own frame.
+    there: (n,) the resolved objects of the drive. The other objects get no covariance in the map. known: the matched
+    objects. measured: the measurements of a joint solve, None if the poses of the drive are fixed in its own frame.
     SolveError if the linear system is indeterminate.
     """
     solved = there if measured is None else np.flatnonzero(estimate.solved & np.isfinite(estimate.positions[:, 0]))
@@ -124,9 +124,9 @@ def _poses(estimate: Estimate, measured: Measurements | None) -> Floats:
 def _drive_factors(
     estimate: Estimate, association: Association, solved: Ints, measured: Measurements | None, *, robust: bool
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of the drive alone. At fixed poses, they are priors with half the covariance of each object.
+    """Return the factors of the drive alone. At fixed poses, these are priors with half the covariance of each object.
 
-    robust: whether the rays have the loss of the settings. The loss `gnc` counts as none.
+    robust: whether the rays have the loss of the settings. `gnc` gives no loss, because only its own optimiser applies it.
     """
     if measured is None:
         return object_priors(L0, solved, estimate.positions[solved], estimate.covariance[solved] / 2, robust=False)
@@ -138,9 +138,9 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return the part (n, 3, 3), m^2, of the objects' covariances that the graph does not contain, as in `beyond`."""
+    """Return the part (n, 3, 3), m^2, of the covariances of the objects `there` that the graph does not contain."""
     floor = LEAST**2 * np.eye(3)
-    if measured is None:  # The graph has the other half. Equal halves condition the linear system best.
+    if measured is None:  # `_drive_factors` has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor
     try:
         marginals = gtsam.Marginals(graph, values)
@@ -151,7 +151,7 @@ def _unknown_to(
 
 
 def beyond(covariance: Floats, alone: Floats) -> Floats:
-    """Return the part of covariances (n, 3, 3), m^2, beyond `alone` (n, 3, 3): at least `LEAST`^2 along each axis."""
+    """Return by how much covariances (n, 3, 3), m^2, exceed `alone` (n, 3, 3): at least `LEAST`^2 along each axis."""
     size, axes = np.linalg.eigh(covariance - alone)
     return np.asarray((axes * np.maximum(size, LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
@@ -159,14 +159,14 @@ def beyond(covariance: Floats, alone: Floats) -> Floats:
 def _covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, there: Ints, frame: Floats, pivot: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the covariance (4, 4) of the frame (4, 4) at a pivot (3,) m, and those (n, 3, 3), m^2, of the points P."""
+    """Return the covariance (4, 4) of a frame (4, 4) at a pivot (3,) m, and covariances (n, 3, 3) m^2 of the points P."""
     try:
         marginals = gtsam.Marginals(graph, values)
         spread = np.array([marginals.marginalCovariance(P0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
         tangent = marginals.marginalCovariance(F0)
     except RuntimeError as error:
         raise indeterminate(error) from error
-    to_pivot = np.zeros((4, 6))  # The Jacobian from the tangent of the frame (rotation first) to the shift and the yaw.
+    to_pivot = np.zeros((4, 6))  # The Jacobian of shift and yaw by the tangent of F (rotation first).
     to_pivot[:3, 3:], to_pivot[3, 2] = values.atPose3(F0).rotation().matrix(), 1.0
     to_pivot[:3, 2] = _turned(pivot - frame[:3, 3])
     return to_pivot @ tangent @ to_pivot.T, spread
@@ -175,9 +175,9 @@ def _covariances(
 def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floats:
     """Return the covariance (4, 4) of the largest error that all objects of a map can share: a shift (m) and a yaw (rad).
 
-    A shared error is part of the error of each object. So no object can be known better than the shared error. The shift has
-    the covariance of the object that is known best. The yaw turns about the pivot (3,) m, and moves no object by more than
-    the object's standard deviation. positions: (M, 3) m. covariance: (M, 3, 3) m^2.
+    The error of each object contains the shared error. So the shift has the smallest covariance of all objects. The yaw
+    turns about the pivot (3,) m, and moves no object by more than its standard deviation. positions: (M, 3) m. covariance:
+    (M, 3, 3) m^2.
     """
     level = np.trace(covariance[:, :2, :2], axis1=1, axis2=2) / 2
     lever = ((positions - pivot)[:, :2] ** 2).sum(axis=1)
@@ -190,11 +190,11 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, plus an error that all objects share.
+    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, with the error that all map objects
+    share.
 
-    doubt: (4, 4) the covariance of this error, as from `shared_at_most`. there: (n,) the objects of the points. index: (M,)
-    those of them that have priors, with covariances `prior` (M, 3, 3). The better a prior determines a point, the less the
-    shared error moves it.
+    doubt: (4, 4) the covariance of this error, from `shared_at_most`. there: (n,) the objects. index: (M,) those with a
+    prior. prior: (M, 3, 3) m^2. The more a prior determines a point, the less the shared error moves it.
     """
     move = np.zeros((len(there), 3, 4))
     move[:, :, :3] = np.eye(3)
@@ -206,5 +206,5 @@ def _with_doubt(
 
 
 def _turned(lever: Floats) -> Floats:
-    """Return how a point at a lever (3,) m moves with the yaw, m per rad."""
+    """Return the derivative (3,), m per rad, of a point by a yaw about a pivot. lever: (3,) m from pivot to point."""
     return np.array([-lever[1], lever[0], 0.0])

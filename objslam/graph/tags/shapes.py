@@ -6,10 +6,10 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import skew
 
 COUNTER_CLOCKWISE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-"""(4, 3) the corners of a tag of side 1 in its own frame, if they go round counter-clockwise in the image, as AprilTag's do.
+"""The corners (4, 3) of a tag of side 1 in its own frame, if they go round counter-clockwise in the image, as with AprilTag.
 x goes from the first corner to the second, and z from the tag to the viewer."""
 CLOCKWISE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""(4, 3) the same for corners that go round clockwise, as ArUco's do. The axes are defined in the same way."""
+"""The corners (4, 3) of a tag of side 1 if they go round clockwise in the image, as with ArUco. The axes are the same."""
 
 
 def goes_clockwise(directions: Floats) -> Bools:
@@ -22,7 +22,7 @@ def goes_clockwise(directions: Floats) -> Bools:
 def squares_of(corners: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the rotations (T, 3, 3), centres (T, 3) and sides (T,) of the squares nearest to corners (T, 4, 3).
 
-    shapes: (T, 4, 3) the corners of each tag of side 1 in its own frame. Least squares (Kabsch 1976), without weights.
+    shapes: (T, 4, 3) the corners of each tag of side 1 in its own frame. The fit is by least squares (Kabsch 1976).
     """
     centre = corners.mean(axis=1)
     u, size, vt = np.linalg.svd(np.swapaxes(corners - centre[:, None], 1, 2) @ shapes[:, :, :2], full_matrices=False)
@@ -32,10 +32,9 @@ def squares_of(corners: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def turned_by_squares(local: Floats, rotation: Floats) -> Floats:
-    """Return the derivatives (T, 12, 7) of the corners of squares in map: by rotation and position in the frame of the
-    square, and by the logarithm of the side.
+    """Return the derivatives (T, 12, 7) of the corners of squares in map by rotation, position and logarithm of the side.
 
-    local: (T, 4, 3) m, the corners in this frame. rotation: (T, 3, 3).
+    Rotation and position are in the frame of the square. local: (T, 4, 3) m, the corners there. rotation: (T, 3, 3).
     """
     count = len(local)
     columns = [-skew(local), np.broadcast_to(np.eye(3), (count, 4, 3, 3)), local[..., None]]

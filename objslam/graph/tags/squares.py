@@ -14,9 +14,9 @@ from objslam.graph.variables import TAG0, TAG_SIZE0
 def add_squares(
     tags: TagCorners, landmarks: Ints, positions: Floats, values: gtsam.Values, prior_sigma: float
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the ties of the fiducials whose corners are all in the graph. Their poses and sizes are added to the values.
+    """Return the ties of the fiducials whose corners are all in the graph, and add their poses and sizes to the values.
 
-    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, as in `tag_ties`.
+    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, of half an unknown diagonal.
     """
     which = tags.tied(landmarks)
     rotation, centre, side = squares_of(positions[tags.landmarks[which]], tags.shape[which])

@@ -17,15 +17,14 @@ from objslam.mapping.sites.merge import merge_sessions
 from objslam.mapping.sites.session import Session
 
 Outcome = Literal["confirmed", "moved", "gone", "new", "unseen"]
-"""What became of an object. `unseen`: only one of the two found it, and the other did not have its place in view."""
+"""What became of an object. `unseen`: only one session found it, and the other did not look at its place often enough."""
 OUTCOMES: tuple[Outcome, ...] = ("confirmed", "moved", "gone", "new", "unseen")
-"""All outcomes, in the order in which they are told."""
+"""All outcomes, in the order in which they are shown."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one object. probability: of an object that is gone, that it is gone. Of the others, that it is where
-    `item` says."""
+    """What became of one object. probability: that it is gone if the outcome is `gone`, else that it is where `item` is."""
 
     outcome: Outcome
     item: MapObject
@@ -36,8 +35,9 @@ class Change:
 class Comparison:
     """Two maps in the frame of the first.
 
-    changes: one for each object of both maps, empty if the registration was refused. reason: of the verdict, in a few words.
-    a_T_b: (4, 4) takes points from the frame of the other map to the frame of the first.
+    registration: the match of the two maps. reason: why it was accepted or refused, in a few words. changes: one for each
+    object of both maps, empty if the registration was refused. a_T_b: (4, 4) takes points from the second frame to the
+    first.
     """
 
     registration: Registration
@@ -46,13 +46,12 @@ class Comparison:
     a_T_b: Floats
 
     def of(self, outcome: Outcome) -> tuple[Change, ...]:
-        """Return the changes of one kind."""
+        """Return the changes with one outcome."""
         return tuple(one for one in self.changes if one.outcome == outcome)
 
 
 def compare(a: Session, b: Session) -> Comparison:
-    """Compare a map with the map of a later session. b: the later one, which needs its views to say that an object is
-    gone."""
+    """Compare the map of session `a` with the map of a later session `b`. Without views in `b`, no object counts as gone."""
     found = register(b.objects, a.objects)
     why = reason(found, b.objects, a.objects, (b.name, a.name))
     if not found.accepted:
@@ -69,8 +68,8 @@ def compare(a: Session, b: Session) -> Comparison:
 
 
 def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
-    """Return the probability (N,) that each object was there in a session that did not find it, by what the session had in
-    view."""
+    """Return the probability (N,) that each object was there in session `a`, which looked at its place and did not find
+    it."""
     looks = a.looks(items, np.array([o.position for o in items]).reshape(-1, 3), np.eye(4))
     lives = np.array([(0, 0) if o.life is None else (o.life.looks, o.life.detections) for o in items]).reshape(-1, 2)
     nobody = np.zeros(len(items), dtype=bool)
@@ -78,8 +77,8 @@ def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
 
 
 def _change(item: MapObject, seen_by: tuple[int, ...], *, new: bool) -> Change:
-    """Return the change of one object. seen_by: the indices of the sessions that found it. new: whether an object that only
-    the later session found is new. It is if the earlier session had the place in view often enough, or has no views."""
+    """Return the change of one object. seen_by: the sessions that found it, 0 for the earlier and 1 for the later one. new:
+    whether an object that only the later session found counts as new. If not, it is `unseen`."""
     assert item.life is not None
     p = item.life.probability
     if item.life.state == "gone":

@@ -1,4 +1,4 @@
-"""The life of the objects of a site: what each session says of each of them, in the order of time."""
+"""The life of each object of a site: whether it is new, confirmed, moved or gone, updated session after session (`Life`)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ GONE = 0.5
 FORGOTTEN = 0.01
 """The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
 UNPROVEN = 0.9
-"""The probability that an object of one session exists, if the session does not say. It is also the largest one that a
-session gives. A larger value trusts single sessions more."""
+"""The largest probability that an object exists after one session found it. It is also the probability if the session has
+none for the object. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
 """The largest ratio of the sizes of an object before and after it moved. A larger value takes more pairs for one object."""
@@ -24,10 +24,11 @@ _ALIKE = 2.0
 
 @dataclass
 class Track:
-    """One object over the sessions. item: as it was seen last. number: its id in the site, None for a new object.
+    """One object over the sessions of a site.
 
-    life: after the sessions so far, None before the first. places: the rows of the joint solve that measure it. begun, met:
-    the first and the last session that found it, counted in the order of time. since: when it was seen first, s.
+    item: the object as seen last. number: its id in the site, None for a new object. life: after the sessions so far, None
+    before the first. places: its measurements, as rows of the joint solve. begun, met: the first and the last session that
+    found it, as indices in the order of time. since: when it was seen first, s.
     """
 
     item: MapObject
@@ -42,9 +43,9 @@ class Track:
 def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
     """Return the lives (N) of the tracks after one session.
 
-    found: (N,) whether the session found each. looks: (N,) in how many frames it should have been detected. seen: the object
-    of the session for each track, None if it was not found. when: the time of the session, s. A track without a life begins
-    here.
+    found: (N,) whether the session found each object. looks: (N,) in how many frames of the session each should have been
+    detected. seen: each object as the session has it, None if not found. when: the time of the session, s. A track without a
+    life begins here.
     """
     old = [t.life for t in tracks]
     before = np.array([UNPROVEN if life is None else life.probability for life in old])
@@ -79,10 +80,10 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
 
 
 def joined(old: Life, new: Life) -> Life:
-    """Return the life of an object that two sites have. old, new: in the earlier and in the later site.
+    """Return the life of an object that two sites have. old, new: its life in the earlier and in the later site.
 
-    The later site began with the prior `UNPROVEN`. Its odds are divided by the odds of this prior, which leaves what its
-    sessions say. They multiply the odds of the earlier site, after one more session that found the object.
+    The odds of the later site, divided by the odds of its prior `UNPROVEN`, are the evidence of its sessions alone. The
+    earlier site gets one more session that found the object. Then its odds are multiplied by this evidence.
     """
     days = np.array([max(new.updated - old.updated, 0.0) / _DAY])
     one, none = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
@@ -103,7 +104,7 @@ def joined(old: Life, new: Life) -> Life:
 
 
 def _odds(probability: float) -> float:
-    p = min(max(probability, 1e-9), 1 - 1e-9)  # The limits of `persistence`.
+    p = min(max(probability, 1e-9), 1 - 1e-9)  # As limited by `persistence`.
     return p / (1 - p)
 
 
@@ -116,7 +117,7 @@ def _fate(life: Life, probability: float, found: bool) -> Fate:
 
 
 def may_be_one(a: MapObject, b: MapObject) -> bool:
-    """Return whether an object that is gone and one that is new may be the same: one label, and sizes that are alike."""
+    """Return whether an object that is gone and a new object may be one object that moved: same label, similar size."""
     if a.label != b.label:
         return False
     if a.extent is None or b.extent is None:

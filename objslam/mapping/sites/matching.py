@@ -1,4 +1,4 @@
-"""Which objects of two maps in one frame are the same: by place, and by label as far as labels can be trusted."""
+"""Match the objects of two maps in one frame, by position and label. Labels count only as far as they can be trusted."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -9,21 +9,21 @@ from objslam.core.object_map import MapObject
 from objslam.core.statistics import SAME_POINT
 
 STILL = 0.05
-"""The standard deviation (m) of the shift of an object that nobody carried away. Somebody may nudge it, or its boxes may
-differ. A larger value takes larger shifts for the same place."""
+"""The standard deviation (m) of the shift between sessions of an object that stayed: somebody nudges it, or its boxes
+differ. With a larger value, more shifted objects count as unmoved."""
 _MISLABELLED = 0.02
-"""The probability that a detector gives an object a certain wrong label. A larger value matches objects with unlike labels
-from farther away."""
+"""The probability that a detector gives an object one particular wrong label. With a larger value, objects with different
+labels match over a larger distance."""
 
 
 def same_objects(
     ours: list[MapObject], theirs: list[MapObject], positions: Floats, covariance: Floats, other: Floats, other_cov: Floats
 ) -> Ints:
-    """Return pairs (P, 2) of indices of one object, one-to-one, with the largest sum of gains.
+    """Return the pairs (P, 2) of indices into `ours` and `theirs` that are one object. The matching is one-to-one.
 
-    The gain of a pair is `SAME_POINT` minus its cost, and is positive. The cost is the squared Mahalanobis distance, minus 2
-    ln of the probability of both labels. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of `ours`. other, other_cov:
-    (M, 3) and (M, 3, 3) of `theirs`, in the same frame.
+    It has the largest sum of gains. The gain of a pair is `SAME_POINT` minus its cost, and is positive. The cost is the
+    squared Mahalanobis distance, minus 2 ln of `label_agreement`. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of
+    `ours`. other, other_cov: (M, 3) m and (M, 3, 3) m^2 of `theirs`, in the same frame.
     """
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), dtype=np.int64)
@@ -42,7 +42,7 @@ def same_objects(
 
 
 def label_agreement(a: MapObject, b: MapObject) -> float:
-    """Return the probability that one object has the labels of both, at least `_MISLABELLED`."""
+    """Return the probability that both objects have one label, by their label shares. It is at least `_MISLABELLED`."""
     shares = [o.labels or {o.label: 1.0} for o in (a, b)]
     both = sum(share * shares[1].get(name, 0.0) for name, share in shares[0].items())
     return max(min(both, 1.0), _MISLABELLED)

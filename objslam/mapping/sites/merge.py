@@ -1,4 +1,8 @@
-"""Join many sessions, each in a frame of its own, to one map of the site."""
+"""Join many sessions, each in a frame of its own, to one map of the site.
+
+An island is a group of sessions that share objects. A track is one object over the sessions of an island. The life of an
+object tells whether it is new, confirmed, moved or gone (`Life`).
+"""
 
 from __future__ import annotations
 
@@ -22,21 +26,21 @@ from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
 _REMEMBERED = 5
-"""An object of a site counts as at most this number of sessions in the next solve. A larger number averages more sessions,
-and follows an object that is nudged more slowly."""
+"""In a solve, an object of a site weighs as much as its number of sessions, up to this number. With a larger number, its
+position averages more sessions, and follows a nudged object more slowly."""
 _YOUNG = 2
-"""An object that at most this number of sessions saw may have moved there. A larger number finds more late moves. It also
+"""An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
 takes more added objects for moved ones."""
 
 
 @dataclass(frozen=True)
 class Island:
-    """Sessions that share objects, in one map. The frame is that of the first session.
+    """S sessions that share objects, as one map in the frame of the first session.
 
-    objects: the map, with the life of each object. sessions: the indices (S,) of the sessions, in their order.
-    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. log_odds: (S,)
-    the evidence that tied each session to those before it, NaN for the first. common: (S,) how many objects of each session
-    another session has too. seen_by: for the id of each object, the indices of the sessions that found it.
+    objects: the map, with the life of each object. sessions: the indices of the sessions, in the order of time.
+    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each session, 0 for the first. log_odds:
+    (S,) the log odds of the registration that tied each session to the others, NaN for the first. common: for each session,
+    how many of its objects another session found too. seen_by: for each object id, the sessions that found it.
     """
 
     objects: ObjectMap
@@ -49,12 +53,11 @@ class Island:
 
 
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
-    """Register all pairs of sessions, and join each group of sessions that overlap to one map. The largest island comes
-    first.
+    """Register all pairs of sessions, and join each group that shares objects to one island. The largest island comes first.
 
-    The sessions are in the order of time, and the first of an island gives its frame. Sessions whose registrations are all
-    refused stay alone. A site among the sessions brings the life of its objects, so that the sessions of the site need not
-    be read again. Two sites are joined in the same way. An object that the later site lacks lives through its `visits`.
+    sessions: in the order of time. The first session of an island gives its frame. A session whose registrations are all
+    refused is an island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions
+    (`visits`) are read only for the objects that it lacks.
     """
     edges = {
         (a, b): found
@@ -73,9 +76,10 @@ def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
 def _tree(
     left: list[int], edges: dict[tuple[int, int], Registration]
 ) -> tuple[list[int], list[tuple[int, Floats]], list[float]]:
-    """Return the sessions that are tied to the first of those left, by the best evidence first (Prim).
+    """Return the spanning tree of the registrations `edges` with the best log odds, from the first session of `left` (Prim).
 
-    Also return for each its parent in the tree, its pose (4, 4) in the frame of the parent, and the log odds of this tie.
+    The three lists are its sessions, the parent of each session with the pose (4, 4) in the parent's frame, and the log
+    odds.
     """
     order, starts, odds = [left[0]], [(left[0], np.eye(4))], [np.nan]
     while True:
@@ -95,7 +99,7 @@ def _tree(
 
 def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[int, Floats]], odds: list[float]) -> Island:
     tracks: list[Track] = []
-    rows: list[tuple[int, int, MapObject]] = []  # The number of the map, the track, and the object of each measurement.
+    rows: list[tuple[int, int, MapObject]] = []  # Each measurement: its session, its track, its object.
     frames = np.zeros((0, 4, 4))
     solved: JointFrames | None = None
     for number, (s, (parent, pose)) in enumerate(zip(order, starts, strict=True)):
@@ -130,12 +134,12 @@ def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[in
 
 
 def _items(objects: ObjectMap) -> list[MapObject]:
-    """Return the objects that can be matched: those with a covariance, also those that are gone and may come back."""
+    """Return the objects that can be matched: those with a covariance. Gone objects may come back, so they count."""
     return [o for o in (*objects.objects, *objects.gone) if o.status == "ok" and o.covariance is not None]
 
 
 def _matched(tracks: list[Track], solved: JointFrames, items: list[MapObject], start: Floats) -> list[tuple[int, int]]:
-    """Return the pairs of an object of a session and its track, as indices. start: (4, 4) the pose of the session."""
+    """Return pairs of indices into `items` and `tracks` that are one object. start: (4, 4) site_T_session at the start."""
     positions = np.array([o.position for o in items]).reshape(-1, 3) @ start[:3, :3].T + start[:3, 3]
     spread = np.array([o.covariance for o in items]).reshape(-1, 3, 3)
     turned = start[:3, :3] @ spread @ start[:3, :3].T
@@ -158,7 +162,7 @@ def _live(
     rows: list[tuple[int, int, MapObject]],
     solved: JointFrames,
 ) -> list[int]:
-    """Let the tracks live through the sessions in the order of time. Return the tracks that are left after `_follow`."""
+    """Update the lives of the tracks, session by session in the order of time. Return the tracks left after `_follow`."""
     begun: list[int] = []
     for turn, number in enumerate(sorted(range(len(order)), key=order.__getitem__)):
         session = sessions[order[number]]
@@ -188,7 +192,7 @@ def _live(
 
 
 def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
-    """Join the lives of the objects that the tracks begun so far and a site both have. here: the site's objects, by
+    """Join the lives of the objects that both the tracks in `begun` and a site have. here: the objects of the site, by
     track."""
     for at in begun:
         old, new = tracks[at].life, here[at].life if at in here else None
@@ -199,7 +203,7 @@ def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject
 def _visit(
     tracks: list[Track], some: list[int], here: dict[int, MapObject], session: Session, positions: Floats, back: Floats
 ) -> None:
-    """Let some tracks live through one session. here: the objects that the session found, by track. back: session_T_site."""
+    """Update the lives of some tracks with a session. here: the objects that it found, by track. back: session_T_site."""
     looks = session.looks(tuple(tracks[at].item for at in some), positions[some], back)
     found = np.array([at in here for at in some], dtype=bool)
     lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
@@ -208,9 +212,9 @@ def _visit(
 
 
 def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) -> MapObject:
-    """Return an object of a session as the site has it: seen from the sides of this session, and of the sessions before.
+    """Return an object of a session for the site, with the sides from which this session or an earlier one saw it.
 
-    before: the same object after the sessions before, None if they did not see it.
+    before: the object after the earlier sessions, None if they did not see it.
     """
     seen = item.seen_from
     if seen is not None:
@@ -222,10 +226,10 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Give an object that moved the number of the one that is gone. Return the tracks without those that are gone this way.
+    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return the tracks except these gone ones.
 
-    begun: the tracks so far. came: the tracks that a later site brought. However often the site saw them, they are new to
-    the sessions before.
+    The new track takes the number of the gone one. begun: the tracks so far. came: the tracks that a later site brought.
+    They count as new, however many sessions of that site saw them.
     """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}
     old = [at for at, life in lives.items() if life.state == "gone"]
@@ -246,17 +250,17 @@ def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequ
 
 
 def _later(young: Track, old: Track) -> bool:
-    """Return whether `young` was first seen after `old` was last seen. Sessions decide, and in the first session the
-    stamps."""
+    """Return whether `young` was first seen after the last session that saw `old`, or within the first session after
+    `old`."""
     return young.begun > old.met or (young.begun == old.met == 0 and young.since > old.item.last_seen)
 
 
 def _objects(
     tracks: list[Track], alive: list[int], rows: list[tuple[int, int, MapObject]], solved: JointFrames
 ) -> tuple[ObjectMap, dict[int, int]]:
-    """Return the map of the tracks, and the track of each id. The map lists objects that are gone apart.
+    """Return the map of the tracks `alive`, and the track of each id.
 
-    It leaves out objects whose probability is below `FORGOTTEN`.
+    Objects with a probability below `FORGOTTEN` are left out.
     """
     free = max((t.number for t in tracks if t.number is not None), default=-1) + 1
     there, gone = [], []
@@ -290,9 +294,9 @@ def _objects(
 
 
 def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, MapObject]]) -> Floats:
-    """Return the covariance (3, 3) of an object, but no smaller one than that of the session that knew it best.
+    """Return the covariance (3, 3) m^2 of an object: that of the solve, or that of the best session if it is larger.
 
-    The errors of its boxes repeat from session to session, so that many sessions do not average them out.
+    The errors of an object's boxes repeat from session to session, so many sessions do not average them out.
     """
     best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
     rotation = solved.site_T_map[best[1], :3, :3]
@@ -300,7 +304,7 @@ def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, Ma
 
 
 def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> Body | None:
-    """Return the body whose size is known best, with its yaw in the frame of the site. None if no session has one."""
+    """Return the body whose size has the smallest noise, with its yaw in the frame of the site. None without any body."""
     best: Body | None = None
     for n, _, o in of:
         if o.body is not None:
@@ -309,13 +313,13 @@ def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> B
 
 
 def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:
-    """Return the rotation and size of a fiducial by the session that knew its rotation best, None for another object."""
+    """Return the rotation and size of a fiducial from the session with the surest rotation. None for other objects."""
     best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
     return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])
 
 
 def _labels(items: list[MapObject]) -> dict[str, float] | None:
-    """Return the mean share of each label over the sessions, the largest first. None if a session has no shares."""
+    """Return the mean share of each label over an object's sessions, the largest first. None if a session has no shares."""
     if any(o.labels is None for o in items):
         return None
     often = [1 if o.life is None else o.life.sessions_seen for o in items]

@@ -20,15 +20,18 @@ from objslam.io.views_parquet import Views
 from objslam.results.read import load_map, load_rays, load_views
 
 _SAME_FRAME = 0.005
-"""The longest time (s) between a ray and the camera frame that it belongs to. A larger value matches damaged stamps, and may
-take the wrong frame of a fast camera."""
+"""The longest time (s) between the stamps of a ray and of its camera frame. A larger value also matches inexact stamps, and
+may take the wrong frame of a fast camera."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """A map in a frame of its own. name: how messages call it. views, rays: the camera frames and the rays of its drive,
-    None for a map without a result folder, which does not say what was in view. visits: a function that returns the sessions
-    of a site, in the order of time. If it returns none, the sessions of the site count no miss."""
+    """A map in a frame of its own: of one drive, or of a whole site.
+
+    name: as shown in messages. views, rays: the camera frames and the rays of the drive. They are None for a map without a
+    result folder, which cannot say what was in view. visits: a function that returns the sessions of a site, in the order of
+    time. If it returns none, no session of the site counts as a miss.
+    """
 
     name: str
     objects: ObjectMap
@@ -47,7 +50,7 @@ class Session:
 
     @property
     def when(self) -> float:
-        """The time of the session, s: the last update of a site, or the last time at which a session saw an object."""
+        """The time of the session, s: the last update of a site, or the last time at which a drive saw an object."""
         lives = [o.life.updated for o in (*self.objects, *self.objects.gone) if o.life is not None]
         seen = lives or [o.last_seen for o in self.objects if np.isfinite(o.last_seen)]
         return max(seen, default=0.0)
@@ -56,7 +59,7 @@ class Session:
         """Return in how many frames (N,) each object should have been detected if it was at positions (N, 3), m.
 
         session_T_map: (4, 4) takes points from the frame of the objects and positions to the frame of this session. The
-        result is 0 for an object without `seen_from`, and for all objects if the session does not know its views.
+        result is 0 for an object without `seen_from`, and for all objects if the session has no views.
         """
         looks = np.zeros(len(objects), dtype=np.int64)
         known = np.array([o.seen_from is not None for o in objects], dtype=bool)
@@ -78,16 +81,17 @@ class Session:
 
 @dataclass(frozen=True)
 class Visit:
-    """A session of a site. session_T_site: (4, 4), the inverse of its pose in the frame of the site."""
+    """A session of a site. session_T_site: (4, 4), takes points from the frame of the site to the frame of the session."""
 
     session: Session
     session_T_site: Floats
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:
-    """Return the boxes of all frames in the order of the frames, and the distance (R,) m of each box's object.
+    """Return the boxes of all frames, in the order of the frames, and the distance (R,) m of each box's object, NaN if
+    unknown.
 
-    The distance is NaN where unknown. Boxes without a camera frame are left out.
+    Boxes without a camera frame are left out.
     """
     frame = np.full(len(rays), -1, dtype=np.int64)
     for number, camera in enumerate(views.cameras):

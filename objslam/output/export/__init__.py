@@ -21,7 +21,7 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
     Args:
         to: the name of a format in `FORMATS`.
-        file: the file to write; by default the format's usual file in `out`.
+        file: the file to write, by default the format's usual file in `out`.
         datum: the position of the map on the earth.
     Raises:
         ConfigError: the format does not exist, or it cannot use the given datum.
@@ -37,7 +37,7 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
 
 def dump_export(out: Path, to: str, datum: Datum | None = None) -> bytes:
-    """Return what `write_export` writes. Raises the same errors."""
+    """Return the content of the file that `write_export` writes. Raise its errors."""
     from objslam.output.export.content import load_content
 
     return _chosen(to, datum).dump(load_content(out, datum))

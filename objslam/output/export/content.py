@@ -13,15 +13,15 @@ from objslam.errors import ConfigError
 from objslam.io.odometry_parquet import Motions
 from objslam.results.read import load_map, load_motions, load_trajectory
 
-_SEMI_MAJOR = 6_378_137.0  # This is the semi-major axis of the WGS 84 ellipsoid, m.
-_FLATTENING = 1 / 298.257223563  # This is the flattening of the WGS 84 ellipsoid.
-_E2 = _FLATTENING * (2 - _FLATTENING)  # This is the squared eccentricity of the WGS 84 ellipsoid.
-_ROUNDS = 6  # The iterations of a latitude. Each divides the error by 150, so 2 suffice near the ground, and 6 anywhere.
+_SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
+_FLATTENING = 1 / 298.257223563  # The flattening of the WGS 84 ellipsoid.
+_E2 = _FLATTENING * (2 - _FLATTENING)  # The squared eccentricity of the WGS 84 ellipsoid.
+_ROUNDS = 6  # The iterations for a latitude. Each divides the error by 150. Near the ground 2 are enough, 6 at any height.
 
 
 @dataclass(frozen=True)
 class Datum:
-    """The WGS 84 position of the map's origin and the compass heading of the map's x axis."""
+    """The WGS 84 position of the map's origin, and the compass heading of the map's x axis."""
 
     latitude: float  # Degrees north.
     longitude: float  # Degrees east.
@@ -29,7 +29,7 @@ class Datum:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse the text "latitude,longitude,heading"; ConfigError if the text is malformed or out of range."""
+        """Parse the text "latitude,longitude,heading". ConfigError if the text is malformed or out of range."""
         try:
             latitude, longitude, heading = (float(part) for part in text.split(","))
         except ValueError as error:
@@ -40,9 +40,9 @@ class Datum:
         return cls(latitude, longitude, heading)
 
     def geodetic(self, points: Floats) -> Floats:
-        """Return longitude and latitude (N, 2), degrees, of points (N, 3) in map, m; the error is well below 1 mm.
+        """Return longitude and latitude (N, 2), degrees, of points (N, 3) in map, m. The error is well below 1 mm.
 
-        The points are converted to east, north and up at the datum, then to earth-centred and to geodetic coordinates.
+        Points become east, north and up at the datum, then earth-centred coordinates, then geodetic ones.
         """
         latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
         sine, cosine = np.sin(latitude), np.cos(latitude)
@@ -64,13 +64,13 @@ class Datum:
 class Content:
     """A result to export."""
 
-    out: Path  # The result folder; error messages name it.
+    out: Path  # The result folder. Error messages name it.
     objects: ObjectMap
     path: Trajectory  # map_T_base at the stamp of each keyframe.
-    motions: Motions | None  # The odometry between consecutive poses of the path; None if the run used no odometry.
-    datum: Datum | None = None  # The position of the map on the earth; None if it is unknown.
+    motions: Motions | None  # The odometry between consecutive poses of the path. None without odometry.
+    datum: Datum | None = None  # The position of the map on the earth. None if unknown.
 
 
 def load_content(out: Path, datum: Datum | None = None) -> Content:
-    """Read a result folder; OutputError names a missing or malformed file."""
+    """Read a result folder. OutputError names a missing or malformed file."""
     return Content(out, load_map(out), load_trajectory(out), load_motions(out), datum)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One format of `objslam export`; each module in `formats` declares one."""
+    """One format of `objslam export`. Each module in `formats` declares one."""
 
     name: str  # The value of `--to`.
     file: str  # The usual name of the file in a result folder. A new run deletes the file with this name.

@@ -1,4 +1,4 @@
-"""Conversion of a map to ROS 2 messages (objects, markers, path), for MCAP files and for DDS; ROS is not needed.
+"""Convert a map to ROS 2 messages (objects, markers, path), for MCAP files and for DDS. ROS is not needed.
 
 Sources: https://docs.ros.org/en/rolling/p/vision_msgs, https://docs.ros.org/en/rolling/p/visualization_msgs.
 """
@@ -20,15 +20,14 @@ from objslam.output.plot.style import captions, ellipsoid, label_colours
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # These are types and actions of visualization_msgs/Marker.
+_SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # Types and actions of visualization_msgs/Marker.
 LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s.
-_MIN_SIZE = 0.05  # An object's marker has at least this diameter, m. Smaller markers are invisible at the scale of a room.
-_TEXT_SIZE = 0.15  # The text of a label has this height, m.
+_MIN_SIZE = 0.05  # The least diameter of a marker, m. A smaller one would be invisible at the scale of a room.
+_TEXT_SIZE = 0.15  # The height of a label's text, m.
 
 
 class MapMessages:
-    """A maker of messages in the coordinate frame `frame`. ROS 2 Humble and later know the types of the messages. `store`
-    serialises them."""
+    """Makes messages in the coordinate frame `frame`, of types that ROS 2 Humble and later know. store: serialises them."""
 
     def __init__(self, frame: str) -> None:
         self.frame, self.store = frame, typestore()
@@ -39,7 +38,7 @@ class MapMessages:
         return self.store.types[f"{package}/msg/{plain}"](*values)
 
     def header(self, stamp: float) -> Any:
-        """Make a std_msgs/Header from a stamp, s. A stamp that ROS cannot express becomes 0, which means unset in ROS."""
+        """Make a std_msgs/Header from a stamp, s. A stamp that ROS cannot express becomes 0, which is unset in ROS."""
         stamp = stamp if abs(stamp) < LAST_STAMP else 0.0
         time = self.make("builtin_interfaces/Time", *divmod(round(stamp * 1e9), 10**9))
         return self.make("std_msgs/Header", time, self.frame)
@@ -64,7 +63,7 @@ class MapMessages:
         return self.make("tf2_msgs/TFMessage", [stamped])
 
     def path(self, stamp: float, stamps: Floats, poses: Floats) -> Any:
-        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s. `stamp`, s, is that of the whole message."""
+        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s. stamp: s, of the message itself."""
         stamped = [self.stamped(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
         return self.make("nav_msgs/Path", self.header(stamp), stamped)
 

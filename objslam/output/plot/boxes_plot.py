@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Array, Floats
 from objslam.output.plot.style import colours_of
 
-_LINE = 300  # A line is as wide as the longer side of the image divided by this. A larger number draws thinner lines.
+_LINE = 300  # The longer side of the image over the width of a line. A larger number draws thinner lines.
 
 
 Plate = tuple[int, int, int, int]
@@ -27,7 +27,7 @@ def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Float
         red, green, blue = (round(255 * part) for part in colours[label])
         x1, y1, x2, y2 = box
         cv2.rectangle(drawn, (x1, y1), (x2, y2), (blue, green, red), line)
-        text = f"{label} {score:.2f}".encode("ascii", "replace").decode()  # the font of OpenCV has ASCII only
+        text = f"{label} {score:.2f}".encode("ascii", "replace").decode()  # OpenCV's font has only ASCII.
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * line, line)
         wide, high = width + 4 * line, height + 6 * line
         plates.append(free_plate((x1, y1 - high, x1 + wide, y1), plates, drawn.shape[1], drawn.shape[0]))
@@ -39,10 +39,9 @@ def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Float
 
 
 def free_plate(wanted: Plate, taken: Sequence[Plate], width: int, height: int) -> Plate:
-    """Return the plate of a label: the wanted one, moved into the image and down to the first free place.
+    """Return the plate of a label: the wanted one, moved into the image and down to the first free place, if there is one.
 
-    taken: the plates that are drawn already. width, height: the size of the image, px. If no place below is free, the plate
-    covers another one.
+    taken: the plates that are drawn already. width, height: the size of the image, px.
     """
     x1, y1, x2, y2 = wanted
     left, high = max(0, min(x1, width - (x2 - x1))), y2 - y1

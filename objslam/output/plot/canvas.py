@@ -14,10 +14,9 @@ from objslam.output.plot.figure import Colour
 
 _SHIFT = 4  # OpenCV takes coordinates as integers, here in 1 / 2^4 of a px. A larger number is finer, and overflows earlier.
 _FAR = 1e6
-"""The largest coordinate, px, of a drawn point. Points beyond it are moved to it, because OpenCV's integers have 32 bits.
-They overflow at 1e8 px."""
+"""The largest coordinate, px, of a drawn point. Points beyond are moved to it. OpenCV's coordinates overflow at 1e8 px."""
 _NEAR = 3.0  # The least distance, px, between two drawn points of a line. A larger one cuts off the corners of curves.
-_BATCH = 4_000_000  # About this many steps along segments are drawn at once. A larger number takes more memory.
+_BATCH = 4_000_000  # The approximate number of steps along segments drawn at once. A larger number takes more memory.
 _HALO = 0.85  # The opacity of the white around a text, in [0, 1].
 _HALO_WIDTH = 5  # The width, px, of the brush that widens a text to its halo.
 _ROOM = 8  # The room, px, around a text for its halo and for letters that reach out of its box.
@@ -46,11 +45,11 @@ def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) ->
 
 
 def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Floats]]:
-    """Yield, in batches, the pixels x, y that segments (n, 2, 2), px, touch, and the covered share of each pixel. A segment
-    touches two neighbouring pixels per px of its length."""
+    """Yield, in batches, the pixels x, y that segments (n, 2, 2), px, touch, and the covered share of each pixel. These are
+    two neighbouring pixels for each px along a segment."""
     along = ends[:, 1] - ends[:, 0]
     steep = np.abs(along[:, 1]) > np.abs(along[:, 0])
-    ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # the first coordinate grows faster
+    ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # The longer coordinate comes first.
     ends = np.where((ends[:, 0, 0] > ends[:, 1, 0])[:, None, None], ends[:, ::-1], ends)
     first = np.clip(np.ceil(ends[:, 0, 0]), 0, np.where(steep, height, width)).astype(np.int64)
     last = np.clip(np.floor(ends[:, 1, 0]), -1, np.where(steep, height, width) - 1).astype(np.int64)
@@ -80,8 +79,7 @@ def draw_line(image: Image, points: Floats, colour: Colour, width: float, dash: 
 
 
 def _apart(points: Floats) -> Floats:
-    """Return the points (n, 2), px, of a line without those near the point before. The smooth ends of short pieces would
-    thicken the line."""
+    """Return the points (n, 2), px, of a line without points too near to the one before. Short pieces would look thick."""
     if len(points) < 3:
         return points
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
@@ -91,12 +89,11 @@ def _apart(points: Floats) -> Floats:
 
 
 def _dashes(points: Floats, dash: float, gap: float, size: tuple[int, int]) -> list[Floats]:
-    """Return the dashes of a line through points (n, 2), px, that an image of this size (width, height), px, shows. A dash
-    is a line through points (k, 2)."""
+    """Return the dashes (k, 2) of a line through points (n, 2), px, that are inside an image. size: (width, height), px."""
     begin, way = points[:-1], np.diff(points, axis=0)
     piece = np.linalg.norm(way, axis=1)
     length = np.append(0.0, np.cumsum(piece))
-    with np.errstate(divide="ignore", invalid="ignore"):  # a piece parallel to an edge divides by 0
+    with np.errstate(divide="ignore", invalid="ignore"):  # Pieces parallel to an edge divide by 0.
         meets = np.sort(
             np.nan_to_num([-begin / way, (np.array(size) - begin) / way], nan=0.0, posinf=2.0, neginf=-2.0), axis=0
         )
@@ -124,7 +121,7 @@ def draw_dot(image: Image, centre: Floats, size: float, colour: Colour, rim: Col
 
 
 def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float, width: float) -> None:
-    """Draw a polygon (n, 2), px, filled with a colour of this opacity, in [0, 1], and with a rim of this width, px."""
+    """Draw a polygon (n, 2), px, filled with a colour. opacity: of the colour, in [0, 1]. width: of its rim, px."""
     if not np.isfinite(rim).all():
         return
     size = np.array(image.shape[1::-1])
@@ -145,8 +142,8 @@ def text_width(text: str, size: float) -> int:
 def draw_text(
     image: Image, text: str, corner: tuple[float, float], size: float, colour: Colour, *, halo: bool = False
 ) -> None:
-    """Draw a text with the upper left corner of its box at x, y, px. size: of the font, px. halo: whether the text has white
-    around it."""
+    """Draw a text in a box with its upper left corner at x, y, px. size: of the font, px. halo: whether white is around
+    it."""
     x, y = round(corner[0]), round(corner[1])
     wide, high = text_width(text, size), round(1.25 * size)
     mask = np.zeros((high + 2 * _ROOM, wide + 2 * _ROOM, 3), dtype=np.uint8)
@@ -168,8 +165,7 @@ def draw_text(
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the content of a PNG file of 256 colours. The file looks the same as one with all colours, and is a
-    fifth of its size."""
+    """Return an image as the content of a PNG file with 256 colours. It looks alike, and has a fifth of the size."""
     from PIL import Image as Picture
 
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(

@@ -4,27 +4,27 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 
-_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # Candidate positions of a label lie in these directions, rad.
+_ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # The directions, rad, of candidate positions from a dot.
 _RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
-"""The candidate positions of a label lie at these distances, px, from its dot. A larger distance costs more."""
+"""The distances, px, of a label's candidate positions from its dot. A larger distance costs more."""
 _DOT = 6.0  # Half the side, px, of the square around a dot that no label covers.
-_PAD = 2.0  # Labels keep this distance, px, from each other.
+_PAD = 2.0  # The least distance, px, between two labels.
 _CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
-_FAR = 14.0  # A label gets a leader line if it is farther than this, px, from its dot.
-_AMBIGUOUS = 2.0  # A label is ambiguous if another dot is nearer than its own dot, or at most this distance, px, farther.
-_AMBIGUOUS_COST = 60.0  # This is the cost, px, of an ambiguous label. With a larger cost, fewer labels are ambiguous.
-_COVER_COST = 1.5  # This is the cost, px, of each point in `avoid` that a label covers.
+_FAR = 14.0  # The distance, px, from its dot beyond which a label gets a leader line.
+_AMBIGUOUS = 2.0  # A label is ambiguous if another dot is nearer than its own, or at most this, px, farther.
+_AMBIGUOUS_COST = 60.0  # The cost, px, of an ambiguous label. With a larger cost, fewer labels are ambiguous.
+_COVER_COST = 1.5  # The cost, px, of each point in `avoid` that a label covers.
 _MOST_COVERED = 20  # At most this many covered points add to the cost.
-_CROSSING_COST = 60.0  # This is the cost, px, of each line, label or dot that a leader line crosses.
-_OUTWARD_GAIN = 0.05  # Each px farther away from the mean of all dots lowers the cost by this, px. The middle stays free.
+_CROSSING_COST = 60.0  # The cost, px, of each line, label or dot that a leader line crosses.
+_OUTWARD_GAIN = 0.05  # The gain, px, for each px away from the mean of all dots. It keeps the middle free.
 
 
 def place_labels(anchors: Floats, sizes: Floats, frame: Floats, avoid: Floats) -> tuple[Floats, Bools]:
     """Place labels one by one. The labels of the most crowded dots come first. All lengths are in px.
 
-    Each label gets the cheapest of a fixed set of candidate positions around its dot. At this position, the label must lie
-    inside `frame`, and must not cover a dot or an earlier label. These properties of a candidate raise its cost: a large
-    distance from the dot, covered points of `avoid`, another dot that is nearer, a leader line that crosses something.
+    Each label gets the cheapest of a fixed set of candidate positions around its dot. There it must lie inside `frame`, and
+    must not cover a dot or an earlier label. These raise the cost: distance from the dot, covered points of `avoid`, another
+    dot that is nearer, a leader line that crosses something.
 
     Args:
         anchors: (N, 2) the dots.
@@ -76,9 +76,9 @@ def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
 
 
 def _counts(points: Floats, frame: Floats) -> Floats:
-    """Return the number of points (P, 2) below and left of each corner of the pixels of an area: a summed-area table.
+    """Return for each pixel corner of an area the number of points (P, 2) below and left of it: a summed-area table.
 
-    With this table, `_covered` is fast. Testing each of 100,000 points, as of hundreds of objects, would take minutes.
+    A test of each of 100,000 points for each candidate would take minutes. With the table, `_covered` is fast.
     """
     edges = [np.arange(np.floor(low), np.ceil(high) + 2) for low, high in frame.T]
     table = np.histogram2d(points[:, 0], points[:, 1], edges)[0]
@@ -110,12 +110,12 @@ def _nearest(boxes: Floats, points: Floats) -> Floats:
 
 
 def _overlaps(a: Floats, b: Floats) -> Bools:
-    """Return a mask (A, B), which is True where a box of `a` (A, 4) overlaps a box of `b` (B, 4)."""
+    """Return whether each box of `a` (A, 4) overlaps each box of `b` (B, 4), as (A, B)."""
     return np.all((a[:, None, :2] < b[None, :, 2:]) & (b[None, :, :2] < a[:, None, 2:]), axis=2)
 
 
 def _cross(a: Floats, b: Floats) -> Bools:
-    """Return a mask (A, B), which is True where a segment of `a` (A, 4) crosses a segment of `b` (B, 4)."""
+    """Return whether each segment of `a` (A, 4) crosses each segment of `b` (B, 4), as (A, B)."""
 
     def side(p: Floats, q: Floats, r: Floats) -> Floats:
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
@@ -126,6 +126,6 @@ def _cross(a: Floats, b: Floats) -> Bools:
 
 
 def _hits(lines: Floats, boxes: Floats) -> Bools:
-    """Return a mask (A, B), which is True where a line of `lines` (A, 4) crosses a diagonal of a box of `boxes` (B, 4)."""
+    """Return whether each of the segments `lines` (A, 4) crosses a diagonal of each box (B, 4), as (A, B)."""
     falling = np.stack([boxes[:, 0], boxes[:, 3], boxes[:, 2], boxes[:, 1]], axis=1)
     return _cross(lines, boxes) | _cross(lines, falling)

@@ -18,15 +18,15 @@ from objslam.output.report.sketch import Sketch, sketch
 from objslam.output.report.timeline import Timeline, timeline
 
 _BINS = 16  # The number of bars in the histogram of an object. More bars show more detail, and each has fewer rays.
-_NEIGHBOURS = 2  # A card names this many of the nearest objects of the label. More say little about duplicates.
+_NEIGHBOURS = 2  # The number of nearest objects of the label on a card. More would say little about duplicates.
 
 
 @dataclass(frozen=True)
 class Neighbour:
     """A resolved object with the same label as the object of a card.
 
-    distance: between the two objects, m. sigmas: the same difference as a Mahalanobis distance, with the sum of the two
-    covariances. None if a covariance is unknown.
+    distance: between the two objects, m. sigmas: their Mahalanobis distance, by the sum of both covariances. None if a
+    covariance is unknown.
     """
 
     object: MapObject
@@ -45,8 +45,8 @@ class Card:
     sigma: list[float] | None  # The standard deviations along x, y and z, m.
     seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
     rejected: int  # The number of rejected rays.
-    promised_deg: float | None  # The rms that the sigmas of the used rays predict, deg; None without used rays.
-    error: float | None  # The distance from the matching true object, m; None without a match.
+    promised_deg: float | None  # The rms residual, deg, expected by the sigmas of the used rays. None without used rays.
+    error: float | None  # The distance from the matching true object, m. None without a match.
     matched: str | None  # A text that names the matching true object.
     histogram: Histogram | None
     timeline: Timeline | None
@@ -65,9 +65,9 @@ def make_cards(
 ) -> list[Card]:
     """Return the cards, sorted by label and id. The times on a card count from the first ray of the result, s.
 
-    rays: all rays of the result. crops: the pictures by object id. errors: by object id, the distance from the matching true
-    object, m, and a text that names the true object. path: (K, 3) positions of the robot, m in map. up: the axis of the map
-    that points up.
+    rays: all rays of the result. crops: the pictures by object id. errors: by object id, the distance from the true object,
+    m, and a text that names the true object. path: (K, 3) positions of the robot, m in map. up: the axis of the map that
+    points up.
     """
     begin, end = (float(rays.stamp.min()), float(rays.stamp.max())) if len(rays) else (0.0, 0.0)
     residual_deg = np.degrees(rays.residual)
@@ -110,7 +110,7 @@ def make_cards(
 
 
 def _neighbours(objects: ObjectMap, names: list[str], i: int) -> list[Neighbour]:
-    """Return up to `_NEIGHBOURS` resolved objects with the label of object i, the nearest first. An unresolved i has none.
+    """Return up to `_NEIGHBOURS` resolved objects with the label of object i, the nearest first. Empty for an unresolved i.
 
     names: the caption of each object.
     """

@@ -1,4 +1,4 @@
-"""Histograms of residuals; the page's template draws their bars in SVG."""
+"""Histograms of residuals. The page's template draws their bars in SVG."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,13 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.output.plot.style import REJECTED_BELOW
 
-WIDTH, HEIGHT = 100.0, 40.0  # The area of the bars has this size, in units of the SVG drawing.
+WIDTH, HEIGHT = 100.0, 40.0  # The size of the area of the bars, in units of the SVG drawing.
 _ENDS = np.array([1.0, 2.0, 2.5, 5.0, 10.0])  # An axis ends at one of these numbers times a power of ten.
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One bin of a histogram; lengths are in units of the SVG drawing."""
+    """One bin of a histogram. Lengths are in units of the SVG drawing."""
 
     x: float
     width: float
@@ -34,7 +34,7 @@ class Histogram:
 
 
 def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = None) -> Histogram | None:
-    """Count residuals (R,), deg, in bins, with separate counts of used and rejected rays. None if no residual is finite.
+    """Count residuals (R,), deg, in bins, used and rejected rays separately. None if no residual is finite.
 
     Args:
         weight: (R,) robust weights. A ray with a weight below `REJECTED_BELOW` is rejected.

@@ -19,9 +19,9 @@ _STEPS = (5.0, 2.0, 1.0)  # A scale bar is one of these numbers times a power of
 class Sketch:
     """The rays of an object from above, in units of the drawing.
 
-    used, rejected, path, ellipse: SVG path data. The ellipse is that of 2 sigma, and empty without a covariance. dot: the
+    used, rejected, path: SVG path data. ellipse: SVG path data of the 2-sigma ellipse, empty without a covariance. dot: the
     position of the object. others: the positions of the other objects of its label. bar: the length of the scale bar.
-    metres: the length in the map that the bar stands for, as text.
+    metres: its length in the map, as text.
     """
 
     used: str
@@ -43,7 +43,7 @@ def sketch(
     path: Floats,
     others: Floats,
 ) -> Sketch | None:
-    """Return the sketch of an object; None without a position or without rays. Positions are in a plane seen from above, m.
+    """Return the sketch of an object. None without a position or without rays. Positions are in a plane seen from above, m.
 
     Args:
         origins, directions: (M, 2) of the rays. A direction is the part of the unit vector in the plane.

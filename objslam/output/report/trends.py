@@ -13,10 +13,10 @@ from objslam.output.report.charts import HEIGHT, WIDTH, axis_end
 _BINS = 12
 """The most points of a curve. Each point is the median of equally many rays. More points show more detail and more noise."""
 _FEWEST = 15
-"""The fewest rays of a point. More rays make curves smoother. The median of 15 rays is known to about 20 %."""
+"""The fewest rays of a point. More rays make curves smoother. With 15 rays, the error of a median is about 20 %."""
 _HONEST = float(np.sqrt(2 * np.log(2)))
-"""The median length of a normal error along two axes, in standard deviations of one axis (Rayleigh). If the median residual
-is larger, the noise is larger than in the settings."""
+"""The expected median residual, in standard deviations along one axis, of an error along two axes (Rayleigh). If the median
+residual is larger, the noise is larger than in the settings."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Trend:
-    """Curves of the median residual. `curves` has the name and the points of each curve.
+    """A chart with curves of the median residual.
 
-    `before` is the curve with the shared errors left in, and it is missing if that is unknown. `after` is the curve with the
-    shared errors taken out. below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart
-    in degrees.
+    curves: the name and the points of each curve: `before` and `after` the correction of shared errors. `before` is missing
+    if it is unknown. below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart in
+    degrees.
     """
 
     title: str

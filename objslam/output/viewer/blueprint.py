@@ -9,9 +9,9 @@ from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind, Timeline
 from objslam.output.viewer.times import ITERATION, STAMP
 from objslam.output.viewer.view_point import ViewPoint
 
-_ITERATIONS = 4.0  # Playback shows this many iterations of the solver per second.
+_ITERATIONS = 4.0  # The number of iterations of the solver that playback shows per second.
 _HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before")
-"""The viewer hides these entities until the user clicks on them, because they are opaque and would hide the map."""
+"""The entities that are hidden until the user clicks on them. They are opaque and would hide the map."""
 
 
 def blueprint(
@@ -52,7 +52,7 @@ def blueprint(
 
 
 def map_view(view_point: ViewPoint, name: str = "map", hidden: tuple[str, ...] = _HIDDEN) -> Any:
-    """Make the 3D view of the map; the entities in `hidden` are invisible at first."""
+    """Make the 3D view of the map. hidden: the entities that are invisible at first."""
     controls = rrb.EyeControls3D(position=view_point.position, look_target=view_point.target, eye_up=view_point.up)
     return rrb.Spatial3DView(
         origin="map",

@@ -20,11 +20,11 @@ from objslam.output.viewer.rays import RAY_COLOURS, kind_colours
 from objslam.output.viewer.times import moments, stamp_column
 from objslam.output.viewer.view_point import label_rows
 
-_BLOCK = 500_000  # This many pairs of an object and an image are tested at once. A larger value takes more memory.
-_NEAR = 0.2  # A camera is expected to see an object only if the object is farther away than this, m.
-_BEYOND = 1.2  # An object is expected to be seen up to this multiple of the length of its longest used ray.
-_LIGHTER = 0.35  # Colours of objects suit a white page. For images, they are lightened by this share, in [0, 1].
-_FRUSTUM = 0.05  # The frustum of a camera has this depth, as a share of the map's size.
+_BLOCK = 500_000  # The number of pairs of an object and an image tested at once. A larger value takes more memory.
+_NEAR = 0.2  # The distance, m, below which no camera is expected to see an object.
+_BEYOND = 1.2  # An object is expected in view up to this multiple of its longest used ray.
+_LIGHTER = 0.35  # The share, in [0, 1], by which colours, made for a white page, are lightened for images.
+_FRUSTUM = 0.05  # The depth of a frustum, as a share of the map's size.
 
 
 def camera_path(camera: Camera) -> str:
@@ -36,8 +36,8 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
     """Log each camera as an entity that moves with the robot, `map/camera/NAME`. Return the number of unreadable images.
 
     Below this entity, `image` has the images, `boxes` has the boxes in the colours of their objects, and `map` has the
-    projected objects. The setting `output.image_width` limits the width of the images. All pixel coordinates are scaled with
-    the images. The size of the map, `size`, m, sets the depth of the frusta.
+    projected objects. Images are scaled down to `output.image_width`, and all pixel coordinates with them. size: the size of
+    the map, m, which sets the depth of the frusta.
     """
     unread = 0
     map_T_camera = result.map_T_base @ result.keyframes.base_T_camera
@@ -62,7 +62,7 @@ def log_cameras(recording: Any, result: RunResult, size: float) -> int:
 
 
 def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: float) -> None:
-    """Log the static frustum of a camera. `scale` multiplies its pixel coordinates. `size` is the size of the map, m."""
+    """Log the static frustum of a camera. scale: the factor on pixel coordinates. size: of the map, m."""
     matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
     pinhole = rr.Pinhole(
         image_from_camera=matrix,
@@ -78,7 +78,7 @@ def log_pinhole(recording: Any, path: str, camera: Camera, scale: float, size: f
 def _send_images(recording: Any, path: str, stamps: Floats, shown: Ints, images: Iterator[bytes | None]) -> int:
     """Send an image for each stamp with an index in `shown` (n,), and return the number of unreadable images.
 
-    The other stamps get no image, because their boxes do not fit the image of another stamp.
+    All other stamps get an empty image. An older image would not fit their boxes.
     """
     blobs, counts = [], np.zeros(len(stamps), dtype=np.int64)
     for place, blob in zip(shown.tolist(), images, strict=True):

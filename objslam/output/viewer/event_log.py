@@ -14,8 +14,8 @@ from objslam.errors import one_line
 from objslam.output.plot.style import captions, ray_kinds
 
 Level = Literal["INFO", "WARN"]
-_MAX_CHANGES = 40  # The log lists at most this many changes of objects per round.
-_MERGED = 0.5  # A deleted object counts as merged if another object of its label lies within this distance, m.
+_MAX_CHANGES = 40  # The most changes of objects that the log lists for a round.
+_MERGED = 0.5  # A dropped object counts as merged if another object of its label is within this distance, m.
 _WHY = {
     "fixed": "association at the fixed poses",
     "labels": "one object assumed for each label",
@@ -46,7 +46,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: first the events of the whole run, then the events of objects in the order of time."""
+    """Return the events of a drive: first those of the whole run, then those of objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
@@ -91,8 +91,8 @@ def _why_unresolved(o: MapObject, result: RunResult) -> str:
 def _enough_parallax(result: RunResult) -> Floats:
     """Return the stamp (N,), s, at which each object first has enough parallax.
 
-    This is the stamp of its first used ray with an angle of at least `triangulation.min_parallax_deg` to its earliest used
-    ray. It is NaN if there is no such ray.
+    The stamp is that of its first used ray at an angle of at least `triangulation.min_parallax_deg` to its earliest used
+    ray. NaN if there is none.
     """
     stamps = np.full(len(result.map), np.nan)
     used = np.flatnonzero(ray_kinds(result)["used"])
@@ -168,7 +168,7 @@ def _changes(before: Round | None, now: Round, label_names: tuple[str, ...]) -> 
 
 
 def map_changes(before: ObjectMap, now: ObjectMap) -> list[tuple[Level, str]]:
-    """Return the level and the text of each change of a live map: an id is new, resolved, unresolved, renamed or dropped."""
+    """Return level and text of each change of a live map: an object is new, resolved, unresolved, renamed or dropped."""
     old, new = ({o.id: o for o in m.objects} for m in (before, now))
     lines: list[tuple[Level, str]] = []
     for j, o in new.items():

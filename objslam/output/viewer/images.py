@@ -15,15 +15,15 @@ from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 from objslam.output.plot.style import evenly
 
-_MAX_LAG = 0.05  # A keyframe and its image differ by at most this time, s.
-_QUALITY = 70  # JPEGs have this quality, 0 to 100. A larger value makes larger recordings.
-_AHEAD = 8  # Threads read this many images ahead. A larger value takes more memory.
+_MAX_LAG = 0.05  # The longest time, s, between a keyframe and its image.
+_QUALITY = 70  # The quality of JPEGs, 0 to 100. A larger value makes larger recordings.
+_AHEAD = 8  # The number of images that threads read ahead. A larger value takes more memory.
 
 
 def choose_images(images: Images, stamps: Floats, most: int) -> tuple[Ints, Ints]:
-    """Choose evenly at most `most` of the stamps (N,), s, that have an image.
+    """Choose at most `most` of the stamps (N,), s, that have an image, evenly spread.
 
-    Returns the indices (n,) of these stamps and the indices (n,) of their images.
+    Return the indices (n,) of these stamps and the indices (n,) of their images.
     """
     if most == 0 or len(stamps) == 0 or len(images.paths) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)

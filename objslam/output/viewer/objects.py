@@ -16,7 +16,7 @@ from objslam.errors import printable
 from objslam.output.plot.style import captions, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
-_MAX_LABELS = 60  # Labels are hidden at first if the map has more objects than this. More labels would overlap.
+_MAX_LABELS = 60  # The most objects of a map whose labels show at first. More labels would overlap.
 _OPACITY = 90  # The opacity of bodies, 0 to 255. More opaque bodies hide the points and ellipsoids inside them.
 _AXES = ((220, 50, 47), (70, 160, 60), (40, 110, 220))  # The RGB colours of the axes x, y and z.
 _TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # The RGB colours are black, white, grey.
@@ -37,8 +37,8 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
     Args:
         path: (K, 3) points, m in map, that labels should not cover.
-        static: whether the objects are static. If not, they are logged at the current time of the recording. An entity
-            without objects is then logged too, because it clears the earlier objects.
+        static: whether the objects are static. If not, they are logged at the current time of the recording, and an entity
+            without objects is logged to clear the earlier ones.
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 
@@ -79,7 +79,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     places = np.array([every[i].position for i in named]).reshape(-1, 3)
     shown = len(named) <= _MAX_LABELS
     hung, ends = label_places(view_point, places, words, path) if shown else (places, places)
-    # The viewer writes a label in the colour of its point. The label is on a dark box, so only white is legible.
+    # A label has the colour of its point, on a dark box. Only white is legible there.
     names = rr.Points3D(hung, colors=[_TEXT], radii=0.0, labels=words, show_labels=shown)
     log("/labels", names, bool(named))
     lines = rr.LineStrips3D(np.stack([places, ends], axis=1), colors=[_LEADER], radii=rr.Radius.ui_points(0.4))
@@ -87,7 +87,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 
 def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]]) -> None:
-    """Log bodies at places: filled ellipsoids and cuboids, so that they differ from the lines of the 2-sigma ellipsoids."""
+    """Log bodies as filled ellipsoids and cuboids. The 2-sigma ellipsoids are lines, so the two look different."""
     for name, kind, some in (
         ("/bodies", rr.Ellipsoids3D, [one for one in bodies if one[1].shape != "cuboid"]),
         ("/cuboids", rr.Boxes3D, [one for one in bodies if one[1].shape == "cuboid"]),

@@ -13,10 +13,10 @@ from objslam.output.plot.style import evenly, label_colours
 from objslam.output.viewer.times import iteration_column, stamp_column
 
 _BEFORE, _AFTER, _TRUTH = (150, 150, 150), (40, 44, 52), (46, 139, 87)  # The RGB colours are grey, nearly black, green.
-_STEP = (240, 140, 40)  # The path of an iteration is orange (RGB), unlike every static path.
-_MAX_POINTS = 4000  # A static path has at most this many points. A screen cannot resolve more points.
-_MAX_STEP_POINTS = 400  # The path of an iteration has at most this many points.
-_MAX_STEPS = 400  # A recording has at most this many iterations, evenly chosen.
+_STEP = (240, 140, 40)  # The colour of the path of an iteration (RGB): orange, unlike the static paths.
+_MAX_POINTS = 4000  # The most points of a static path. A screen cannot resolve more.
+_MAX_STEP_POINTS = 400  # The most points of the path of an iteration.
+_MAX_STEPS = 400  # The most iterations in a recording, evenly chosen.
 
 
 def log_paths(recording: Any, result: RunResult, truth: Truth | None) -> None:
@@ -45,7 +45,7 @@ def send_poses(recording: Any, entity: str, stamps: Floats, poses: Floats) -> No
 
 
 def thinned(path: Trajectory, most: int) -> Floats:
-    """Return at most `most` positions (n, 3), m, of a path. They are evenly chosen and include the first and the last."""
+    """Return at most `most` positions (n, 3), m, of a path, evenly chosen, with the first and the last."""
     return path.poses[evenly(len(path), most), :3, 3]
 
 

@@ -13,8 +13,8 @@ from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
 _GAP, _GAP_STEPS = 1.0, 5.0
-"""A pause between stamps breaks a curve if it is longer than 1 s and longer than 5 times the median step of stamps."""
-_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # Curves have these colours.
+"""A pause breaks a curve if it is longer than `_GAP`, s, and than `_GAP_STEPS` times the median step between stamps."""
+_BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # RGB, of curves.
 _MANY = (
     *(_BLUE, _ORANGE, _GREEN, (190, 70, 70), (140, 90, 190), (140, 100, 80)),
     *((220, 120, 190), _GREY, (180, 180, 50), (60, 180, 200)),
@@ -66,8 +66,8 @@ def log_costs(recording: Any, result: RunResult) -> None:
 def log_parameters(recording: Any, result: RunResult) -> None:
     """Log the shared errors by iteration, in standard deviations of their priors.
 
-    `plots/calibration/NAME` has the value of a parameter, `plots/calibration_sigma/NAME` its standard deviation, which
-    is 1 before the first step. The last points are the result of the run.
+    `plots/calibration/NAME` has the value of a shared error. `plots/calibration_sigma/NAME` has its standard deviation, 1 at
+    the start. The last points are the result of the run.
     """
     if result.calibration is None or not result.trace:
         return

@@ -15,8 +15,8 @@ _Palette = dict[RayKind, tuple[int, int, int]]
 RAY_COLOURS: _Palette = {"used": (62, 128, 214), "rejected": (224, 62, 50), "unexplained": (150, 150, 150)}
 """The RGB colour of each kind of ray."""
 _FAINT: _Palette = {"used": (186, 212, 243), "rejected": (246, 205, 200), "unexplained": (222, 222, 222)}
-"""The RGB colour of each kind of static ray. It is `RAY_COLOURS`, mixed with about two thirds of white."""
-_MAX_RAYS = 240  # The map shows at most this many static rays of each kind. Lines are opaque, so more would hide the map.
+"""The RGB colour of each kind of static ray: `RAY_COLOURS` with about two thirds of white."""
+_MAX_RAYS = 240  # The most static rays of each kind. Lines are opaque, so more would hide the map.
 
 
 def log_rays(recording: Any, result: RunResult) -> None:
@@ -34,7 +34,7 @@ def log_rays(recording: Any, result: RunResult) -> None:
 
 
 def kind_colours(result: RunResult) -> NDArray[np.uint8]:
-    """Return the colour (R, 3), RGB, of each ray. The colour shows the kind of the ray."""
+    """Return the colour (R, 3), RGB, of each ray by its kind: used, rejected or unexplained."""
     colours = np.zeros((len(result.rays), 3), dtype=np.uint8)
     for kind, mask in ray_kinds(result).items():
         colours[mask] = RAY_COLOURS[kind]

@@ -23,7 +23,7 @@ from objslam.output.viewer.surface import log_surfaces
 from objslam.output.viewer.times import iteration_column, stamp_column
 from objslam.output.viewer.view_point import first_view_point
 
-_AVOIDED = 500  # Labels avoid at most this many points of the path.
+_AVOIDED = 500  # The most points of the path that labels avoid.
 
 
 def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -> None:
@@ -35,7 +35,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     has the events on both timelines, and `summary` has a table. OSError if the file cannot be written.
     """
     recording = rr.RecordingStream("objslam")
-    # The recording stays in memory until the end. A file sink would report a full disk on stderr and raise no error.
+    # The recording is kept in memory until the end, because a file sink does not raise an error on a full disk.
     memory = recording.memory_recording()
     recording.send_recording_name(one_line(result.summary.get("log", "objslam")))
     up = up_axis(result.keyframes)

@@ -8,9 +8,9 @@ import rerun as rr
 from objslam.core.result import RunResult
 from objslam.core.types import Surface
 
-_MAX_VERTICES = 100_000  # A recorded surface has at most this many vertices, 5 MB. reconstruction.ply has all.
-_CELL = 0.02  # The grid cells have this edge length, m, before they first grow.
-_GROWTH = 1.25  # The cells grow by this factor until at most `_MAX_VERTICES` vertices remain.
+_MAX_VERTICES = 100_000  # The most vertices of a recorded surface, 5 MB. reconstruction.ply has all vertices.
+_CELL = 0.02  # The first edge length, m, of the grid cells.
+_GROWTH = 1.25  # The factor by which cells grow until at most `_MAX_VERTICES` vertices are left.
 
 
 def log_surfaces(recording: Any, result: RunResult) -> None:
@@ -53,7 +53,7 @@ def coarser(surface: Surface, most: int) -> Surface:
         colours = surface.colours
         if colours is not None:
             colours = (_sums(colours, into, len(counts)) / counts[:, None]).round().astype(np.uint8)
-        # Triangles of a thin part can flip if both sides of the part fall into one cell. Flipped triangles are removed.
+        # If both sides of a thin part fall into one cell, triangles can flip. Flipped triangles are removed.
         a, b, c = (vertices[corner] for corner in triangles.T)
         upright = np.einsum("ti,ti->t", np.cross(b - a, c - a), normals[triangles].sum(axis=1)) > 0
         return Surface(vertices=vertices, normals=normals, colours=colours, triangles=triangles[upright])
@@ -61,5 +61,5 @@ def coarser(surface: Surface, most: int) -> Surface:
 
 
 def _sums(values: Any, into: Any, count: int) -> Any:
-    """Add up the rows of values (N, C) in `count` groups, one row per group. `into` (N,) is the group of each row."""
+    """Return the sums (count, C) of values (N, C) by group. into: (N,) the group of each row."""
     return np.stack([np.bincount(into, column, count) for column in np.asarray(values, dtype=np.float64).T], axis=1)

@@ -11,15 +11,15 @@ from objslam.frontend.up import from_above, up_vector
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import frame_objects
 
-_FOV = np.radians(55.0)  # The viewer has this vertical field of view, rad.
-_VIEW = np.array([900.0, 620.0])  # The view of the map has this width and height, px, in a window of 1600 x 900.
-_FILLED = 0.86  # The map fills this share of the view.
-_FROM = np.array([-0.28, -0.80, 0.78])  # The first view point lies in this direction: south, slightly west, 43 deg up.
-_LINE = 24.0  # A label on the map has this height, px.
+_FOV = np.radians(55.0)  # The vertical field of view of the viewer, rad.
+_VIEW = np.array([900.0, 620.0])  # The width and height of the view of the map, px, in a window of 1600 x 900.
+_FILLED = 0.86  # The share of the view that the map fills.
+_FROM = np.array([-0.28, -0.80, 0.78])  # The direction of the first view point: south, slightly west, 43 deg up.
+_LINE = 24.0  # The height of a label on the map, px.
 _LETTER, _PADDING = 7.3, 12.0  # The width of a letter, and the width of both margins of a label, px on the screen.
-_IMAGE_LINE = 21.0  # A label in an image has this height, px on the screen.
-_IMAGE_VIEW = (580.0, 350.0)  # The view of a camera has this width and height, px, in a window of 1600 x 900.
-_ROWS = 6  # A label hangs at most this many rows below its dot.
+_IMAGE_LINE = 21.0  # The height of a label in an image, px on the screen.
+_IMAGE_VIEW = (580.0, 350.0)  # The width and height of the view of a camera, px, in a window of 1600 x 900.
+_ROWS = 6  # The most rows between a dot and its label.
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ViewPoint:
 
     position: Floats  # (3,) m in map.
     target: Floats  # (3,) m in map, at the centre of the view.
-    axes: Floats  # (3, 3); the rows point right, up and towards the target.
+    axes: Floats  # (3, 3), the rows point right, up and towards the target.
     focal: float  # The focal length, px.
     up: Floats  # (3,) the unit vector in map that points up in the world.
 
@@ -54,7 +54,7 @@ class ViewPoint:
 
 
 def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoint:
-    """Return the view point from which the objects and the path (K, 3) fill the view; far objects are left out.
+    """Return the view point from which the objects, without far ones, and the path (K, 3) fill the view.
 
     up: the axis of the map that points up.
     """
@@ -65,7 +65,7 @@ def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoin
     back = _FROM @ np.stack([*np.eye(3)[from_above(up)], up_vector(up)])
     axes = _axes(back, up_vector(up))
     tangent = _FILLED * np.tan(_FOV / 2) * np.array([_VIEW[0] / _VIEW[1], 1.0])
-    for _ in range(4):  # Perspective enlarges the near half, so the centre is found by iteration.
+    for _ in range(4):  # Perspective enlarges the near half. So the target moves to the centre step by step.
         x, y, ahead = ((points - centre) @ axes.T).T
         distance = max(float(np.max(np.abs(x) / tangent[0] - ahead)), float(np.max(np.abs(y) / tangent[1] - ahead)), 1.0)
         seen = np.column_stack([x, y]) / np.maximum(distance + ahead, 1e-6)[:, None]
@@ -96,10 +96,10 @@ def label_places(view_point: ViewPoint, anchors: Floats, texts: list[str], avoid
     A label without a free place hangs below its object.
 
     Args:
-        anchors: (N, 3) the objects, m in map; a label has the depth of its object.
+        anchors: (N, 3) the objects, m in map. A label has the depth of its object.
         avoid: (P, 3) points, m in map, that the labels should not cover.
     Returns:
-        The centres (N, 3) of the labels' upper edges, and the points (N, 3) at which leader lines meet the labels; m in map.
+        The centres (N, 3) of the labels' upper edges, and the points (N, 3) at which leader lines meet the labels, m in map.
     """
     if len(anchors) == 0:
         return anchors, anchors
@@ -120,7 +120,7 @@ def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, floa
         frame: (S,) the image of each dot.
         dots: (S, 2) px of the image.
         letters: (S,) the number of letters of each label.
-        size: width and height of the images, px; the viewer scales an image to its view.
+        size: width and height of the images, px. The viewer scales an image to its view.
     Returns:
         The positions (S, 2) of the labels, px of the image, and a mask (S,) of the labels that were placed.
     """
@@ -135,7 +135,7 @@ def label_rows(frame: Ints, dots: Floats, letters: Ints, size: tuple[float, floa
     until = np.full((frames, int(np.ceil(size[1] / line)) + _ROWS + 1), -np.inf)  # Labels fill each row up to this x, px.
     hung, found = dots.copy(), np.zeros(len(dots), dtype=bool)
     for k in range(int(rank.max()) + 1 if len(rank) else 0):
-        mine = order[rank == k]  # the k-th label of each image
+        mine = order[rank == k]  # The k-th label of each image.
         for below in range(_ROWS):
             at = row[mine] + below
             free = until[frame[mine], at] <= dots[mine, 0] - half[mine]

@@ -1,4 +1,4 @@
-"""The formats of `objslam export`, with one module for each format; code that several formats share is in `output.export`.
+"""The formats of `objslam export`, with one module for each format. Code that several formats share is in `output.export`.
 
 Every command imports these modules at its start, so they import slow libraries (numpy too) inside their functions.
 """

@@ -17,9 +17,9 @@ _FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def _dump(content: Content) -> bytes:
-    """Return the objects as UTF-8 text. A reader gets each number back as the same float. An unknown value is empty.
+    """Return the objects as UTF-8 text. Numbers have all digits of their floats. An unknown value is empty.
 
-    A label that a spreadsheet would take for a formula is preceded by an apostrophe, as OWASP advises against CSV injection.
+    A label that a spreadsheet would take for a formula gets an apostrophe in front, as OWASP advises against CSV injection.
     """
     from objslam.core.object_map import COLUMNS
 

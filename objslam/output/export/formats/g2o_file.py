@@ -16,8 +16,8 @@ def _dump(content: Content) -> bytes:
     """Return the pose graph as text.
 
     Each map_T_base of trajectory.txt is a vertex, and each odometry measurement is an edge. The first vertex of each
-    connected part is fixed. The information matrix of an edge is over x, y, z (m) and the rotation about x, y, z (rad), in
-    the coordinate frame of the edge's second pose, as GTSAM reads it.
+    connected part is fixed. The information matrix of an edge has the order x, y, z (m), then rotation about x, y, z (rad),
+    in the frame of the second pose, as GTSAM reads it.
     """
     import numpy as np
 

@@ -1,6 +1,6 @@
 """The MCAP format with ROS 2 messages: map and path, for Foxglove, RViz (`ros2 bag play`) and readers of ROS 2 bags.
 
-The module writes such a file without ROS. Source: https://mcap.dev/spec.
+ROS is not needed. Source: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LATCHED = (
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  liveliness_lease_duration:\n"
     "    sec: 9223372036\n    nsec: 854775807\n  avoid_ros_namespace_conventions: false"
 )
-"""The offered QoS in the format of rosbag2: reliable and transient local, so that an RViz that joins late gets the map."""
+"""The offered QoS, as rosbag2 writes it: reliable and transient local, so that a late RViz gets the map too."""
 
 
 def _dump(content: Content) -> bytes:
@@ -34,7 +34,7 @@ def _dump(content: Content) -> bytes:
     from objslam.output.export.map_messages import LAST_STAMP, MapMessages
 
     stamps = content.path.stamps
-    if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < LAST_STAMP:  # a file has no negative stamps
+    if len(stamps) and not 0.0 <= stamps[0] <= stamps[-1] < LAST_STAMP:  # An MCAP file has no negative stamps.
         raise OutputError("the stamps are no ROS time: they lie before 1970 or after 2038", where=str(content.out))
     messages = MapMessages(content.objects.frame)
     start = float(stamps[0]) if len(stamps) else 0.0

@@ -19,7 +19,7 @@ _PROPERTIES = (
 
 
 def _dump(content: Content) -> bytes:
-    """Return a file with a vertex for each resolved object. A vertex has position (m), colour, id, label and sigma.
+    """Return a PLY file with a vertex for each resolved object: position (m), colour, id, label and sigma.
 
     `label` is an index into the labels that the header's comments list. `sigma` is the standard deviation along the least
     certain direction (m), or 0 if it is unknown.

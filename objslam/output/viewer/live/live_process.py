@@ -4,8 +4,8 @@ If a viewer hangs, rerun's connection blocks, and the process with this connecti
 a process of its own, which the session can kill.
 
 Start: `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`. The process reads messages from
-stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if this
-is uncertain.
+stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if it may not
+have.
 """
 
 import argparse
@@ -34,10 +34,10 @@ from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import STAMP
 from objslam.output.viewer.view_point import ViewPoint, first_view_point
 
-_GRACE = 5.0  # After the end of the session, a viewer has this time, s, to receive the last message.
-_RETRY = 2.0  # Two attempts to reach a lost viewer are at least this time, s, apart.
-_PATH = (40, 44, 52)  # The path is nearly black (RGB).
-_FREE_REACH = 2.0  # A ray without an object is drawn with this length, m.
+_GRACE = 5.0  # The time, s, after the end of the session in which a viewer can receive the last message.
+_RETRY = 2.0  # The least time, s, between two attempts to reach a lost viewer.
+_PATH = (40, 44, 52)  # The colour of the path (RGB): nearly black.
+_FREE_REACH = 2.0  # The drawn length, m, of a ray without an object.
 
 
 def main() -> None:

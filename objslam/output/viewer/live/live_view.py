@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from objslam.core.snapshot import Snapshot
 
-_MAX_WAITING = 4  # At most this many snapshots wait for the viewer. Beyond that, the oldest is dropped.
-_ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # The address of a viewer has this form.
+_MAX_WAITING = 4  # The most snapshots that wait for the viewer. Beyond that, the oldest is dropped.
+_ADDRESS = re.compile(r"rerun(\+https?)?://[^/\s]+/proxy")  # The form of a viewer's address.
 
 Image = Callable[[str, float], "NDArray[np.uint8] | bytes | None"]
 """A function that takes a camera's name and a stamp, s, and returns an image, or None if there is no image."""
@@ -58,8 +58,8 @@ class LiveView:
     """A view that shows the snapshots of a session. If the viewer is too slow, snapshots are dropped and counted.
 
     A separate process logs the snapshots, and a thread feeds this process. So a hanging viewer cannot block the session or
-    its end. If the viewer is killed, the process tries to connect to its address every few seconds. A new viewer at this
-    address receives the later snapshots.
+    its end. If the viewer is killed, the process tries its address every few seconds. A new viewer there gets the later
+    snapshots.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class LiveView:
         """Start to log to a recording file, to the viewer at an address, or to both.
 
         Args:
-            file: the recording; it can be read at any time.
+            file: the recording. It can be read at any time.
             image: finds the images of camera frames. The thread of the view calls this function.
             server: a viewer to stop at the end.
         Raises:
@@ -98,14 +98,14 @@ class LiveView:
             arguments,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # rerun reports every message that an ended viewer misses.
+            stderr=subprocess.DEVNULL,  # Otherwise rerun reports each message that an ended viewer misses.
             start_new_session=True,  # Ctrl+C ends the session, and the session ends this process.
         )
         self._thread = threading.Thread(target=self._feed, name="objslam live view", daemon=True)
         self._thread.start()
 
     def show(self, snapshot: Snapshot) -> bool:
-        """Queue a snapshot and return at once; any thread may call this. Return False if an older snapshot was dropped."""
+        """Queue a snapshot and return at once. Any thread may call this. Return False if an older snapshot was dropped."""
         with self._changed:
             full = len(self._waiting) >= _MAX_WAITING
             if full:
@@ -116,7 +116,7 @@ class LiveView:
         return not full
 
     def close(self, timeout: float = 3.0) -> None:
-        """Wait at most `timeout`, s, until the waiting snapshots are shown, then end the process."""
+        """Wait until the queued snapshots are shown, at most `timeout`, s. Then end the process."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -139,7 +139,7 @@ class LiveView:
         self.close()
 
     def _feed(self) -> None:
-        """Send one snapshot at a time to the process; if the process has ended, count the snapshots as dropped."""
+        """Send one snapshot at a time to the process. If the process has ended, count the snapshots as dropped."""
         into, back = self._process.stdin, self._process.stdout
         assert into is not None
         assert back is not None

@@ -16,27 +16,27 @@ from objslam.output.plot.style import evenly
 from objslam.output.viewer.images import pack
 
 _LENGTH = struct.Struct("<Q")  # A message begins with the length of its JSON text, bytes.
-_MAX_POINTS = 500  # A message has at most this many points of the path.
-_MAX_LENGTH = 1 << 30  # At most this many bytes of text are read, so that a damaged length does not fill the memory.
-_CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion")  # A message has these camera fields.
-_FRAME = ("stamp", "map_T_camera", "boxes", "objects", "rejected")  # A message has these fields of a frame.
+_MAX_POINTS = 500  # The most points of the path in a message.
+_MAX_LENGTH = 1 << 30  # The most bytes of text that are read, so that a damaged length does not fill the memory.
+_CAMERA = ("name", "width", "height", "matrix", "distortion_model", "distortion")  # The fields of a camera in a message.
+_FRAME = ("stamp", "map_T_camera", "boxes", "objects", "rejected")  # The fields of a frame in a message.
 
 
 @dataclass(frozen=True)
 class ShownSnapshot:
     """The part of a snapshot that the view shows."""
 
-    stamp: float  # The stamp of the newest keyframe, s; NaN without keyframes.
+    stamp: float  # The stamp of the newest keyframe, s. NaN without keyframes.
     map: ObjectMap
     path: Floats  # (n, 3) positions of the base, m in map, evenly chosen.
-    base: Floats | None  # (4, 4) the newest map_T_base; None without keyframes.
+    base: Floats | None  # (4, 4) the newest map_T_base. None without keyframes.
     numbers: dict[str, float]  # Counts: keyframes, rebuilds, unseen snapshots. Times, s: lag; p50, p99 of an update.
     counters: dict[str, int]  # The number of accepted messages by kind.
     dropped: dict[str, int]  # The number of dropped messages by reason.
 
 
 def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
-    """Encode a snapshot as one message; `unseen` is the number of snapshots that were dropped before it."""
+    """Encode a snapshot as one message. unseen: the number of snapshots that were dropped before it."""
     frames, path, (p50, p99) = snapshot.frames, snapshot.path, snapshot.update
     numbers = {"lag": snapshot.lag, "p50": p50, "p99": p99, "unseen": unseen}
     numbers |= {"keyframes": snapshot.keyframes, "rebuilds": snapshot.rebuilds}
@@ -57,7 +57,7 @@ def encode_snapshot(snapshot: Snapshot, unseen: int = 0) -> bytes:
 
 
 def read_snapshot(stream: BinaryIO) -> tuple[ShownSnapshot, list[CameraFrame]] | None:
-    """Return the snapshot and the camera frames of a stream's next message; None at the end or if the message is cut off."""
+    """Return the snapshot and the camera frames of a stream's next message. None at the end or if the message is cut off."""
     start = stream.read(_LENGTH.size)
     if len(start) < _LENGTH.size:
         return None
