@@ -52,11 +52,16 @@ class InnerSolve(Linearised):
             self,
             map_T_camera=self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6)),
             positions=positions,
+            known=self.graph,
         )
 
     def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
         """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
-        return replace(self.moved(system.sensitivity @ step + system.newton), measured=measured)
+        return self.moved(system.sensitivity @ step + system.newton).measuring(measured)
+
+    def measuring(self, measured: Measurements) -> Self:
+        """Return the state with other measured values of the same rays and motions."""
+        return replace(self, measured=measured, known=self.graph.measuring(measured))
 
     def solved(self) -> Self:
         """Return the state after at most `_INNER` Gauss-Newton steps, or `_damped` if a step does not lower the cost."""
@@ -80,4 +85,4 @@ class InnerSolve(Linearised):
     def settled(self) -> Self:
         """Return the state with the rays that now agree with their objects."""
         used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
-        return self if np.array_equal(used, self.used) else replace(self, used=used)
+        return self if np.array_equal(used, self.used) else replace(self, used=used, known=None)

@@ -224,7 +224,7 @@ class _Fit:
 
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the optimum for the measurements with the present noise."""
-        return replace(state, measured=self.measure(*self.errors.at(theta))).solved()
+        return state.measuring(self.measure(*self.errors.at(theta))).solved()
 
 
 def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:

@@ -32,7 +32,8 @@ class Linearised:
     """The graph of a joint solve with Huber's loss, and values of its variables.
 
     map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark outside the graph. used: (R,) the rays in the graph.
-    order: (D,) the order in which the columns of the Jacobian are eliminated. None means that it is not known yet.
+    order: (D,) the order in which the columns of the Jacobian are eliminated. known: the graph, which states with the same
+    measurements share. None means that they are not known yet.
     """
 
     measured: Measurements
@@ -41,6 +42,7 @@ class Linearised:
     positions: Floats
     used: Bools
     order: Ints | None = None
+    known: JointGraph | None = None
 
     @property
     def which(self) -> Ints:
@@ -54,7 +56,9 @@ class Linearised:
 
     @cached_property
     def graph(self) -> JointGraph:
-        """The graph. The means of the weak priors of landmarks are `positions`."""
+        """The graph. The means of the weak priors of landmarks are the `positions` at which it was made."""
+        if self.known is not None:
+            return self.known
         return JointGraph.of(self.measured, self.association, self.used, self.positions)
 
     @cached_property

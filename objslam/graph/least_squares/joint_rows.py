@@ -4,7 +4,7 @@ A calibration solves the same graph for many values of the shared errors. To mak
 it, so these solves have arrays instead. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -42,15 +42,18 @@ class JointRows:
 class JointGraph:
     """The measurements of a joint solve with Huber's loss.
 
-    rays: the n rays in the graph. landmark: (n,) the row of each ray's landmark in `weak`. weak: (m, 3) m, the means of the
-    landmarks' weak priors. squares: fiducials, whose corners are landmarks.
+    which: (n,) the rays in the graph, of the rays of `measured`. rays: these rays. landmark: (n,) the row of each ray's
+    landmark in `weak`. weak: (m, 3) m, the means of the landmarks' weak priors. squares: fiducials, whose corners are
+    landmarks. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each row.
     """
 
     measured: Measurements
+    which: Ints
     rays: Rays
     landmark: Ints
     weak: Floats
     squares: SquareRows
+    pattern: tuple[Ints, Ints]
 
     @classmethod
     def of(cls, measured: Measurements, association: Association, used: Bools, positions: Floats) -> Self:
@@ -58,19 +61,23 @@ class JointGraph:
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         landmark = np.searchsorted(landmarks, association.object[which])
         squares = SquareRows.of(measured.tags, landmarks)
-        return cls(measured, measured.rays.take(which), landmark, positions[landmarks], squares)
+        rays = measured.rays.take(which)
+        pattern = _pattern(measured, rays, landmark, len(landmarks), squares)
+        return cls(measured, which, rays, landmark, positions[landmarks], squares, pattern)
+
+    def measuring(self, measured: Measurements) -> Self:
+        """Return the graph of the same rays and landmarks with other measured values."""
+        return replace(self, measured=measured, rays=measured.rays.take(self.which))
 
     @cached_property
     def ranged(self) -> Ints:
         """(q,) the rays with a range."""
-        return np.flatnonzero(np.isfinite(self.rays.range))
+        return _ranged(self.rays)
 
     @cached_property
     def steps(self) -> Ints:
         """(s,) the motions that the odometry measured. Motion i is from pose i to pose i + 1."""
-        if self.measured.motion is None:
-            return np.zeros(0, dtype=np.int64)
-        return np.flatnonzero(self.measured.keyframes.measured)
+        return _steps(self.measured)
 
     @property
     def first_range(self) -> int:
@@ -105,26 +112,6 @@ class JointGraph:
         """(D,) the variable of each column: first the landmarks, then the poses."""
         m, poses = len(self.weak), len(self.measured.keyframes)
         return np.concatenate([np.repeat(np.arange(m), 3), np.repeat(m + np.arange(poses), 6)])
-
-    @cached_property
-    def _pattern(self) -> tuple[Ints, Ints]:
-        """The columns of all entries of the Jacobian, row by row, and the first entry of each row."""
-        first_pose = self.weak.size
-        on_landmark = 3 * self.landmark[:, None] + np.arange(3)
-        seen = np.hstack([on_landmark, first_pose + 6 * self.rays.keyframe[:, None] + np.arange(6)])
-        moved = first_pose + 6 * self.steps[:, None] + np.arange(12)
-        absolute = first_pose + 6 * np.arange(len(self._absolute_roots))[:, None] + np.arange(6)
-        parts = (
-            np.repeat(seen, 2, axis=0),
-            seen[self.ranged],
-            np.arange(first_pose)[:, None],
-            np.repeat(moved, 6, axis=0),
-            np.repeat(absolute, 6, axis=0),
-            np.repeat(self.squares.columns, 12, axis=0),
-        )
-        lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
-        columns = np.concatenate([part.ravel() for part in parts])
-        return columns.astype(np.int32), np.append(0, np.cumsum(lengths)).astype(np.int32)
 
     def seen(self, map_T_camera: Floats, landmarks: Floats) -> Floats:
         """Return the landmark (n, 3), m, of each ray, in the camera frame of the ray's pose."""
@@ -188,7 +175,7 @@ class JointGraph:
         by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
         by_absolute = (absolute_roots @ _by_end(apart)).ravel()
         data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, by_corner.ravel()])
-        columns, first = self._pattern
+        columns, first = self.pattern
         jacobian = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=(len(first) - 1, len(self.blocks)))
         jacobian.eliminate_zeros()  # On a plane, half of the entries are zero.
         past = range_root * (distance - rays.range[ranged])
@@ -222,6 +209,39 @@ class JointGraph:
         after = roots @ _by_end(off)
         before = -after @ adjoint(inverse(moved))
         return (roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2), cost
+
+
+def _ranged(rays: Rays) -> Ints:
+    return np.flatnonzero(np.isfinite(rays.range))
+
+
+def _steps(measured: Measurements) -> Ints:
+    if measured.motion is None:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(measured.keyframes.measured)
+
+
+def _pattern(
+    measured: Measurements, rays: Rays, landmark: Ints, landmarks: int, squares: SquareRows
+) -> tuple[Ints, Ints]:
+    """Return the columns of all entries of the Jacobian, row by row, and the first entry of each row."""
+    first_pose = 3 * landmarks
+    on_landmark = 3 * landmark[:, None] + np.arange(3)
+    seen = np.hstack([on_landmark, first_pose + 6 * rays.keyframe[:, None] + np.arange(6)])
+    moved = first_pose + 6 * _steps(measured)[:, None] + np.arange(12)
+    localized = len(measured.keyframes) if measured.keyframes.localized_every else 1
+    absolute = first_pose + 6 * np.arange(localized)[:, None] + np.arange(6)
+    parts = (
+        np.repeat(seen, 2, axis=0),
+        seen[_ranged(rays)],
+        np.arange(first_pose)[:, None],
+        np.repeat(moved, 6, axis=0),
+        np.repeat(absolute, 6, axis=0),
+        np.repeat(squares.columns, 12, axis=0),
+    )
+    lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+    columns = np.concatenate([part.ravel() for part in parts])
+    return columns.astype(np.int32), np.append(0, np.cumsum(lengths)).astype(np.int32)
 
 
 def from_origins(rays: Rays, seen: Floats) -> Floats:
