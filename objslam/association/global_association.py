@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.existence import chance_odds, existence
+from objslam.association.chance import Strays, chance_odds, unmatched_costs
+from objslam.association.detection_rates import detection_rates
+from objslam.association.existence import existence
 from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
@@ -17,6 +19,7 @@ from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
 from objslam.association.refinement import grouped_sums, refine
+from objslam.association.sparse_search import SparseSearch, discover_sparse
 from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
@@ -30,6 +33,7 @@ _SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames
 _FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
+_SPARSE_SAMPLE = 1024
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
@@ -43,6 +47,7 @@ class _Task:
 
     gate: float
     settings: config.AssociationSettings
+    strays: Strays
     device: str
     seed: int
 
@@ -77,17 +82,26 @@ def associate_globally(
     view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
-    task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
+    task = _Task(gate_limit(settings.association.gate), settings.association, Strays.of(obs, view, len(rays.label_names)), settings.triangulation.device, seed)
     if guess is not None:
         association, position = guess
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
         state = replace(state, landmarks=landmarks, matched=association.object[ray])
         state = _alternate(task, state.keep(_plausible(task, state)))
+    refuted = np.zeros(len(ray), dtype=bool)
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX), 2)
-        state = _merge_round(task, state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS))
-        state = _drop(task, state, existence(state, task.gate))
+        found = _merge_round(task, state.keep(_odds(task, state) >= _CHANCE_ODDS))
+        state = _drop(task, found, _existence(task, found))
+        refuted |= (found.matched >= 0) & (state.matched < 0)
+        if state.count <= before:
+            break
+    for turn in range(_TURNS):
+        before = state.count
+        state = _alternate(task, _discover_sparse(task, state, turn, ~refuted), 2)
+        state = _merge_round(task, state.keep(_odds(task, state) >= 0))
+        state = _drop(task, state, _existence(task, state))
         if state.count <= before:
             break
     state = _add_distant(task, state)
@@ -107,8 +121,6 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))
-        if len(free) < task.settings.min_rays:
-            continue
         rng = np.random.default_rng([task.seed, turn, label])
         if len(free) > _SAMPLE:
             frames = np.unique(obs.frame[free])
@@ -138,7 +150,43 @@ def _add_distant(task: _Task, state: State) -> State:
     off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
     state = state.keep(narrow | (np.arange(len(narrow)) < known))
-    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
+    return state.keep(_odds(task, state) >= _CHANCE_ODDS)
+
+
+def _discover_sparse(task: _Task, state: State, turn: int, allowed: Bools) -> State:
+    """Add landmarks where few unassigned rays of one label agree. allowed: (R,) the rays that may be used."""
+    obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
+    for label in np.flatnonzero(state.unassigned).tolist():
+        free = np.flatnonzero((obs.label == label) & (state.matched < 0) & allowed)
+        free = _some_frames(obs.frame, free, _SPARSE_SAMPLE, np.random.default_rng([task.seed, turn, label]))
+        pool = obs.take(free)
+        pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
+        number = float(state.unassigned[label])
+        search = SparseSearch(task.strays.take(free), number, task.gate, _PARALLAX, 0.0)
+        points = discover_sparse(pool, search)
+        new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
+        landmarks = landmarks.and_also(new)
+    return replace(state, landmarks=landmarks)
+
+
+def _some_frames(frame: Ints, rays: Ints, most: int, rng: np.random.Generator) -> Ints:
+    """Return the rays of a random part of the frames if there are more than `most` rays."""
+    if len(rays) <= most:
+        return rays
+    frames = np.unique(frame[rays])
+    some = rng.permutation(frames)[: max(int(len(frames) * most / len(rays)), _FRAMES)]
+    rays = rays[np.isin(frame[rays], some)]
+    return rays if len(rays) <= most else np.sort(rng.permutation(rays)[:most])
+
+
+def _odds(task: _Task, state: State) -> Floats:
+    """Return the log odds (N,) of each landmark over stray rays that meet."""
+    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    return chance_odds(state, task.gate, task.strays, rates)
+
+
+def _existence(task: _Task, state: State) -> Floats:
+    return existence(state, task.gate, task.strays)
 
 
 def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
@@ -146,7 +194,9 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched
         edges = gated_edges(obs, old, task.gate)
-        matched = best_assignment(edges, edges.cost - track_bonus(edges, obs.track, before), obs.frame, task.gate)
+        cost = edges.cost - track_bonus(edges, obs.track, before)
+        cost -= unmatched_costs(state, edges, task.strays, task.gate)
+        matched = best_assignment(edges, cost, obs.frame, 0.0)
         held = np.flatnonzero(matched >= 0)
         position = refine(obs, held, matched[held], old.position, old.noise)
         state = State(obs, state.view, replace(old, position=position), matched)
@@ -160,13 +210,13 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
 def _plausible(task: _Task, state: State) -> Bools:
     """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
     near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
-    return np.asarray((state.ray_count >= task.settings.min_rays) & near)
+    return np.asarray((state.ray_count > 0) & near)
 
 
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:
     if state.count < 2:
         return state
-    target = merge_targets(state, task.gate, across_labels)
+    target = merge_targets(state, task.gate, task.strays, across_labels)
     return state if (target == np.arange(len(target))).all() else _alternate(task, state.merge(target))
 
 
@@ -183,7 +233,7 @@ def _merge_all(task: _Task, state: State) -> State:
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
     """Drop landmarks until all others are likely enough to exist. Also return the probability (N,) that each exists."""
     while True:
-        likely = existence(state, task.gate)
+        likely = _existence(task, state)
         left = _drop(task, state, likely)
         if left.count == state.count:
             return left, likely
