@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.chance import Strays, chance_odds, unmatched_costs
-from objslam.association.detection_rates import detection_rates
-from objslam.association.existence import existence
+from objslam.association.evidence.chance import Strays, chance_odds, total_odds, unmatched_costs
+from objslam.association.evidence.detection_rates import detection_rates
+from objslam.association.evidence.existence import existence
+from objslam.association.evidence.visibility import CameraFrames
 from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
@@ -20,7 +21,6 @@ from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
 from objslam.association.refinement import grouped_sums, refine
 from objslam.association.sparse_search import SparseSearch, discover_sparse
-from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
@@ -82,7 +82,13 @@ def associate_globally(
     view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
-    task = _Task(gate_limit(settings.association.gate), settings.association, Strays.of(obs, view, len(rays.label_names)), settings.triangulation.device, seed)
+    task = _Task(
+        gate_limit(settings.association.gate),
+        settings.association,
+        Strays.of(obs, view, len(rays.label_names)),
+        settings.triangulation.device,
+        seed,
+    )
     if guess is not None:
         association, position = guess
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
@@ -113,7 +119,8 @@ def associate_globally(
     if settings.association.fuse_labels:
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
-    return _result(state, likely, ray)
+    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    return replace(_result(state, likely, ray), log_odds=total_odds(state, task.gate, task.strays, rates))
 
 
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
@@ -149,8 +156,9 @@ def _add_distant(task: _Task, state: State) -> State:
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
-    state = state.keep(narrow | (np.arange(len(narrow)) < known))
-    return state.keep(_odds(task, state) >= _CHANCE_ODDS)
+    first = np.arange(len(narrow)) < known
+    state = state.keep(narrow | first)
+    return state.keep((_odds(task, state) >= _CHANCE_ODDS) | (np.arange(state.count) < known))
 
 
 def _discover_sparse(task: _Task, state: State, turn: int, allowed: Bools) -> State:
@@ -210,7 +218,8 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
 def _plausible(task: _Task, state: State) -> Bools:
     """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
     near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
-    return np.asarray((state.ray_count > 0) & near)
+    ranged = np.bincount(state.owner, np.isfinite(state.obs.range[state.assigned]), state.count) > 0
+    return np.asarray(((state.ray_count > 1) | ranged) & near)
 
 
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:

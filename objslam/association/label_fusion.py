@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from objslam.association.existence import stray_share
+from objslam.association.evidence.existence import stray_share
 from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
 from objslam.core.arrays import Bools

@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.chance import Strays, log_places
-from objslam.association.detection_rates import detection_rates
+from objslam.association.evidence.chance import Strays, log_places
+from objslam.association.evidence.detection_rates import detection_rates
+from objslam.association.evidence.visibility import DetectionHistory
 from objslam.association.gating import gated_edges
 from objslam.association.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
-from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
@@ -130,8 +130,9 @@ def _gains(state: State, gate: float, strays: Strays, pairs: _Pairs, both_seen: 
     one[second] = np.where(duplicate, 0.0, gate)
     two[second] = np.where(duplicate, 0.0, two[second])
     rates = detection_rates(history, state.label, len(state.unassigned))
-    places, _ = log_places(state, strays, rates)
-    price = np.minimum(_OBJECT_COST + 3 * np.log(number[a] + number[b]), 2 * np.maximum(np.minimum(places[a], places[b]), 0.0))
+    places = log_places(state, strays, rates)
+    one_more = 2 * np.maximum(np.minimum(places[a], places[b]), 0.0)  # Where objects are dense, one more is no surprise.
+    price = np.minimum(_OBJECT_COST + 3 * np.log(number[a] + number[b]), one_more)
     saved = np.bincount(pairs.pair, two - one, count) + price
     misses = rates.cost(history.seen, history.expected, state.label)
     stronger = np.where(number[a] >= number[b], state.label[a], state.label[b])

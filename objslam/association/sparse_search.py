@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.chance import Strays, log_volume, ray_odds
+from objslam.association.evidence.chance import Strays, log_volume, ray_odds
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
 from objslam.core.arrays import Bools, Floats, Ints
 
@@ -83,7 +83,8 @@ def _meetings(obs: Observations, search: SparseSearch) -> tuple[Ints, Ints, Floa
 
 def _odds(obs: Observations, search: SparseSearch, points: Floats, rays: Ints) -> Floats:
     """Return the log odds (H,) of points (H, 3) m from a few rays (S, H) each."""
-    total, information, objects = np.zeros(len(points)), np.zeros((len(points), 3, 3)), np.zeros(len(points))
+    total, objects, away = np.zeros((3, len(points)))
+    information = np.zeros((len(points), 3, 3))
     for ray in rays:
         mine = obs.take(ray)
         to = points - mine.origin
@@ -92,13 +93,13 @@ def _odds(obs: Observations, search: SparseSearch, points: Floats, rays: Ints) -
         off2 = np.maximum(distance2 - depth**2, 0.0)
         odds, density = ray_odds(mine, search.strays.take(ray), search.number, off2, distance, 1.0, search.gate)
         total += odds
+        away += distance / len(rays)
         objects += density * search.strays.along(distance, mine.label) / len(rays)
         n = mine.direction
         along = n[:, :, None] * n[:, None, :]
         information += (np.eye(3) - along) / ((mine.sigma * distance) ** 2 + obs.position_sigma**2)[:, None, None]
         information += np.nan_to_num(1 / mine.range_sigma**2)[:, None, None] * along
-    volume, fixed = log_volume(information)
-    return np.where(fixed, total + volume + np.log(np.maximum(objects, 1e-300)), -np.inf)
+    return np.asarray(total + log_volume(information, away) + np.log(np.maximum(objects, 1e-300)))
 
 
 def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch) -> tuple[Floats, Floats, Bools]:
@@ -131,7 +132,8 @@ def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch)
         damping = (_DAMPING * np.trace(information, axis1=1, axis2=2) + 1e-9)[:, None]
         right = weight @ foot + ranged @ end + damping * points
         points = np.linalg.solve(information + damping[:, :, None] * np.eye(3), right[:, :, None])[:, :, 0]
-    volume, fixed = log_volume(information)
-    objects = (taken * density * search.strays.along(distance, obs.label)).sum(axis=1) / np.maximum(taken.sum(axis=1), 1)
+    number = np.maximum(taken.sum(axis=1), 1)
+    objects = (taken * density * search.strays.along(distance, obs.label)).sum(axis=1) / number
+    volume = log_volume(information, (taken * distance).sum(axis=1) / number)
     total = np.where(taken, odds, 0.0).sum(axis=1) + volume + np.log(np.maximum(objects, 1e-300))
-    return points + centre, np.where(fixed & taken.any(axis=1), total, -np.inf), taken
+    return points + centre, np.where(taken.any(axis=1), total, -np.inf), taken

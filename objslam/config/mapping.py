@@ -100,10 +100,11 @@ class AssociationSettings(Section):
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5
-    """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
+    """Existence probability below which an object is dropped. It is computed from detections, missed detections, sizes, and
+    from how unlikely the rays meet by chance. A larger value drops more objects with few rays."""
     min_rays: Annotated[int, Field(ge=2)] = 3
-    """Minimum number of rays of an object, because two rays of different things often intersect. One or two more rays are
-    needed while the poses have not converged. A larger value finds fewer and more certain objects."""
+    """Number of rays on which the start of a joint solve builds: one or two more rays are needed before an object enters a
+    map whose poses have not converged. No number decides whether an object exists, min_existence does."""
     duplicate_distance: Positive = 1.0
     """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
     loop_evidence: Positive = 7.0

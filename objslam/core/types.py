@@ -264,13 +264,15 @@ class Association:
 
     object: (R,) index of the object, or -1. label: (N,) the label of each object, as an index into label_names of the rays.
     label_weights: (N, L) the share of each label among the boxes of each object, None if unknown. existence: (N,) the
-    probability that the object exists, None if unknown.
+    probability that the object exists, None if unknown. log_odds: of all objects over stray boxes, NaN if unknown.
+    Associations of one log with different noise can be compared by it.
     """
 
     object: Ints
     label: Ints
     label_weights: Floats | None = None
     existence: Floats | None = None
+    log_odds: float = np.nan
 
     @property
     def count(self) -> int:

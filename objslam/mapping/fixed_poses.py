@@ -48,6 +48,10 @@ class FixedPoses:
     cameras: tuple[Camera, ...]
     settings: Settings
 
+    def with_settings(self, settings: Settings) -> FixedPoses:
+        """Return the same input with other settings."""
+        return replace(self, settings=settings)
+
     def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
         """Return the same input without shared errors (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.detection_rates import Rates
+from objslam.association.evidence.detection_rates import Rates
+from objslam.association.evidence.visibility import CameraFrames
 from objslam.association.gating import Edges
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import grouped_sums, range_costs, variance
-from objslam.association.visibility import CameraFrames
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import grouped_median
 
 MOST_ODDS = 20.0
@@ -28,9 +28,6 @@ _LOG_RANGE = 4.6
 """The width of the uniform density of ln range if no range is known. It is a factor of 100 in range."""
 _WRONG_RANGE = 0.1
 """The share of correct boxes with a wrong range. A larger share trusts ranges less."""
-_LEAST_INFORMATION = 1e-6
-"""The least ratio between the information along the least and the most certain direction of a position that rays fix. A
-larger ratio needs more parallax."""
 _TRIED = 25
 """The number of shares of strays, and of densities of objects, that are tried. A larger number is more exact."""
 _DENSITIES = (1e-4, 10.0)
@@ -38,6 +35,8 @@ _DENSITIES = (1e-4, 10.0)
 where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
 _PRIOR_STRAYS = 1.0
 """The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
+_LOOK = 1.0
+"""The time, s, after which strays are independent. A larger time drops more of what moves, and of what is seen briefly."""
 _PRIOR = 0.5
 """The prior share of boxes that see an object. A larger share keeps more landmarks with few rays."""
 
@@ -52,8 +51,8 @@ class _Density:
     value: Floats
 
     @classmethod
-    def of(cls, x: Floats, label: Ints, labels: int, noise: Floats) -> "_Density":
-        """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel.
+    def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
+        """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
 
         Few boxes leave gaps between their kernels. So the fewer boxes lie in a kernel, the more a uniform density weighs.
         """
@@ -61,6 +60,8 @@ class _Density:
 
         pad = 2 * float(noise.max(initial=1e-6))
         low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)
+        if reach:
+            low, high = min(low, -reach), max(high, reach)
         width = (high - low) / _BINS
         counts = np.bincount(label * _BINS + _bins(x, low, width), minlength=labels * _BINS).reshape(labels, _BINS)
         number = counts.sum(axis=1)
@@ -107,8 +108,10 @@ class Strays:
         angle = obs.sigma.copy()
         angle[known] = np.hypot(angle[known], obs.position_sigma / obs.range[known])
         noise = np.nan_to_num(grouped_median(angle, obs.label, labels))
-        columns = np.arctan2(x, z), y
-        image = np.prod([_Density.of(c, obs.label, labels, noise).at(c, obs.label) for c in columns], axis=0)
+        wide = min(max(camera.view_angle for camera in view.cameras), np.pi)
+        columns = (np.arctan2(x, z), wide), (y, min(view.solid_angle / (4 * wide), 1.0))
+        each = [_Density.of(column, obs.label, labels, noise, reach).at(column, obs.label) for column, reach in columns]
+        image = each[0] * each[1]
         if not len(known):
             return cls(image, len(view.camera), None, np.zeros(labels))
         noise = np.nan_to_num(grouped_median(obs.range_sigma[known] / obs.range[known], obs.label[known], labels))
@@ -156,37 +159,68 @@ def ray_odds(
 
 
 def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
-    """Return the cost (E,) of a ray without a landmark, instead of each match: -2 ln of the density of strays, relative to
-    the density of the landmark's rays at their peak. It is at most `gate`, so it matters only where strays are dense compared
-    with the noise of the rays."""
+    """Return the cost (E,) of a ray without a landmark, instead of each match.
+
+    It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
+    So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do
+    not count as strays.
+    """
     obs, noise = state.obs.take(edges.ray), state.landmarks.noise[edges.landmark]
     distance = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin, axis=1)
-    number = state.unassigned[obs.label] + state.ray_count[edges.landmark]
+    near = np.bincount(edges.landmark[state.matched[edges.ray] < 0], minlength=state.count)
+    number = np.maximum(state.unassigned[obs.label] - near[edges.landmark], 1.0)
     odds, _ = ray_odds(obs, strays.take(edges.ray), number, np.zeros(len(distance)), distance, noise, gate)
     return np.clip(2 * odds + range_costs(obs, distance), 0.0, gate)
 
 
 def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
-    """Return the log odds (N,) of one object over stray boxes, from the rays of each landmark and the frames without a ray.
+    """Return the log odds (N,) of one object over stray boxes, from the rays of each landmark. Misses do not count.
 
-    One object: its position x is anywhere where boxes of its label are, p(rays) = int p(x) prod p(ray | x) dx by Laplace's
-    method, and it is detected at the rate of its class. Strays: each box has the density of the label's strays.
+    One object: its position x is anywhere where boxes of its label are, and p(rays) = int p(x) prod p(ray | x) dx by
+    Laplace's method. Strays: each box has the density of the label's strays.
     """
-    held, owner, label, number = state.assigned, state.owner, state.label, state.ray_count
+    total, label = _evidence(state, gate, strays, rates), state.label
+    share, density = _likeliest(total, _looks(state), label, *_expected(state, rates))
+    return np.clip(total + np.log(density[label]) - _looks(state) * np.log(share[label]), -MOST_ODDS, MOST_ODDS)
+
+
+def total_odds(state: State, gate: float, strays: Strays, rates: Rates) -> float:
+    """Return the log odds of all landmarks over stray boxes. All boxes that are no object's count as strays."""
+    return float(_evidence(state, gate, strays, rates).sum())
+
+
+def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
+    """Return the log odds (N,) of each landmark if all boxes of its label may be strays."""
+    held, owner, label = state.assigned, state.owner, state.label
     obs, distance = state.obs.take(held), np.maximum(state.distance, 1e-3)
-    noise = state.landmarks.noise[owner]
     off2 = state.deviation**2 * variance(obs, distance, 1.0)
     boxes = state.label_count.sum(axis=0) + state.unassigned
-    odds, _ = ray_odds(obs, strays.take(held), boxes[label][owner], off2, distance, noise, gate)
-    places, fixed = log_places(state, strays, rates)
-    total = np.bincount(owner, odds, state.count) - places
-    total = np.where(fixed, total, -np.inf)
-    looks = rates.mean * np.bincount(label, state.history.expected, len(boxes)) / np.maximum(np.bincount(label, minlength=len(boxes)), 1)
-    share, density = _likeliest(total, number, label, boxes, _PRIOR * boxes / np.maximum(looks, 1.0))
-    return np.clip(total + np.log(density[label]) - number * np.log(share[label]), -MOST_ODDS, MOST_ODDS)
+    odds, _ = ray_odds(obs, strays.take(held), boxes[label][owner], off2, distance, state.landmarks.noise[owner], gate)
+    looks = _looks(state) / np.maximum(state.ray_count, 1)
+    return np.asarray(looks * np.bincount(owner, odds, state.count) - log_places(state, strays, rates))
 
 
-def _likeliest(odds: Floats, number: Ints, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:
+def _looks(state: State) -> Floats:
+    """Return the number (N,) of independent looks at each landmark.
+
+    Strays of one moment are often one thing: an object that moves slowly, or an error that the detector repeats. So a ray
+    counts by the time since the last one, up to 1.
+    """
+    order = np.lexsort((state.obs.frame[state.assigned], state.owner))
+    owner, stamp = state.owner[order], state.view.stamps[state.obs.frame[state.assigned[order]]]
+    since = np.minimum(np.diff(stamp, prepend=-np.inf) / _LOOK, 1.0)
+    return np.bincount(owner, np.where(np.diff(owner, prepend=-1) != 0, 1.0, since), state.count)
+
+
+def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
+    """Return the number (L,) of boxes of each label, and the number of objects (L,) that would give these boxes."""
+    boxes = np.asarray(state.label_count.sum(axis=0) + state.unassigned)
+    landmarks = np.maximum(np.bincount(state.label, minlength=len(boxes)), 1)
+    looks = rates.mean * np.bincount(state.label, state.history.expected, len(boxes)) / landmarks
+    return boxes, _PRIOR * boxes / np.maximum(looks, 1.0)
+
+
+def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:
     """Return the share (L,) of the boxes of each label that are stray, and the factor (L,) on the density of its objects.
 
     Strays and objects are Poisson distributed, with c n of the n boxes and m times the nominal number of objects. Then the
@@ -205,8 +239,8 @@ def _likeliest(odds: Floats, number: Ints, label: Ints, boxes: Ints, objects: Fl
     return np.exp(log_share[share]), np.exp(log_density[density])
 
 
-def log_places(state: State, strays: Strays, rates: Rates) -> tuple[Floats, Bools]:
-    """Return ln of the number (N,) of places that each landmark could have been at, and whether its position is fixed.
+def log_places(state: State, strays: Strays, rates: Rates) -> Floats:
+    """Return ln of the number (N,) of places that each landmark could have been at.
 
     It is the volume in which its rays leave its position, against the density of objects. This density is taken from the
     boxes at its rays: each object is detected in a frame with the rate of its class.
@@ -218,22 +252,23 @@ def log_places(state: State, strays: Strays, rates: Rates) -> tuple[Floats, Bool
     density = density * strays.along(distance, label[owner])
     number = np.maximum(state.ray_count, 1)
     objects = _PRIOR / rates.mean[label] * np.bincount(owner, density, state.count) / number
-    volume, fixed = _volume(state)
-    return -np.log(np.maximum(objects, 1e-300)) - volume, fixed
+    return np.asarray(-np.log(np.maximum(objects, 1e-300)) - _volume(state))
 
 
-def log_volume(information: Floats) -> tuple[Floats, Bools]:
-    """Return ln of the volume (N,) m^3 of a position with this information (N, 3, 3) m^-2, and whether it is finite."""
-    eigen = np.linalg.eigvalsh(information)
-    fixed = eigen[:, 0] > _LEAST_INFORMATION * eigen[:, 2]
-    return 1.5 * np.log(2 * np.pi) - 0.5 * np.log(np.maximum(eigen, 1e-12)).sum(axis=1), fixed
+def log_volume(information: Floats, distance: Floats) -> Floats:
+    """Return ln of the volume (N,) m^3 of a position with this information (N, 3, 3) m^-2. It is never longer than the
+    distance (N,) m from the cameras."""
+    least = 1 / np.maximum(distance, 1e-3) ** 2
+    eigen = np.maximum(np.linalg.eigvalsh(information), least[:, None])
+    return np.asarray(1.5 * np.log(2 * np.pi) - 0.5 * np.log(eigen).sum(axis=1))
 
 
-def _volume(state: State) -> tuple[Floats, Bools]:
+def _volume(state: State) -> Floats:
     obs, held, owner = state.obs, state.assigned, state.owner
     to = state.landmarks.position[owner] - obs.origin[held]
     to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
     along = to[:, :, None] * to[:, None, :]
     weight = np.nan_to_num(1 / obs.range_sigma[held] ** 2)
     each = (np.eye(3) - along) / state.variance[:, None, None] + weight[:, None, None] * along
-    return log_volume(grouped_sums(each.reshape(-1, 9), owner, state.count).reshape(-1, 3, 3))
+    information = grouped_sums(each.reshape(-1, 9), owner, state.count).reshape(-1, 3, 3)
+    return log_volume(information, np.bincount(owner, state.distance, state.count) / np.maximum(state.ray_count, 1))
