@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from peers.drives import drives
 
-from objslam.association.global_association import associate_globally
+from objslam.association.known_poses.global_association import associate_globally
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera

@@ -8,9 +8,9 @@ from typing import Self
 
 import numpy as np
 
-from objslam.association.evidence.visibility import CameraFrames, DetectionHistory, detection_history
 from objslam.association.observations import Observations
 from objslam.association.refinement import BEHIND, normalised_residuals, variance
+from objslam.association.visibility import CameraFrames, DetectionHistory, detection_history
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_CLASS, RAYLEIGH_MEDIAN, grouped_median
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from objslam.association.evidence.visibility import seen_from
 from objslam.association.observations import extents
+from objslam.association.visibility import seen_from
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
@@ -106,9 +106,7 @@ def describe(
                 extent=(float(sizes[j, 0]), float(sizes[j, 1])) if np.isfinite(sizes[j]).all() else None,
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, rays.label_names),
-                existence=None
-                if association.evidence.existence is None
-                else round(float(association.evidence.existence[j]), 4),
+                existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
             )
         )

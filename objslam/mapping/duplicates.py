@@ -42,7 +42,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
         into[drop], taken[i], taken[j] = keep, True, True
     kept = np.flatnonzero(into == np.arange(association.count))
     number = np.searchsorted(kept, into)
-    weights, existence = association.label_weights, association.evidence.existence
+    weights, existence = association.label_weights, association.existence
     return Association(
         object=np.append(number, -1)[association.object],  # -1 indexes the last
         label=association.label[kept],

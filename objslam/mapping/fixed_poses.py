@@ -60,7 +60,7 @@ class FixedPoses:
 
     def associate(self, more: Floats | float = 0.0) -> Association:
         """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
-        from objslam.association.global_association import associate_globally
+        from objslam.association.known_poses.global_association import associate_globally
         from objslam.graph.fixed_pose_triangulation import pose_noise
 
         settings = self.settings

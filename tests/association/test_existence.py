@@ -8,14 +8,14 @@ from association_scenes import drive, rays_of_boxes, watch
 from scipy.special import comb
 from scipy.stats import betabinom
 
-from objslam.association.evidence.chance import Strays, chance_odds
-from objslam.association.evidence.detection_rates import Rates, _beta_binomial, detection_rates
-from objslam.association.evidence.existence import existence, prior_odds, rest_odds, size_odds
-from objslam.association.evidence.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
+from objslam.association.known_poses.chance import Strays, chance_odds
+from objslam.association.known_poses.detection_rates import Rates, _beta_binomial, detection_rates
+from objslam.association.known_poses.existence import existence, prior_odds, rest_odds, size_odds
+from objslam.association.known_poses.merging import overlap
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.merging import overlap
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.association.observations import extents, observe
+from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Association
 from objslam.simulation import DriveSettings, make_camera

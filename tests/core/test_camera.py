@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from objslam.association.evidence.visibility import CameraFrames, _in_image
+from objslam.association.visibility import CameraFrames, _in_image
 from objslam.core.camera import Camera, in_field, in_view, project, undistort
 from objslam.live.mapper.landmark_table import LandmarkTable
 from objslam.live.mapper.landmark_table import in_view as landmarks_in_view

@@ -1,8 +1,9 @@
 """A Markov random field over crossings of rays, as a peer: Krylov, Kenny and Dahyot, Automatic Discovery and Geotagging of
 Objects from Street View Imagery, Remote Sensing 2018. Written from the paper, with its weights.
 
-Each crossing of two rays is a site, on or off. The energy of a ray is what its crossings miss its depth by, and how far they
-lie apart. A ray without a crossing costs a constant. Iterated conditional modes flip random sites. What is left is clustered.
+Each crossing of two rays is a site, on or off. The energy of a ray is what its crossings miss its depth by, and how far
+they lie apart. A ray without a crossing costs a constant. Iterated conditional modes flip random sites. Then crossings that
+are on are clustered.
 """
 
 from __future__ import annotations

@@ -8,10 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from objslam.association.evidence.visibility import thinned
 from objslam.association.registration.joint_frames import JointFrames, Measured, solve_frames
 from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import register
+from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom

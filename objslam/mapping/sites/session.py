@@ -9,8 +9,8 @@ from typing import Self
 
 import numpy as np
 
-from objslam.association.evidence.visibility import CameraFrames, count_looks
 from objslam.association.observations import Observations
+from objslam.association.visibility import CameraFrames, count_looks
 from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.io.objects_json import read_objects

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.evidence.detection_rates import Rates
-from objslam.association.evidence.visibility import CameraFrames
 from objslam.association.gating import Edges
+from objslam.association.known_poses.detection_rates import Rates
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import grouped_sums, range_costs, variance
+from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import grouped_median
 
@@ -110,8 +110,9 @@ class Strays:
         noise = np.nan_to_num(grouped_median(angle, obs.label, labels))
         wide = min(max(camera.view_angle for camera in view.cameras), np.pi)
         columns = (np.arctan2(x, z), wide), (y, min(view.solid_angle / (4 * wide), 1.0))
-        each = [_Density.of(column, obs.label, labels, noise, reach).at(column, obs.label) for column, reach in columns]
-        image = each[0] * each[1]
+        image = np.ones(len(obs))
+        for column, reach in columns:
+            image *= _Density.of(column, obs.label, labels, noise, reach).at(column, obs.label)
         if not len(known):
             return cls(image, len(view.camera), None, np.zeros(labels))
         noise = np.nan_to_num(grouped_median(obs.range_sigma[known] / obs.range[known], obs.label[known], labels))
@@ -123,9 +124,9 @@ class Strays:
         """Select rays."""
         return replace(self, image=self.image[rays])
 
-    def per_frame(self, number: Floats) -> Floats:
+    def per_frame(self, number: Floats | float) -> Floats:
         """Return the mean number of strays in a frame. At least one stray is taken to be in the log."""
-        return np.maximum(number, 1.0) / max(self.frames, 1)
+        return np.asarray(np.maximum(number, 1.0) / max(self.frames, 1))
 
     def along(self, distance: Floats, label: Ints) -> Floats:
         """Return the density, m^-1, of distances (E,) m at which there are boxes of a label (E,)."""
@@ -137,7 +138,7 @@ class Strays:
 
 
 def ray_odds(
-    obs: Observations, strays: Strays, number: Floats, off2: Floats, distance: Floats, noise: Floats | float, gate: float
+    obs: Observations, strays: Strays, number: Floats | float, off2: Floats, distance: Floats, noise: Floats | float, gate: float
 ) -> tuple[Floats, Floats]:
     """Return the log odds (..., R) that each ray sees its point over being stray, and the density of strays, m^-2.
 
@@ -217,7 +218,7 @@ def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
     boxes = np.asarray(state.label_count.sum(axis=0) + state.unassigned)
     landmarks = np.maximum(np.bincount(state.label, minlength=len(boxes)), 1)
     looks = rates.mean * np.bincount(state.label, state.history.expected, len(boxes)) / landmarks
-    return boxes, _PRIOR * boxes / np.maximum(looks, 1.0)
+    return boxes, np.asarray(_PRIOR * boxes / np.maximum(looks, 1.0))
 
 
 def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:

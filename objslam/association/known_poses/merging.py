@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.evidence.chance import Strays, log_places
-from objslam.association.evidence.detection_rates import detection_rates
-from objslam.association.evidence.visibility import DetectionHistory
 from objslam.association.gating import gated_edges
-from objslam.association.label_fusion import SIZE_RATIO
+from objslam.association.known_poses.chance import Strays, log_places
+from objslam.association.known_poses.detection_rates import detection_rates
+from objslam.association.known_poses.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
+from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 

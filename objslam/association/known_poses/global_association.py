@@ -9,18 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.evidence.chance import Strays, chance_odds, total_odds, unmatched_costs
-from objslam.association.evidence.detection_rates import detection_rates
-from objslam.association.evidence.existence import existence
-from objslam.association.evidence.visibility import CameraFrames
 from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
-from objslam.association.hypothesis_search import Search, discover
-from objslam.association.label_fusion import fused_labels
+from objslam.association.known_poses.chance import Strays, chance_odds, total_odds, unmatched_costs
+from objslam.association.known_poses.detection_rates import detection_rates
+from objslam.association.known_poses.existence import existence
+from objslam.association.known_poses.hypothesis_search import Search, discover
+from objslam.association.known_poses.label_fusion import fused_labels
+from objslam.association.known_poses.merging import close_pairs, merge_targets
+from objslam.association.known_poses.sparse_search import SparseSearch, discover_sparse
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
 from objslam.association.refinement import grouped_sums, refine
-from objslam.association.sparse_search import SparseSearch, discover_sparse
+from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile

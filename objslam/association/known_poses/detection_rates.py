@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.evidence.visibility import DetectionHistory
+from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.

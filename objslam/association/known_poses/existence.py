@@ -3,8 +3,8 @@ landmark without an object: rays of different things meet there."""
 
 import numpy as np
 
-from objslam.association.evidence.chance import Strays, chance_odds
-from objslam.association.evidence.detection_rates import detection_rates, weighted_median
+from objslam.association.known_poses.chance import Strays, chance_odds
+from objslam.association.known_poses.detection_rates import detection_rates, weighted_median
 from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.core.arrays import Floats

@@ -1,1 +1,0 @@
-"""What speaks for an object and against it: chance, detections and misses, size and motion."""
