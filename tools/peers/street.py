@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
-from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.simulation import make_camera
@@ -131,9 +130,7 @@ def _log(measured: Floats, yaw: Floats, place: Ints, bearing: Floats, distance: 
             f"camera{number}", width=width, height=200, focal=_FOCAL, position=(0.0, 0.0, 2.0), yaw=turn,
             distortion_model="equidistant", distortion=(0.0,) * 4,
         )  # fmt: skip
-        camera = Camera(
-            **{k: v for k, v in vars(like).items() if k in like.__dataclass_fields__ and k != "sees_size"}, sees_size=False
-        )
+        camera = replace(like, sees_size=False)
         centre = np.column_stack([(width - 1) / 2 - _FOCAL * left, np.full(len(mine), 199 / 2)])
         found = Detections(
             stamps,

@@ -138,7 +138,13 @@ class Strays:
 
 
 def ray_odds(
-    obs: Observations, strays: Strays, number: Floats | float, off2: Floats, distance: Floats, noise: Floats | float, gate: float
+    obs: Observations,
+    strays: Strays,
+    number: Floats | float,
+    off2: Floats,
+    distance: Floats,
+    noise: Floats | float,
+    gate: float,
 ) -> tuple[Floats, Floats]:
     """Return the log odds (..., R) that each ray sees its point over being stray, and the density of strays, m^-2.
 
@@ -210,7 +216,8 @@ def _looks(state: State) -> Floats:
     order = np.lexsort((state.obs.frame[state.assigned], state.owner))
     owner, stamp = state.owner[order], state.view.stamps[state.obs.frame[state.assigned[order]]]
     since = np.minimum(np.diff(stamp, prepend=-np.inf) / _LOOK, 1.0)
-    return np.bincount(owner, np.where(np.diff(owner, prepend=-1) != 0, 1.0, since), state.count)
+    counted = np.where(np.diff(owner, prepend=-1) != 0, 1.0, since)
+    return np.asarray(np.bincount(owner, counted, state.count).astype(np.float64))
 
 
 def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
