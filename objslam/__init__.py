@@ -1,6 +1,6 @@
-"""objslam: object SLAM for mobile robots, which builds a 3D map of objects from detector boxes and planar poses.
+"""objslam: object SLAM for mobile robots, which builds a 3D map of objects from detector boxes and robot poses.
 
-`read` and `run` map a recording, `Log.from_arrays` makes a log of arrays, and `Session` maps while data come.
+`read` and `run` map a recording, `Log.from_arrays` makes a log from arrays, and `Session` maps while data come.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Errors that a user can correct. Each error names the problem, the place and the remedy."""
+"""Errors that a user can correct. Each error names the problem and, if they are known, the place and the remedy."""
 
 import errno
 
@@ -14,7 +14,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """Return a text, or the text of an exception, as one printable line. An exception without text gives its type."""
+    """Return a text, or the text of an exception, as one printable line. An exception without text gives its type name."""
     said = str(text)
     if not said.isprintable():
         said = printable(" ".join(part for line in said.splitlines() if (part := line.strip())))
@@ -30,8 +30,9 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 class ObjslamError(Exception):
-    """A failure that a user can correct. `where` is a file:line, topic or timestamp, and `hint` is the remedy.
-    The message, `where` and `hint` are reduced to one line each, so the text of the error is also one line."""
+    """A failure that a user can correct. `where` is the place, such as a file:line, a topic or a stamp. `hint` is the
+    remedy. The message, `where` and `hint` are reduced to one line each, so the text of the error is also one line.
+    `exit_code` is the exit code of a command that fails with this error."""
 
     exit_code = 1
 

@@ -181,3 +181,11 @@ def test_a_mistyped_setting_is_guessed():
         load_settings(None, ("rays.pixel_sgima=2",))
     with pytest.raises(ConfigError, match=r"no setting nonsense \(`objslam"):
         load_settings(None, ("nonsense=2",))
+
+
+def test_a_file_of_settings_that_is_too_long_is_not_cut(tmp_path):
+    """Bytes count, not letters: the last line was lost behind a comment of two-byte letters."""
+    file = tmp_path / "long.yaml"
+    file.write_text("# " + "é" * 600_000 + "\nseed: 5\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"long.yaml.*longer than 1,048,576 bytes"):
+        load_settings(file, ())

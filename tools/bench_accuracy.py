@@ -1,10 +1,11 @@
-"""How good the maps are, and whether their sigmas say so: simulated drives, and real ones where they are at hand.
+"""Measure the errors of maps, and whether their sigmas are right, on simulated drives and on recordings.
 
     python tools/bench_accuracy.py [--drives 100] [--parts simulated mrclam cube]
 
-simulated: drives of the demo's room, 12 objects each, 5 % false boxes a class, poses as localised (fixed) and from odometry
-alone (joint): the share of the objects whose truth lies inside their 95 % ellipsoid, and the errors beside what the
-covariances promise. mrclam, cube: UTIAS MRCLAM 6 and TUM fr3_cabinet from the folder in OBJSLAM_DATA.
+simulated: drives in the demo's room with 12 objects. Each class has a false box in 5 % of the images. The poses are from a
+localisation (fixed) or from odometry alone (joint). The table has the share of objects whose true position is inside their
+95 % ellipsoid, and the errors beside those that the covariances promise. mrclam, cube: the recordings UTIAS MRCLAM 6 and
+TUM fr3_cabinet, from the folder in OBJSLAM_DATA.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions, read
 
 RADIUS = 2.0
-"""m; labels say who is whom here, so that no error is hidden by calling the object missed."""
+"""The radius of a match, m. Labels identify the objects here, and a large error must not count as a missed object."""
 ELLIPSOID = float(chi2.ppf(0.95, 3))
 CABINET = np.array([-1.520, 0.454])
-"""m; the centre of the depth images fused with the true poses, seen from above."""
+"""The x and y, m, of the cabinet's centre in the depth images, fused with the true poses."""
 
 
 def solved_path(result: pipeline.RunResult) -> Trajectory:

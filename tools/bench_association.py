@@ -1,11 +1,11 @@
-"""How well association finds objects without identities, and how long it takes.
+"""Measure how well association finds objects whose identities are unknown, and how long it takes.
 
     python tools/bench_association.py [--seeds 20] [--parts scenes speed drift mrclam unnamed street] [--picture PNG]
 
-scenes: drives with known poses and truth. speed: growth with the log. drift: from odometry alone, poses and objects
-together. mrclam: UTIAS MRCLAM 6 without identities, from odometry, from the folder in OBJSLAM_DATA. unnamed: the drives of
-peers/drives.py that name their landmarks, against the same drives with the names hidden. street: poles seen from a few places
-with the noise of GPS, beside a Markov random field.
+scenes: simulated drives with known poses. speed: the time and memory for a short and a long log. drift: simulated drives
+from odometry alone, whose poses and objects are estimated together. mrclam: the recording UTIAS MRCLAM 6 without identities,
+in the folder OBJSLAM_DATA. unnamed: drives of peers/drives.py, mapped with and without the names of their landmarks.
+street: poles seen from a few places with the noise of GPS, beside a Markov random field.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ STEP_DRIFT = {
     **{"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0},
     **{"floor_xy": 0.01, "floor_yaw": float(np.radians(0.3))},
 }
-"""The noise of the preset `drift`, a step."""
+"""The odometry noise of one step in the preset `drift`."""
 LOCALIZATION = {"xy": 0.02, "yaw": 0.005}
-"""The noise of the poses that `large` drives with, m and rad."""
+"""The noise of the poses in the preset `large`, m and rad."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,8 @@ def street(seeds: int) -> None:
         for name, told in (("objslam, noise told", True), ("objslam, noise not told", False)):
             result = pipeline.run(scene.log, scene.settings(told), Ledger())
             objects = result.map.resolved()
-            counts, right = street_counts(scene, objects.positions[:, :2])
+            points = np.array([o.position[:2] for o in objects]).reshape(-1, 2)
+            counts, right = street_counts(scene, points)
             rows[name] = rows.get(name, np.zeros(4, dtype=np.int64)) + counts
             if told:
                 said += [(o.existence, i in right) for i, o in enumerate(objects) if o.existence is not None]
@@ -293,7 +294,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--picture", type=Path, help="draw the map of the first drive of `drift` into this PNG")
+    parser.add_argument("--picture", type=Path, help="write a PNG of the map of the first drive of `drift`")
     arguments = parser.parse_args()
     seeds = arguments.seeds
     if "scenes" in arguments.parts:

@@ -1,12 +1,12 @@
-"""How fast bags are read and decoded, and how much memory a large one takes.
+"""Measure how fast bags are read and decoded, and how much memory a large bag takes.
 
     python tools/bench_bags.py [--messages 200000] [--image-gb 1.0] [--folder DIR]
 
-writes one recording of small messages (odometry, transforms, detections) as each kind of bag and prints messages read and
-decoded per second, and how that compares with rosbags' AnyReader, which decodes the same messages and keeps none (reading a
-log also gathers and checks poses and boxes, and builds the tf tree); then writes a bag of raw images and reads it in a
-process of its own, with the images written to files, and prints the most memory that it took. The bags go to a temporary
-folder, or to DIR, and are removed.
+The tool writes one recording of small messages (odometry, transforms, detections) as each kind of bag. It prints how many
+messages per second are read and decoded, and the ratio to AnyReader of rosbags. AnyReader only decodes the messages. objslam
+also collects and checks poses and boxes, and builds the tf tree. Then the tool writes a bag of raw images. A second process
+reads this bag and writes the images to files, and the tool prints the peak memory of the second process. The bags are in a
+temporary folder, in DIR if it is given, and are deleted at the end.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Is the calibration honest? Simulated drives with shared errors drawn from their priors, with and without calibration.
+"""Measure whether the sigmas of the calibration are right, on simulated drives with shared errors drawn from their priors.
 
-The frame of a map is that of the odometry at the first frame that is used. So the odometry begins there without an error.
+Each drive is also solved without calibration. A map begins in the frame of the odometry at the first image with boxes. So
+the odometry of a drive has no error there.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""How far the code travels: which files a box passes through, and how often a call goes from one file to another.
+"""Count the files of the package that a box passes through, and the calls from one file to another on its way.
 
     python tools/bench_calls.py [--most 20]
 
-offline: a log of five frames with one box each, from reading it to the map, poses fixed. live: one message with the boxes
-of a frame, from its push until it is worked in; the median of the second half of a simulated drive. A move is a call of, or
-a return to, a function in another file of the package; fewer moves are easier to follow.
+offline: a log of five frames with one box each, from the reader to the map, with fixed poses. live: one message with the
+boxes of a frame, from its push until the map contains it, as the median over the second half of a simulated drive. A move is
+a call of, or a return to, a function in another file of the package. Code with fewer moves is easier to follow.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def live(moves: Moves) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--most", type=int, default=0, help="also list the most frequent ways from file to file")
+    parser.add_argument("--most", type=int, default=0, help="also list this many of the most frequent pairs of files")
     most = parser.parse_args().most
     box, message = Moves(), Moves()
     offline(box)

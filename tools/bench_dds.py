@@ -1,10 +1,10 @@
-"""A robot in another process, heard over DDS on the loopback interface: losses and delays, against a bare cyclonedds reader.
+"""Measure losses and delays of messages over DDS on the loopback interface, and compare with a bare cyclonedds reader.
 
 python tools/bench_dds.py [--seconds 30] [--sink session|count] [--best-effort]
 
-The robot sends 200 odometry messages and 20 Detection2DArray of 5 boxes a second. `accepted` is the time from just before
-the message is written to when the push has been accepted; the bare reader, on the same topics in a process of its own, at
-the same time, stops its clock when it has the bytes, and decodes nothing.
+A robot in another process sends 200 odometry messages and 20 Detection2DArray of 5 boxes per second. The delay `accepted`
+begins just before a message is written, and ends when its push is accepted. The bare reader runs at the same time in a third
+process, on the same topics. Its delay ends when it has the bytes, which it does not decode.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--domain", type=int, default=77)
-    parser.add_argument("--sink", choices=("session", "count"), default="session", help="count: nothing but a time is kept")
+    parser.add_argument("--sink", choices=("session", "count"), default="session", help="count: only times, without a map")
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--role", choices=("robot", "bare"), help=argparse.SUPPRESS)
     options = parser.parse_args()

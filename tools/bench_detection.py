@@ -1,10 +1,11 @@
-"""What a frame costs around the network: reading, decoding, fitting in, boxes from the outputs, suppression, cache.
+"""Measure the time per frame of each part of a detection: read and decode, fit in, network, boxes from outputs, cache.
 
     python tools/bench_detection.py MODEL.onnx [IMAGE ...] [--frames 100] [--width 640] [--height 480] [--format jpg]
 
-The images are resized and written anew in the given format; without one, a drawn picture with noise stands in. Prints
-milliseconds a frame, median and 95th percentile, of each part; the network's own time is apart. In a run, reading and
-decoding go on in threads of their own beside the network; here all is measured one after the other, on one thread of OpenCV.
+The images are resized, and written in the given format. If no image is given, a drawn picture with noise is used. The tool
+prints the median and the 95th percentile of the time of each part, ms per frame, and of all parts except the network. In a
+run, other threads read and decode images while the network runs. Here, the parts run one after the other, and OpenCV has one
+thread.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from objslam.detection.detect_log import load_frame
 from objslam.errors import LogError
 
 PARTS = ("read and decode", "fit in", "network", "boxes from outputs", "write to cache")
-ENOUGH = 5.0  # ms that everything around the network may take
+ENOUGH = 5.0  # The most time, ms per frame, that all parts except the network should take.
 
 
 def picture(width: int, height: int) -> np.ndarray:
@@ -48,7 +49,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=480)
     parser.add_argument("--format", choices=["jpg", "png"], default="jpg")
-    parser.add_argument("--threads", type=int, default=0, help="of the network")
+    parser.add_argument("--threads", type=int, default=0, help="the number of threads of the network, 0 for one per core")
     parser.add_argument("--min-score", type=float, default=0.25)
     args = parser.parse_args()
     cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""Is wrong input named? Each mistake in a simulated and in a recorded log: what is said, and error against sigma."""
+"""Put each kind of mistake into a simulated log, and with --log into a recorded one, and print what the checks say of it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,15 @@ ROOM = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--log", type=Path, help="a recorded log with localisation or odometry, for the column of real logs")
+    parser.add_argument("--log", type=Path, help="a recorded log with poses, which gets the same mistakes")
     parser.add_argument("--robot", type=int, help="the robot of an MRCLAM folder")
     parser.add_argument("--label", help="the label of the boxes of a TUM RGB-D folder")
     parser.add_argument("--modes", nargs="+", default=["fixed", "joint"], choices=["fixed", "joint"])
-    parser.add_argument("--cases", nargs="+", help="the mistakes, all without this", metavar="NAME")
-    parser.add_argument("--clean", type=int, default=0, metavar="N", help="only N clean simulated logs")
-    parser.add_argument("--map", action="store_true", help="also solve each log, and compare errors with sigmas (minutes)")
+    parser.add_argument("--cases", nargs="+", help="the names of the mistakes, by default all", metavar="NAME")
+    parser.add_argument("--clean", type=int, default=0, metavar="N", help="count false alarms in N logs a mode instead")
+    parser.add_argument(
+        "--map", action="store_true", help="also map each log, and compare errors with sigmas (takes minutes)"
+    )
     options = parser.parse_args()
     if options.clean:
         clean(options.clean, options.modes)

@@ -1,13 +1,14 @@
-"""What every command leaves where the process is killed, the disk fails or is full, or something else goes wrong.
+"""Check what each command leaves on the disk if its process is killed, or if the disk fails or is full.
 
     python tools/bench_faults.py                                # 1,000 kills and 300 errors of the disk, half an hour
     python tools/bench_faults.py --kills 100 --errors 50 --cases convert export
     python tools/bench_faults.py --special                      # small disks, signals, closed pipes, limits
 
-A fault strikes at a call that changes the disk: a write (which is torn), a sync, rename or deletion, a new file or folder.
-It is injected into a forked process (tests/faults.py), so that no fault costs a new interpreter. After each fault the folder
-must hold the old result, the new one or none (tests/fault_cases.py), and the next start of the command must work and leave
-nothing of the fault. The faults of a case are spread evenly over its calls. Exit code 1 if anything is wrong.
+A fault happens at a call that changes the disk: a write (only a part is written), a sync, a rename, a deletion, or a new
+file or folder. tests/faults.py puts it into a forked process, because a new interpreter would take longer. After each fault,
+the folder must have the old result, the new result or none (tests/fault_cases.py). The next start of the command must work,
+and must remove what the fault left. The faults of a case are spread evenly over its calls. The exit code is 1 if anything is
+wrong.
 """
 
 from __future__ import annotations
@@ -57,9 +58,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--errors", type=int, default=300)
-    parser.add_argument("--frames", type=int, default=20, help="the length of the log")
-    parser.add_argument("--cases", nargs="*", default=[], help="only the cases whose names begin so")
-    parser.add_argument("--special", nargs="*", metavar="NAME", help=f"instead, all or some of: {', '.join(SPECIAL)}")
+    parser.add_argument("--frames", type=int, default=20, help="the number of frames in the log")
+    parser.add_argument("--cases", nargs="*", default=[], help="only the cases whose names begin with one of these words")
+    parser.add_argument(
+        "--special", nargs="*", metavar="NAME", help=f"instead of the cases, all or the named ones of: {', '.join(SPECIAL)}"
+    )
     options = parser.parse_args()
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as name:

@@ -1,6 +1,6 @@
-"""Times of the factor graph: the compiled factors against Python's CustomFactor, and how build and solve grow with the log.
+"""Measure how the time to build and solve the factor graph grows with the log, and compare with GTSAM's CustomFactor.
 
-python tools/bench_graph.py              # all of it, a few minutes (most of it the CustomFactor's)
+python tools/bench_graph.py               # everything, a few minutes, most of them for the CustomFactor
 python tools/bench_graph.py --skip-custom
 """
 

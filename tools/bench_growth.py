@@ -1,12 +1,13 @@
-"""How the time of a map from odometry grows with the length of the drive, beside a plain batch solve of GTSAM.
+"""Measure how the time to map from odometry grows with the length of the drive, and compare with a batch solve of GTSAM.
 
-    python tools/bench_growth.py                     # 2 to 60 minutes, a few minutes of time
+    python tools/bench_growth.py                     # drives of 2 to 60 minutes; takes a few minutes
     python tools/bench_growth.py --minutes 2 4 8 --clock 0.2
     python tools/bench_growth.py --check             # exit code 1 if the exponent of CPU time is above 1.10
 
-Simulated drives of a room of 12 m by 9 m with 20 objects of known names, images at 5 Hz, and odometry that drifts. --clock
-delays the camera, so that every turn surprises the growing graph. The batch solve is GTSAM's Levenberg-Marquardt on the same
-bearings and motions in one graph, from the TRUE poses and positions: the least that any start could cost.
+The simulated drives have a room of 12 m by 9 m, 20 objects with known names, images at 5 Hz, and odometry that drifts.
+--clock delays the camera, so that predicted bearings are wrong in every turn. The batch solve is GTSAM's Levenberg-Marquardt
+on the same bearings and motions in one graph. It starts from the true poses and positions, so no other start takes less
+time.
 """
 
 from __future__ import annotations
@@ -112,8 +113,8 @@ def batch_from_truth(log: Log, keyframes: Keyframes, rays: Rays, association: As
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, nargs="+", default=MINUTES)
-    parser.add_argument("--clock", type=float, default=0.0, help="the delay of the camera (s)")
-    parser.add_argument("--calibration", action="store_true", help="estimate the shared errors, too")
+    parser.add_argument("--clock", type=float, default=0.0, help="the delay of the camera, s")
+    parser.add_argument("--calibration", action="store_true", help="also estimate the shared errors")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--check", action="store_true", help=f"fail if the exponent of the mapping is above {HIGHEST}")
     options = parser.parse_args()

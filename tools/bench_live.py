@@ -1,12 +1,13 @@
-"""Whether the map while the robot drives keeps up, agrees with offline, and survives what robots do.
+"""Check that a session keeps up with the robot, agrees with an offline run, and survives kills and disordered messages.
 
     python tools/bench_live.py [--parts realtime same overload kill disorder memory] [--minutes 60]
 
-realtime: 200 Hz odometry and 20 Hz frames of 5 boxes, pushed at that pace until there are 10,000 keyframes (9 minutes).
-same: the final map, and the last one before the end, against offline `run --mode joint` on the same data: ten simulated
-drives, and UTIAS MRCLAM 6 robots 1, 3, 5 from the folder in OBJSLAM_DATA. overload: frames five times as fast as they can be
-worked in. kill: twenty sessions killed with signal 9 at random moments and resumed. disorder: late, repeated and swapped
-messages, a clock that jumps, odometry that starts anew. memory: an hour at 200 Hz and 10 Hz, as fast as possible.
+realtime: odometry at 200 Hz and frames of 5 boxes at 20 Hz, pushed in real time until there are 10,000 keyframes (9
+minutes). same: the last map before the end and the final map, compared with offline `run --mode joint` on the same data. The
+data are ten simulated drives, and robots 1, 3 and 5 of UTIAS MRCLAM 6 from the folder in OBJSLAM_DATA. overload: five times
+as many frames as the session can map. kill: twenty sessions that are killed with signal 9 at random moments, and resumed.
+disorder: late, repeated and swapped messages, a clock that jumps, and odometry that restarts. memory: one hour of odometry
+at 200 Hz and frames at 10 Hz (--minutes), pushed as fast as possible.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""objslam against graphs written by hand, on the same drives with names known: CPU seconds, error and memory.
+"""Compare objslam with hand-written graphs on the same drives with known names: CPU seconds, error and memory.
 
 OBJSLAM_DATA=... python tools/bench_peers.py                 # all drives and all ways to solve them; a few minutes
 OBJSLAM_DATA=... python tools/bench_peers.py --drive woods   # the drives whose name has these letters
 
-Each solve runs in a process of its own. The error is that of the landmarks after an SE(2) alignment with the truth, or,
-where nobody knows the truth, with the solution of the plain GTSAM script. A line says what is left out, and why.
+Each solve runs in a process of its own. The error is the RMSE of the landmarks after an SE(2) alignment with the truth. If
+the truth is unknown, the solution of the plain GTSAM script replaces it. One line for each drive or way that is left out
+says why.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def main() -> None:
     """Print a table for each drive."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drive", default="", help="solve only the drives whose name has these letters")
-    parser.add_argument("--peer", default="", help="solve only by the ways whose name has these letters")
+    parser.add_argument("--peer", default="", help="solve only in the ways whose name has these letters")
     asked = parser.parse_args()
     data = os.environ.get("OBJSLAM_DATA")
     for name, known in drives(Path(data) if data else None).items():

@@ -1,11 +1,12 @@
-"""What the reconstruction costs and how true it is, on the demo's rendered drive.
+"""Measure the error, the time and the memory of the reconstruction, on the demo's rendered drive.
 
     objslam demo -o demo_out
     python tools/bench_reconstruction.py demo_out [--seed 0] [--repeats 3] [--picture docs/reconstruction.png]
 
-Fuses the drive's depth images at the true poses, at those that `fixed` and `joint` solve, and at the odometry's, and prints
-the distance of the surface from the true room. A map from odometry alone has a frame of its own: it is laid onto the room by
-its path first. Then milliseconds a frame, the best and the median of all repeats, and the peak memory of a full grid.
+The tool fuses the depth images of the drive at the true poses, at the poses of the `fixed` and `joint` results, and at the
+poses of the odometry. It prints the distance of each surface from the true room. A map from odometry alone has its own
+frame, so its path is aligned with the true path first. Then the tool prints the time per frame, ms, as the best and the
+median of all repeats, and the peak memory of a full grid.
 """
 
 from __future__ import annotations
@@ -139,9 +140,9 @@ def picture(before: Surface, after: Surface, file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("demo", type=Path, nargs="?", default=Path("demo_out"), help="what `objslam demo` made")
-    parser.add_argument("--seed", type=int, default=0, help="of the demo")
+    parser.add_argument("--seed", type=int, default=0, help="the seed of the demo")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--picture", type=Path, help="PNG of the room at the odometry's and at the solved poses")
+    parser.add_argument("--picture", type=Path, help="write a PNG of the room at the odometry's poses and the solved poses")
     parser.add_argument("--fill", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.fill:

@@ -1,10 +1,11 @@
-"""How often two maps in unknown frames are registered rightly, and how often two different places are taken for one.
+"""Measure how often two maps of one place are registered correctly, and how often maps of different places are accepted.
 
     python tools/bench_registration.py [--pairs 200] [--different 1000] [--folders A B ...]
 
-The maps have 10 to 200 objects of 3 to 10 labels, 30 to 100 % overlap, a fifth of the objects changed, and 5 cm of noise in
-each. `known` is the share that a fit to the true matches brings within 0.1 m and 1 degree: no method can do much better.
---folders registers each of these result folders to the others in place of that.
+The maps have 10 to 200 objects of 3 to 10 labels and noise of 5 cm. They overlap by 30 to 100 %, and a fifth of the objects
+has changed. `right` is the share of pairs that are registered within 0.1 m and 1 degree. `known` is this share for a fit to
+the true matches, so no method can do much better. With --folders, the tool instead registers each of these result folders to
+the others.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""A session that runs for a day: its memory, descriptors, threads, journal and latency, hour by hour.
+"""Measure the memory, descriptors, threads, journal and latency of a session hour by hour for a day.
 
     python tools/bench_soak.py                      # 24 hours of a robot in about 40 minutes of CPU
     python tools/bench_soak.py --hours 2 --laps 40
     python tools/bench_soak.py --check              # exit code 1 if memory or latency grow after the second hour
 
-A robot drives the same laps of a room with 30 objects again and again, so that every lap closes a loop. Its odometry drifts
-and comes at 200 Hz, its boxes at 20 Hz. The session gets the messages as fast as it takes them, never faster than it can,
-and keeps a journal. --odometry and --frames set lower rates, which cost less time. Memory is the resident size of the
-process. Latency is the time from the push of a frame to the map that has it, median and 99 %.
+A robot drives the same lap of a room with 30 objects again and again, so every lap closes a loop. Its odometry drifts and
+comes at 200 Hz, and its boxes at 20 Hz. A frame is pushed as soon as the session has mapped the frame before, and the
+session keeps a journal. --odometry and --frames set lower rates, which take less time. Memory is the resident size of the
+process. Latency is the time from the push of a frame until the map contains it, as the median and the 99th percentile.
 """
 
 from __future__ import annotations
@@ -139,11 +139,11 @@ def judge(rows: list[Hour]) -> list[str]:
 def main() -> int:
     """Print the table, and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--hours", type=float, default=24.0, help="of the robot")
-    parser.add_argument("--odometry", type=float, default=200.0, help="poses a second")
-    parser.add_argument("--frames", type=float, default=20.0, help="frames a second")
-    parser.add_argument("--every", type=float, default=1.0, help="hours between two rows")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after so many CPU seconds")
+    parser.add_argument("--hours", type=float, default=24.0, help="the hours that the robot drives")
+    parser.add_argument("--odometry", type=float, default=200.0, help="the rate of the odometry, poses per second")
+    parser.add_argument("--frames", type=float, default=20.0, help="the rate of the camera, frames per second")
+    parser.add_argument("--every", type=float, default=1.0, help="the hours of the robot between two rows")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this number of CPU seconds")
     parser.add_argument("--check", action="store_true", help="exit code 1 if something grows")
     options = parser.parse_args()
     log, rows = lap(options.odometry, options.frames), list[Hour]()

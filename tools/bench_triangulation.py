@@ -1,9 +1,10 @@
-"""How fast objects are triangulated: one batch against a loop of scipy over the objects, in the same run.
+"""Measure how fast objects are triangulated, and compare one batch with loops of scipy and torch over the objects.
 
     python tools/bench_triangulation.py [--objects 1000] [--rays 50] [--outliers 0.2] [--device cpu]
 
-prints CPU time and rays per second of Eq. 1 in one batch, of scipy (BFGS with the analytic gradient, from the same start),
-and of Adam (torch), their ratios and how far apart the solutions are; then of the whole triangulation.
+The tool solves Eq. 1 in one batch, by scipy (BFGS with the analytic gradient), and by Adam of torch, all from the same
+start. It prints the CPU time and the rays per second of each and of the whole triangulation, the ratios of the times, and
+the distances between the solutions.
 """
 
 from __future__ import annotations
@@ -69,11 +70,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--objects", type=int, default=1000)
     parser.add_argument("--rays", type=int, default=50)
-    parser.add_argument("--outliers", type=float, default=0.2, help="share of rays that point elsewhere")
-    parser.add_argument("--noise", type=float, default=0.006, help="rad")
+    parser.add_argument("--outliers", type=float, default=0.2, help="the share of rays that do not point at their object")
+    parser.add_argument("--noise", type=float, default=0.006, help="the noise of the directions, rad")
     parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
-    parser.add_argument("--repeat", type=int, default=5, help="the fastest of so many runs counts (scipy: one run)")
-    parser.add_argument("--adam", type=int, default=10, help="the objects that the loop of Adam solves; its time is scaled")
+    parser.add_argument("--repeat", type=int, default=5, help="the runs, of which the fastest counts (scipy, Adam: one run)")
+    parser.add_argument("--adam", type=int, default=10, help="the number of objects for Adam; its time is scaled to all")
     args = parser.parse_args()
     rays = scene(args.objects, args.rays, args.outliers, args.noise)
     number = args.objects * args.rays

@@ -1,10 +1,10 @@
-"""What looking costs: the recording of a run, against logging each entity of each keyframe one by one; and a session with a
-viewer that is frozen or killed, against the same session with none.
+"""Measure what the viewer costs a run and a session.
 
 python tools/bench_viewer.py [LOG ...] [--mode joint] [--set KEY=VALUE ...] [--skip-live]
 
-Without a LOG: a simulated drive of 15 minutes, without images. Prints, for each, time and bytes a keyframe, the best of some
-repetitions.
+The time and the size of the recording of a run, per keyframe, are compared with logging each entity of each keyframe one by
+one. Each time is the best of several repetitions. Without a LOG, the run maps a simulated drive of 15 minutes without
+images. Then a session with a viewer that works, hangs or is killed is compared with a session without a viewer.
 """
 
 from __future__ import annotations

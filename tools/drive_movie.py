@@ -1,10 +1,10 @@
-"""An animated picture of a drive while a session maps it: the camera's image, and the map as it is known at that moment.
+"""Make an animated picture of a drive that a session maps: the image of the camera, and the map at that moment.
 
     objslam demo
     python tools/drive_movie.py demo_out/log demo_out/joint -o docs/drive.webp
 
-The session gets the odometry and the boxes one after the other, and nothing later. The room behind the map is the
-reconstruction of the finished run, for orientation. The last pictures show the map after the last solve.
+At each moment, the session has only the odometry and the boxes up to this moment. The room behind the map is the
+reconstruction of the finished run, for orientation. The last picture shows the map after the last solve.
 """
 
 from __future__ import annotations
@@ -210,10 +210,10 @@ def draw_side(moment: Moment, begin: float, image: np.ndarray, colours: Colours)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("log", type=Path, help="a log with images and odometry")
-    parser.add_argument("result", type=Path, help="the folder of its run from odometry, with boxes and a reconstruction")
+    parser.add_argument("result", type=Path, help="the result of its run from odometry, with boxes and a reconstruction")
     parser.add_argument("-o", "--out", type=Path, default=Path("drive.webp"))
-    parser.add_argument("--every", type=int, default=2, help="a picture every so many frames")
-    parser.add_argument("--quality", type=int, default=60, help="of the pictures, up to 100")
+    parser.add_argument("--every", type=int, default=2, help="the number of frames per picture")
+    parser.add_argument("--quality", type=int, default=60, help="the quality of the pictures, up to 100")
     args = parser.parse_args()
     for name in (DETECTIONS, SURFACE):
         if not (args.result / name).is_file():

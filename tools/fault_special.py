@@ -1,4 +1,4 @@
-"""What else goes wrong beside the calls of the disk: small disks, limits, foreign folders, signals, closed pipes.
+"""Faults that are not at one call of the disk: small disks, limits, folders of other users, signals, closed pipes.
 
 Each function takes a folder for its files, and returns one line for each thing that is wrong.
 """

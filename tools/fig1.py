@@ -1,9 +1,9 @@
-"""The experiment of Staszak & Belter's Fig. 1: lines that meet at (0, 0, 1) among random ones, Eq. 1 alone and consensus.
+"""Repeat the experiment of Staszak & Belter's Fig. 1 with Eq. 1 alone and with consensus.
 
     python tools/fig1.py [--seeds 200] [--noise 0.002] [-o docs/fig1.png]
 
-prints the median distance (m) of the solution from the meeting point, over seeds, for 0, 7, 20 and 40 random lines; with -o
-it draws one seed of the first three, in 3D.
+7 noisy lines meet at (0, 0, 1), among 0, 7, 20 or 40 random lines. The tool prints the median distance, m, of the solution
+from the meeting point over all seeds. With -o, it also draws one seed with 0, 7 and 20 random lines in 3D.
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ def draw(noise: float, seed: int, file: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--noise", type=float, default=0.002, help="rad")
-    parser.add_argument("-o", "--out", type=Path, help="PNG with a picture of one seed")
-    parser.add_argument("--seed", type=int, default=0, help="the one in the picture")
+    parser.add_argument("--noise", type=float, default=0.002, help="the noise of the directions, rad")
+    parser.add_argument("-o", "--out", type=Path, help="write a PNG of one seed")
+    parser.add_argument("--seed", type=int, default=0, help="the seed in the picture")
     args = parser.parse_args()
     if args.out:
         draw(args.noise, args.seed, args.out)

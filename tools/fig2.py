@@ -1,11 +1,11 @@
-"""The paper's Fig. 2 from a result: the reconstruction, objects as black rings, their rays in blue, Eq. 1's cost around one.
+"""Draw the paper's Fig. 2 from a result: the reconstruction, objects as black rings, blue rays, and the cost of Eq. 1.
 
     objslam demo
     python tools/fig2.py demo_out/fixed --object 0 -o docs/fig2.png
 
-The left picture is the room; the right one is close to the chosen object: the heat map is the mean distance of its rays to
-each point of the slices through Eq. 1's minimum (a cross), hot where they agree. A result has a reconstruction where its log
-has depth images.
+The left picture shows the room, and the right picture the chosen object. The heat map is the mean distance of the object's
+rays from each point of two slices through the minimum of Eq. 1 (a cross). It is hot where the rays agree. A result has a
+reconstruction if its log has depth images.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def draw_slice(picture: Picture, s: FieldSlice, norm: Normalize) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("result", type=Path, help="a result folder with reconstruction.ply")
-    parser.add_argument("--object", type=int, help="id; the one with the most rays if not given")
+    parser.add_argument("--object", type=int, help="the id of the object, by default the object with the most rays")
     parser.add_argument("-o", "--out", type=Path, default=Path("fig2.png"))
     args = parser.parse_args()
     objects, rays = load_map(args.result).resolved(), load_rays(args.result)

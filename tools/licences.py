@@ -1,11 +1,11 @@
-"""The packages that objslam needs to run, each with its version and licence, as a page and as a bill of materials.
+"""Write the packages that objslam needs to run, with their versions and licences, as a page and as a bill of materials.
 
     python tools/licences.py                  # writes docs/licences.md
     python tools/licences.py --sbom sbom.json # also a CycloneDX 1.5 file
 
-All of it comes from the metadata of what is installed; nothing is fetched. The packages are those that pyproject.toml names
-without an extra or in the extras open3d, torch and dds, and those that they need, and so on. Run it in the environment that
-tools/setup.sh made. Where the metadata name no licence, the page says so.
+All data come from the metadata of the installed packages, and nothing is downloaded. The packages are the dependencies of
+objslam and of its extras open3d, torch and dds in pyproject.toml, and all packages that these need. Run the tool in the
+environment that tools/setup.sh made. If the metadata name no licence, the page says so.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction without a screen or a GPU: rays cast onto the mesh, with lines, rings and slices over it."""
+"""Draw pictures of a reconstruction without a screen or a GPU, by casting rays, with lines, rings and slices over it."""
 
 from __future__ import annotations
 

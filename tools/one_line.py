@@ -1,4 +1,4 @@
-"""The way in which tools end that read what a user names: an error that a user can mend is one line, as in `objslam`."""
+"""The end of a tool that reads files of a user. An error that the user can correct is one line, as in `objslam`."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Train the SSD that ships with the package on rendered images, from nothing to objslam/models/ssd7.onnx.
+"""Train the SSD that comes with the package on rendered images, and export it to objslam/models/ssd7.onnx.
 
-python tools/train_detector.py render --out DATA            images (resumable)
-python tools/train_detector.py train --data DATA --out RUN  checkpoints (resumable), log with mAP
+python tools/train_detector.py render --out DATA            # write images (resumable)
+python tools/train_detector.py train --data DATA --out RUN  # write checkpoints and a log with mAP (resumable)
 python tools/train_detector.py export --run RUN --data DATA --onnx objslam/models/ssd7.onnx
-python tools/train_detector.py measure --data DATA          a model on the held-out images (after render --train 0)
+python tools/train_detector.py measure --data DATA          # measure a model on the held-out images of `render`
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def main() -> None:
     render.add_argument("--train", type=int, default=1920)
     render.add_argument("--held-out", type=int, default=400)
     render.add_argument("--seed", type=int, default=7)
-    training = commands.add_parser("train", help="train, or go on training from the last checkpoint")
+    training = commands.add_parser("train", help="train from the start, or from the last checkpoint if there is one")
     training.add_argument("--data", type=Path, required=True)
     training.add_argument("--out", type=Path, required=True)
     training.add_argument("--steps", type=int, default=1600)

@@ -1,4 +1,4 @@
-"""Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names its row."""
+"""Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names the row."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -48,7 +48,7 @@ def as_poses(values: ArrayLike) -> Floats:
 
 
 def as_pose(values: ArrayLike) -> Floats:
-    """Return one pose (4, 4) from a row or a matrix, as `as_poses` takes them."""
+    """Return one pose (4, 4) from a row or a matrix, as `as_poses` takes them. ValueError as there."""
     return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
 
 
@@ -71,7 +71,10 @@ def as_boxes(values: ArrayLike, where: str) -> Floats:
 
 
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
-    """Return one number for each box (M,) from one list for each frame. Without `values`, each number is `unknown`."""
+    """Return one number for each box (M,) from one list for each frame. Without `values`, each number is `unknown`.
+
+    counts: the number of boxes of each frame. ValueError with `name` if the lists have other lengths.
+    """
     if values is None:
         return np.full(sum(counts), unknown)
     lists = [np.asarray(one, dtype=np.float64).reshape(-1) for one in values]

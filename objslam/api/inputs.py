@@ -126,7 +126,7 @@ class Log(types.Log):
         return cls(name, views, _path(odometry), _path(localization))
 
     def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
-        """Return the log with other boxes. They are for its only camera, or there are detections for each camera name.
+        """Return the log with other boxes: the detections of its only camera, or those of each camera by name.
 
         ValueError if the given names differ from the names of the cameras.
         """

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from objslam.mapping.localization import PriorMap
 
 Given = Settings | Mapping[str, Any] | str | PathLike[str] | None
-"""Settings as a user gives them: a mapping of changes, the name of ready settings, a YAML file, or None for the defaults."""
+"""Settings as a user gives them: `Settings`, a mapping of changes of the defaults, the name of ready settings, a YAML file,
+or None for the defaults."""
 
 _LOG = logging.getLogger("objslam")
 
@@ -61,16 +62,16 @@ def run(
 
     Args:
         log: what `read` or `Log.from_arrays` returned. It is not changed.
-        settings: changes of the defaults, as {"mode": "joint", "rays.pixel_sigma": 2}; or a YAML file, or the name of ready
-            settings such as "odometry".
+        settings: a `Settings`, changes of the defaults such as {"mode": "joint", "rays.pixel_sigma": 2}, a YAML file, or the
+            name of ready settings such as "odometry".
         detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
-        map: the map of another day, or its file or result folder. If the drive is found in it, the result is in its frame,
-            and its objects count as priors. `Result.localised` says whether.
+        map: the map of another day, or its file or result folder. If the drive is found in this map, the result is in the
+            frame of the map, and the objects of the map count as priors. `Result.localised` says whether it was found.
         progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
         changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
         LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.
-        DetectorError: the model cannot be used. TypeError: `log` is no log.
+        DetectorError: the model cannot be used. OutputError: `map` cannot be read. TypeError: `log` is no log.
     """
     if not isinstance(log, types.Log):
         raise TypeError(f"run needs a log, as `objslam.read(path)` returns it, got {type(log).__name__}")

@@ -102,7 +102,7 @@ class Result:
 
     @property
     def views(self) -> Views | None:
-        """Where each image was taken, which tells what could have been seen. None for a result of an older version."""
+        """Where each image was taken, which tells what was in view. None for a session, or a result of an older version."""
         from objslam.results import read
 
         if self._run is None:

@@ -11,7 +11,7 @@ from typing import Any, Self
 from numpy.typing import ArrayLike
 
 from objslam.api.array_input import as_pose
-from objslam.api.mapping import Given, settings_of
+from objslam.api.mapping import Given, prior_map, settings_of
 from objslam.api.result import Result
 from objslam.core.arrays import Floats
 from objslam.core.snapshot import Snapshot
@@ -33,9 +33,11 @@ class Session(LiveSession):
             print(session.snapshot().map)
             result = session.result()
 
-    settings: as in `objslam.run`; the mode is always joint. journal: a file that keeps every accepted message, so that a
-    killed program loses nothing. resume: whether to continue an existing journal. patient: whether old frames are accepted
-    too. It is for a program that waits for the session (`wait`) now and then, such as a replay.
+    settings, changes: as in `objslam.run`. The mode is always joint. journal: a file that keeps every accepted message, so
+    that a killed program loses nothing. resume: whether to continue an existing journal. name: of the log, in the result.
+    patient: whether frames of any age are accepted, and the session waits for calibrations. It is for a program that waits
+    for the session (`wait`) now and then, such as a replay. map: the map of another day, or its file or result folder. Once
+    the session is found in it, `snapshot().in_map` says so, and snapshots and result are in its frame.
     """
 
     def __init__(
@@ -46,10 +48,12 @@ class Session(LiveSession):
         resume: bool = False,
         name: str = "live",
         patient: bool = False,
+        map: ObjectMap | str | PathLike[str] | None = None,
         **changes: Any,
     ) -> None:
         chosen = settings_of(settings, {**changes, "mode": "joint"})
-        super().__init__(chosen, None if journal is None else Path(journal), resume, name, patient)
+        known = None if map is None else prior_map(map)
+        super().__init__(chosen, None if journal is None else Path(journal), resume, name, patient, known)
 
     def __enter__(self) -> Self:
         return self.start()
@@ -58,7 +62,8 @@ class Session(LiveSession):
         self.abort()
 
     def push_odometry(self, stamp: float, odom_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base at a stamp, s: x, y, yaw, or x, y, z, qx, qy, qz, qw, or (4, 4), in m and rad."""
+        """Push odom_T_base at a stamp, s: x, y, yaw, or x, y, z, qx, qy, qz, qw, or (4, 4), in m and rad. The covariance has
+        no effect: the drift comes from the settings."""
         return super().push_odometry(stamp, _pose(odom_T_base), covariance)
 
     def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
@@ -66,11 +71,12 @@ class Session(LiveSession):
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot, as `push_odometry` takes a pose."""
+        """Push base_T_camera of a camera that moves on the robot, from a stamp, s, on, as `push_odometry` takes a pose."""
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:
-        """Return the present map, path and counts. It takes milliseconds."""
+        """Return the present map, path and counts, usually in milliseconds. It is the last snapshot if the session has
+        stopped or is busy for 5 s."""
         found = super().snapshot()
         return replace(found, map=ObjectMap(found.map.objects, found.map.frame))
 

@@ -36,7 +36,7 @@ def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
 def diff(a: Given, b: Given) -> Comparison:
     """Compare a map with the map of a later session: which objects are confirmed, moved, gone, new, and unseen.
 
-    The later session must be a result: a map alone does not say what was in view, so that none of its objects is gone. If
+    The later session should be a result. A map alone does not say what was in view, so no object could be called gone. If
     the registration is refused, there are no changes, and `reason` says why. OutputError if a path cannot be read.
     """
     return compare(_session(a, "the first map"), _session(b, "the other map"))
@@ -48,7 +48,7 @@ def load_session(path: Path) -> Session:
 
 
 def warnings_of(sessions: Sequence[Session], islands: Sequence[Island]) -> list[str]:
-    """Return what a user is to know of a merge: sessions that stay apart, and results that already contain a map."""
+    """Return the warnings of a merge: sessions that stay apart, and results of runs that were localised in a map."""
     found = []
     if len(islands) > 1:
         apart = "; ".join(", ".join(sessions[s].name for s in one.sessions) for one in islands)

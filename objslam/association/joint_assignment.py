@@ -72,9 +72,10 @@ def _is_unambiguous(pairings: Pairings, allowed: Bools) -> bool:
 
 
 def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
-    """Return the hypothesis with the pairings `which` (n,), None if it is better without one of them.
+    """Return the hypothesis that has all pairings `which` (n,).
 
-    The inverse of the covariance gives each residual's deviation and covariance, given all others. So nothing has to grow.
+    None if one of them is outside the gate given the others, or if the hypothesis is better without it. One inverse of the
+    joint covariance gives the deviation of every residual given all others, so no hypothesis has to grow pairing by pairing.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape

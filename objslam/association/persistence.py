@@ -13,8 +13,8 @@ LIFETIME = 60.0
 """The mean time (days) that an object stays where it is. A larger value needs more misses before an object is gone. At 60
 days, a tenth of the objects change in a week, which is a lived-in place."""
 _OVERLOOKED = 0.03
-"""The probability that a session in which an object is in view misses it, however many looks there are: the map, the light
-or a person is in the way. A larger value needs more misses before an object is gone."""
+"""The probability that a session misses an object in view however often it looks, because of an error of the map, bad light,
+or a person in the way. A larger value needs more misses before an object is gone."""
 _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0

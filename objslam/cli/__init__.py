@@ -70,8 +70,8 @@ def _options(
 
 
 def main() -> NoReturn:
-    """Run a command. Exit codes: 0 success, 1 failure, 2 usage error, 130 Ctrl-C. An error is printed as one line on
-    stderr, or with --debug as a traceback."""
+    """Run a command. Exit codes: 0 success, 1 failure, 2 usage error, 3 the drive is not in the map of --map, 130 Ctrl-C. An
+    error is printed as one line on stderr, or with --debug as a traceback."""
     debug = "--debug" in sys.argv
     try:
         app()

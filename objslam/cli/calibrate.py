@@ -65,7 +65,7 @@ def calibrate(
         report(ledger)
     if not found:
         raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
-    if settings.calibration.file is not None:  # The file is the prior of all logs. The result keeps its other errors.
+    if settings.calibration.file is not None:  # The prior of all logs. Errors that only this file has stay in the result.
         known = load_calibration(Path(settings.calibration.file))
         found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)
@@ -77,7 +77,8 @@ def calibrate(
 
 
 def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: Ledger, show: Progress) -> Calibration:
-    """Return the shared errors of one log. ConfigError if the log lacks the poses, SolveError if the estimation fails."""
+    """Return the shared errors of one log. ConfigError if the log lacks the poses that the settings need. SolveError if the
+    estimation fails."""
     from objslam.errors import ConfigError, SolveError
     from objslam.mapping import pipeline
     from objslam.sources import read

@@ -24,7 +24,7 @@ def demo(
 ) -> None:
     """Simulate a drive. Map it once with fixed poses and once with joint estimation. Compare both maps with the truth.
 
-    The drive is rendered as RGB-D images of a furnished room. The detector shipped with objslam knows its seven objects.
+    The drive is rendered as RGB-D images of a room with seven objects, which the detector shipped with objslam knows.
     """
     from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from objslam.mapping.checks.diagnosis import Diagnosis
     from objslam.mapping.progress import Progress
 
-_ROWS = 8  # The number of hypotheses in the table. The others explain less.
+_ROWS = 8  # The most hypotheses in the table, besides the log as it is. The ones left out explain less.
 
 
 @with_options

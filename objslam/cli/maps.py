@@ -12,14 +12,14 @@ from objslam.cli.console import say
 from objslam.cli.options import Json, Out
 
 NOT_REGISTERED = 1
-"""The exit code for two maps that do not show one place, as far as their objects tell."""
+"""The exit code if the objects of two maps do not prove that both show one place."""
 
 
 def register_results(
     a: Annotated[Path, typer.Argument(metavar="A", help="A result folder, or an objects.json.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The other map.")],
 ) -> None:
-    """Find the transform from map A to map B by the relative positions of their objects. Exit code 1: it is not certain."""
+    """Find the transform from map A to map B by the relative positions of their objects. Exit code 1 if it is uncertain."""
     import numpy as np
 
     from objslam.association.registration.object_maps import reason, register
@@ -82,11 +82,11 @@ def _session_line(told: dict[str, Any]) -> str:
 
 def diff_results(
     a: Annotated[Path, typer.Argument(metavar="MAP_A", help="The earlier map: result folder, site, or objects.json.")],
-    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later one: a result folder, which has what was in view.")],
+    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later one: a result folder, which says what was in view.")],
     picture: Annotated[Path | None, typer.Option("-o", "--out", help="Draw the changes into this PNG file.")] = None,
     json: Json = False,
 ) -> None:
-    """Compare two maps of one place: which objects are confirmed, moved, gone and new.
+    """Compare two maps of one place: which objects are confirmed, moved, gone, new or unseen.
 
     The exit code is 1 if the maps cannot be registered to each other.
     """

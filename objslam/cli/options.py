@@ -77,8 +77,8 @@ CalibrationFile = Annotated[
 
 
 def settings_of(mode: str | None, config: Path | None, set_: list[str] | None, calibration: Path | None = None) -> Settings:
-    """Load the settings from --config, --set, --calibration and --mode. --set overrides the other flags, and these override
-    --config. A calibration file is read too, so that a wrong one fails before a long log is read."""
+    """Load the settings from --config, --set, --calibration and --mode. --set overrides --mode and --calibration. All three
+    override --config. A calibration file is read too, so that a wrong one fails before a long log is read."""
     import yaml
 
     from objslam.config import load_settings

@@ -13,7 +13,7 @@ def report_result(
     log: Annotated[
         Path | None, typer.Option("--log", help="The log with the images. Default: the log that the run read.")
     ] = None,
-    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of the best boxes of each object.")] = 4,
+    crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of each object (its best boxes).")] = 4,
 ) -> None:
     """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline."""
     from objslam.output.report import write_report

@@ -6,16 +6,16 @@ from objslam.config.section import NotNegative, Positive, Section
 
 
 class CalibrationSettings(Section):
-    """Errors that all measurements of a robot share. A number is a prior standard deviation, and 0 holds its error at 0
-    or at the value of `file`."""
+    """Errors that all measurements of a robot share. Each number except max_clock is the prior standard deviation of an
+    error. With 0, the error is not estimated: it is 0, or the value in `file`."""
 
     use: Literal["auto"] | bool = "auto"
-    """auto: estimate all errors in joint mode if the log has odometry, and the errors of cameras in fixed mode if it has a
-    localisation. A camera whose base_T_camera is the identity then has no rotation to estimate, because its poses are the
-    camera's own. true: always estimate. false: never estimate."""
+    """auto: in joint mode, estimate all errors if the log has odometry. In fixed mode, estimate the errors of cameras if the
+    log has a localisation. If base_T_camera is the identity, the poses are those of the camera, so its rotation and place
+    are not estimated. true: estimate them too, and in joint mode also without odometry. false: never estimate."""
     file: str | None = None
-    """a file of `objslam calibrate`. Its values and covariance are the prior of the parameters in it. An error in it that is
-    not estimated has the value of the file."""
+    """a file of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. An
+    error in it that is not estimated has its value from the file."""
     scale: NotNegative = 0.03
     """share by which all distances of the odometry are too long or too short."""
     turn_scale: NotNegative = 0.05

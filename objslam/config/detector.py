@@ -24,12 +24,13 @@ class Detector(Section):
     and scores. yolov8: box, classes (v8, v11, v12). yolov5: box, objectness, classes (v5, v7). end_to_end: corners, score,
     class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
     outputs: dict[Role, str] | None = None
-    """Name of the model output for each role. In ssd, the roles are boxes, labels and scores; without scores, the output of
-    boxes holds them. In detr, they are boxes and logits, or predictions alone. In every other layout, the only role is
-    predictions."""
+    """Name of the model output for each role. In ssd, the roles are boxes, labels and scores. Without scores, they are the
+    fifth column of the boxes. In detr, they are boxes and logits, or predictions alone. In every other layout, the only role
+    is predictions."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
     """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
-    one name per line, or is YAML with the key `names`. It lies beside the settings file or beside the model."""
+    one name per line, or is YAML or JSON with the key `names`. A relative path may start from the folder of the settings
+    file, the working folder or the folder of the model."""
     first_label: Annotated[int, Field(ge=0)] | None = None
     """Class number of the first name. It is 1 if class 0 is the background and the names omit the background."""
     classes: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
@@ -41,7 +42,7 @@ class Detector(Section):
     nms: bool | None = None
     """Apply non-maximum suppression. null applies it to every YOLO layout except end_to_end."""
     max_boxes: Count = 300
-    """Maximum number of boxes per image. The boxes with the highest scores are kept."""
+    """Maximum number of boxes per image, up to 1000. The boxes with the highest scores are kept."""
     size: tuple[Count, Count] | None = None
     """Width and height of the input in px, for a model that accepts any size."""
     resize: Resize | None = None

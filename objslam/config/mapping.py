@@ -51,7 +51,8 @@ class Depth(Section):
 
 
 class Odometry(Section):
-    """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion."""
+    """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion. On a path
+    that is not planar, the noise of x holds for all three axes, and the noise of the heading for all three rotations."""
 
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""
@@ -94,9 +95,9 @@ class AssociationSettings(Section):
     method: Literal["auto", "global", "by_label"] = "auto"
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
-    joint mode, if many rays miss, they are judged again with the noise of the log instead of that in the settings."""
+    joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects but is slow."""
+    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects more slowly."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5
@@ -111,7 +112,7 @@ class AssociationSettings(Section):
     """Minimum log odds that the current landmarks are landmarks of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
     """Minimum lead in log odds of the best place over the second-best place. A smaller lead closes no loop. A larger value
-    separates similar places."""
+    confuses fewer similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 
@@ -123,7 +124,7 @@ class Triangulation(Section):
     consensus: bool = True
     """Use only the rays of an object that agree on one point, so that outliers do not shift the object."""
     hypotheses: Count = 256
-    """Number of ray pairs tested per object."""
+    """Number of ray pairs whose points are tested per object. A larger value tolerates more outliers and is slower."""
     min_parallax_deg: NotNegative = 3.0
     """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
     max_rel_sigma: Positive = 0.5
@@ -162,13 +163,14 @@ class Live(Section):
     """Configure the mapping while the robot drives."""
 
     keyframe_distance: NotNegative = 0.01
-    """Camera motion in m from the last keyframe to a new keyframe. The first ten frames without motion are keyframes too."""
+    """Camera motion in m from the last keyframe to a new keyframe. While the camera stands, the first ten frames are
+    keyframes too."""
     keyframe_angle_deg: NotNegative = 0.5
     """Camera rotation in degrees from the last keyframe to a new keyframe. A frame also becomes a keyframe if it shows a
     label that no keyframe at the current place shows."""
     max_keyframes: Annotated[int, Field(ge=50)] = 1500
-    """Maximum number of keyframes, to bound memory and time. Above it, a quarter of the older keyframes is removed with
-    their boxes, and the odometry before and after each removed keyframe is joined."""
+    """Maximum number of keyframes, to bound memory and time. Above it, older keyframes are removed with their boxes, a
+    quarter of this number at a time. The odometry before and after each removed keyframe is joined."""
     max_lag: Positive = 0.35
     """Maximum waiting time of a frame in s. A frame that waits longer is dropped and counted."""
     max_late: Positive = 2.0
@@ -192,7 +194,7 @@ class Live(Section):
     """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
     of less than 50 times this size, it is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
-    """Maximum number of boxes for repeating the offline association at the end of a session. This takes a few seconds."""
+    """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200
     """Number of keyframes at which the session first estimates the shared errors. It estimates them again whenever the
     number of keyframes has grown by half. 0 estimates them only at the end of the session."""

@@ -8,16 +8,18 @@ Estimated = Literal["auto"] | bool
 
 
 class Noise(Section):
-    """Estimate the noise of measurements from the log. The noise in the other settings is then only the start of the search.
+    """Estimate the noise of measurements from the log. For an estimated noise, the other settings are only a prior of the
+    weight `prior`.
 
-    auto: estimate it in joint mode if the log has odometry and the settings of this noise have their defaults. true:
-    estimate it even if they differ from their defaults. false: never estimate it.
+    auto: in joint mode, estimate the noise if the log has odometry and the settings of this noise have their defaults. true:
+    estimate it even if these settings differ from their defaults. false: never estimate it.
     """
 
     rays: Estimated = "auto"
     """rays.pixel_sigma and rays.box_sigma, with one common factor."""
     ranges: Estimated = "auto"
-    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own."""
+    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own. auto does not
+    estimate it if a camera has its own depth_noise."""
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
     prior: Positive = 10.0

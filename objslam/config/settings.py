@@ -93,7 +93,10 @@ def dump_settings(settings: Settings) -> str:
 def _read_yaml(file: Path) -> dict[str, Any]:
     try:
         with file.open("rb") as stream:
-            data = parse_yaml(stream.read(MAX_YAML + 1).decode("utf-8"))
+            raw = stream.read(MAX_YAML + 1)
+        if len(raw) > MAX_YAML:
+            raise ConfigError(f"the settings are longer than {MAX_YAML:,} bytes", where=str(file))
+        data = parse_yaml(raw.decode("utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read the settings: {error}", where=str(file)) from error
     except yaml.YAMLError as error:

@@ -1,12 +1,12 @@
-"""Parse YAML texts from outside, so that a text that PyYAML cannot construct is an error of YAML as well."""
+"""Parse YAML texts from outside. Any text that PyYAML cannot turn into plain data raises yaml.YAMLError."""
 
 from typing import Any
 
 import yaml
 
 MAX_YAML = 1 << 20
-"""The most bytes of a YAML text. A larger text is refused unread, because PyYAML takes seconds for a megabyte. Settings need
-a few kB."""
+"""The most characters of a YAML text. A longer text is not parsed, because PyYAML takes seconds for a megabyte. Settings
+need a few kB."""
 
 
 def parse_yaml(text: str) -> Any:

@@ -1,7 +1,7 @@
-"""The same code for numpy arrays and torch tensors: functions for their differences, and the choice between the two.
+"""Functions with which the same code runs on numpy arrays and on torch tensors, and the choice between the two libraries.
 
-Code for both calls functions of `module_of(array)`, which is numpy or torch. Both take `axis=` and positional arguments.
-This module imports torch only to make tensors of it.
+Such code calls the functions of `module_of(array)`, which is numpy or torch. Both libraries take `axis=` and positional
+arguments. This module imports torch only for a batch that torch may compute.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ Tensor = Any
 """A numpy array or a torch tensor."""
 
 Backend = Literal["numpy", "cpu", "cuda"]
-"""numpy, or the torch device."""
+"""The library numpy, or the device of torch."""
 
 
 @contextmanager
 def array_backend(device: str, large: bool) -> Iterator[Backend]:
-    """Give the backend for the setting `triangulation.device`, and prepare its library.
+    """Give the backend for a value of the setting `triangulation.device`, and prepare its library.
 
-    A batch that is not `large` runs in numpy, without an import of torch. If torch is not installed, every batch does. The
-    setting "auto" gives a large one to CUDA if torch sees a CUDA device. The setting "cuda" always gives CUDA, and raises
-    ConfigError if torch is not installed or sees no CUDA device.
+    With "auto" and "cpu", a batch that is not `large` runs in numpy, and torch is not imported. A large batch runs in torch:
+    with "auto" on CUDA if torch sees a CUDA device, else on the CPU. If torch is not installed, every batch runs in numpy.
+    The setting "cuda" always gives CUDA, and raises ConfigError if torch is not installed or sees no CUDA device.
 
-    numpy does not warn of divisions by zero, as torch does not. torch gets one thread, because a thread pool waits actively
-    while other processes need the cores. On two cores, one of which was busy, a run took 4 s with one thread and up to 18 s
-    with two.
+    numpy gives no warnings of divisions by zero, overflows and invalid values, because torch gives none. torch gets one
+    thread, because a thread pool waits actively while other processes need the cores. On two cores, one of which was busy, a
+    run took 4 s with one thread and up to 18 s with two.
     """
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:
@@ -77,7 +77,7 @@ def as_tensor(array: Array, backend: Backend) -> Tensor:
 
 
 def as_numpy(array: Tensor) -> Array:
-    """Return a copy of an array, or the array itself, as a numpy array."""
+    """Return an array as a numpy array on the CPU, which may share the memory of the array."""
     return array if isinstance(array, np.ndarray) else np.asarray(array.cpu().numpy())
 
 
@@ -87,7 +87,7 @@ def as_type(array: Tensor, like: Any) -> Tensor:
 
 
 def as_single(array: Tensor) -> Tensor:
-    """Return a copy of an array in single precision."""
+    """Return an array in single precision."""
     return array.astype(np.float32) if isinstance(array, np.ndarray) else array.float()
 
 
@@ -119,7 +119,10 @@ def rows(array: Tensor, index: Tensor) -> Tensor:
 
 
 def group_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Return the sum (N,) or (N, C) of the values (R,) or (R, C) of each group. index: (R,) group of each value."""
+    """Return the sum (N,) or (N, C) of the values (R,) or (R, C) of each group.
+
+    index: (R,) the group of each value. count: the number of groups, N.
+    """
     if not isinstance(values, np.ndarray):
         return values.new_zeros((count, *values.shape[1:])).index_add_(0, index, values)
     if values.ndim == 1:

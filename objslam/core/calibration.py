@@ -15,17 +15,17 @@ OBSERVABLE = 0.8
 """The largest standard deviation of an observable parameter, as a share of the standard deviation of its prior. A larger
 share calls more parameters observable. At this share, the log gives about half as much information as the prior."""
 TRADED_OFF = 0.9
-"""The correlation from which two parameters trade off, so that the log hardly tells them apart. With a larger value, fewer
-pairs trade off."""
+"""The absolute correlation above which two parameters trade off, so that the log hardly tells them apart. With a larger
+value, fewer pairs trade off."""
 
 SCALES = ("scale", "turn_scale", "range_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
 MOST_SCALE = 0.5
-"""The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of half the value
-comes from wrong units, which no calibration should hide."""
+"""The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. Measurements that are
+wrong by half have wrong units, which no calibration should hide."""
 
 UNITS = {"clock": "s", "turn_bias": "rad/s", "yaw": "rad", "tilt": "rad", "roll": "rad", "x": "m", "y": "m", "z": "m"}
-"""The unit of each kind of parameter; the others are shares."""
+"""The unit of each kind of parameter. A kind that is not in this table is a share without a unit."""
 
 
 def kind(name: str) -> str:
@@ -71,9 +71,10 @@ class Calibration:
         return [(self.names[i], self.names[j]) for i, j in zip(first, second, strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the entries of summary.json: each parameter with value, sigma, prior, unit and whether it is observable.
+        """Return the entries of summary.json: each parameter with value, sigma, prior, unit and whether it is observable,
+        the pairs that trade off, and the covariance before and after the solve.
 
-        A later run that is given the file starts from the values and the covariance.
+        A later run with this file in `calibration.file` takes the values and the covariance as its prior.
         """
         sigma, expected = self.sigma, self.expected
         parameters = {
@@ -170,8 +171,8 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def unknown_scales(self) -> frozenset[str]:
-        """The scales of the measured lengths, if each length has one. Then the log cannot tell a factor common to all
-        lengths. Else empty."""
+        """The parameters that scale the measured lengths, if every kind of length has one and no absolute pose is measured.
+        The log cannot determine a factor that all these lengths share. The set is empty in all other cases."""
 
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
@@ -187,5 +188,5 @@ class CalibratedMeasurements(Protocol):
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return the measurements corrected by the errors (P,), and the settings of their noise.
 
-        drift: whether the keyframes' drift is needed; without it the call is quicker and `Keyframes.drift` is not current.
+        drift: whether `Keyframes.drift` is needed. If not, the call is quicker, and the drift is not corrected.
         """

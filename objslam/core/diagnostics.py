@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from objslam.errors import one_line
 
-_EXAMPLES = 3  # The most examples that are kept for each reason. A larger number makes the lines longer.
+_EXAMPLES = 3  # The most places that are kept for each reason. A larger number makes the lines of text longer.
 
 
 @dataclass

@@ -75,7 +75,10 @@ def split_se2(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset."""
+    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset.
+
+    tolerance: the largest difference between two poses, in m or rad.
+    """
     _, remainder = split_se2(poses)
     return bool(len(poses) == 0 or np.abs(remainder - remainder[:1]).max() <= tolerance)
 
@@ -124,8 +127,8 @@ def exp_se3(twist: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles, whether each is so small that it needs a series, and the angles with each small one set to
-    1."""
+    """Return the rotation angles (..., 1, 1) of vectors (..., 3), which of them are small and need a series, and the angles
+    with 1 in place of the small ones."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)

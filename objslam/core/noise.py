@@ -29,7 +29,8 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the noise of the odometry multiplied. `rays_with_noise` does this for rays and ranges."""
+        """Return the settings with the odometry noise multiplied by its factors. The noise of rays and ranges stays, because
+        `rays_with_noise` multiplies it."""
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -43,7 +44,7 @@ class NoiseFactors:
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with the noise of their directions and of their ranges multiplied."""
+        """Return rays with the noise of their directions and of their ranges multiplied by its factors."""
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,
@@ -52,12 +53,14 @@ class NoiseFactors:
         )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
-        """Return whether all factors agree with the factors of `other` within a relative tolerance."""
+        """Return whether all factors agree with the factors of `other` within a relative tolerance. The shrinkage is not
+        compared."""
         mine, its = (np.array(list(one.to_dict(None).values())) for one in (self, other))
         return bool((np.abs(np.log(np.maximum(mine[:-1], 1e-9) / np.maximum(its[:-1], 1e-9))) < tolerance).all())
 
     def to_dict(self, digits: int | None = 4) -> dict[str, float]:
-        """Return the factors by name, rounded to `digits` decimals, as summary.json holds them."""
+        """Return the factors and the shrinkage by name, as in summary.json. If `digits` is not None, they are rounded to
+        that many decimals."""
         return {name: value if digits is None else round(value, digits) for name, value in asdict(self).items()}
 
 
@@ -66,10 +69,11 @@ NOMINAL = NoiseFactors()
 
 
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
-    """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
+    """Return the standard deviations (n,), m, of ranges (n,), m, and those (n,), m, of the bias that all ranges of an object
+    share.
 
-    camera: (n,) the index of each range's camera. If a camera has its own noise of depths, its ranges have this noise. The
-    others have the noise of the settings.
+    camera: (n,) the index of each range's camera. The ranges of a camera with `depth_noise` have this noise. The ranges of
+    the other cameras have the noise of the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]

@@ -47,10 +47,11 @@ class SeenFrom:
 class Life:
     """What several sessions say of one object.
 
-    state: `new` since the last session, `confirmed` by more than one, `moved` since the last session, or `gone`.
-    probability: that the object is still at its position. sessions_expected, sessions_seen: in how many sessions it was in
-    view, and in how many it was found. looks, detections: in how many frames of them it was in view, and in how many it was
-    detected. updated: the time of the last session, s. moved_from: (3,) m, where it was before it moved, None if it did not.
+    state: `new` if one session found it, `confirmed` if a later session found it again, `moved` if a later session found it
+    at another position, or `gone`. probability: that the object is still at its position. sessions_expected, sessions_seen:
+    in how many sessions it was in view, and in how many it was found. looks, detections: in how many camera frames of all
+    sessions it was in view, and in how many it was detected. updated: the time of the last session, s. moved_from: (3,) m,
+    where it was before it moved, None if it did not move.
     """
 
     state: Fate
@@ -68,10 +69,12 @@ class MapObject:
     """One object of the map, with the fields of objects.json.
 
     position: (3,) m. covariance: (3, 3) m^2, None for an unresolved object. rays, frames: how many rays and frames support
-    the object. extent: width and height, m. ray: for an unresolved object, the origin (3,) and direction (3,) of one of its
-    rays. labels: the share of each label among the boxes. existence: the probability that the object exists. labels and
-    existence are None if the run took all boxes of a label as one object. seen_from: from where it was detected, None if
-    unknown. life: what several sessions say of it, None if there was one.
+    the object. parallax_deg: the widest angle between two of these rays. rms_deg: the root mean square of the angles between
+    these rays and the object. first_seen, last_seen: stamps, s. extent: width and height, m, None if unknown. ray: the
+    origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
+    boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
+    label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
+    in the map of a single run.
     """
 
     id: int
@@ -144,7 +147,7 @@ class ObjectMap:
     @overload
     def __getitem__(self, index: slice) -> Self: ...
     def __getitem__(self, index: int | slice) -> MapObject | Self:
-        """Return the object at a place in the map, counted from 0, or a map of a range of them. `by_id` looks for an id."""
+        """Return the object with an index, or a map of the objects of a slice. `by_id` finds an object by its id."""
         return replace(self, objects=self.objects[index]) if isinstance(index, slice) else self.objects[index]
 
     def __repr__(self) -> str:
@@ -196,10 +199,11 @@ class ObjectMap:
     def merge(self, other: ObjectMap) -> Self:
         """Merge another map into this one, and fuse the objects that both maps have.
 
-        Two objects of one label may be the same if the Mahalanobis distance of their positions is below the 99 % quantile.
-        The Hungarian method pairs them one-to-one with the least sum of squares. The two positions of a pair are fused like
-        two independent measurements, weighted by their information. Objects of this map keep their ids. Objects that only
-        the other map has get new ids. ValueError if the two coordinate frames have different names.
+        Two resolved objects of one label may be the same if the Mahalanobis distance of their positions is below the 99 %
+        quantile. The Hungarian method makes as many one-to-one pairs as it can, with the least sum of squared distances. The
+        two positions of a pair are fused like two independent measurements, weighted by their information. Objects of this
+        map keep their ids, and its `gone` stays as it is. Objects that only the other map has get new ids. ValueError if the
+        two coordinate frames have different names.
         """
         if self.frame != other.frame:
             raise ValueError(f"the maps are in two frames, {self.frame!r} and {other.frame!r}: transform one map first")

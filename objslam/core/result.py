@@ -24,7 +24,7 @@ class RunResult:
     camera. surface: the surroundings, None without depth images. surface_before: the same at the poses before the
     estimation, if the settings ask for it. calibration: the shared errors that were estimated, None if none were.
     residual_before: (R,) rad, the residual of the rays as measured, with the shared errors. None if none were estimated.
-    views: all camera frames on the path, also those without a box, at the solved poses. None if nobody asked for them.
+    views: all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for.
     """
 
     map: ObjectMap

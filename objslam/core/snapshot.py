@@ -11,7 +11,7 @@ from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 
-NOT_USED = " not used"  # The suffix of each kind in `Snapshot.counters` whose messages the settings do not use.
+NOT_USED = " not used"  # The end of the name, in `Snapshot.counters`, of a kind of messages that the settings do not use.
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,30 @@ class CameraFrame:
 
 
 @dataclass(frozen=True)
+class InPriorMap:
+    """What a session knows about its place in a prior map.
+
+    objects: how many of its objects were found there, 0 while the place is unknown. line: the same and the evidence, as a
+    sentence.
+    """
+
+    objects: int
+    line: str
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """The state of a session at one moment.
 
     stamp: the time of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns
     them. path: map_T_base of all keyframes. keyframes, rebuilds: how many keyframes there are, and how often the graph was
-    rebuilt. lag: the time, s, from the arrival of the newest message until the map contains it. update: the median and the
-    99th percentile of the time, s, from the push of a message to the updated map. counters: how many messages of each kind
-    were accepted. dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its
-    image. calibration: the shared errors that the session corrects in its measurements, None if it corrects none.
-    map_T_odom: (4, 4) the pose of the odometry's frame in the map at the newest keyframe (REP 105), for the odometry as
-    received. None if the odometry does not cover this keyframe.
+    rebuilt. lag: the time, s, from the arrival of the newest frame in the map until the map contained it. update: the median
+    and the 99th percentile of the lag, s, of recent frames. counters: how many messages of each kind were accepted. dropped:
+    how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image. calibration: the
+    shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom: (4, 4) the pose of the
+    odometry's frame in the map at the newest keyframe (REP 105), for the odometry as received. None if the odometry does not
+    cover this keyframe. in_map: the place in a prior map, None without such a map or before the first search for it. Once
+    the place is known, everything is in the frame of the prior map.
     """
 
     stamp: float
@@ -57,3 +70,4 @@ class Snapshot:
     frames: tuple[CameraFrame, ...] = ()
     calibration: Calibration | None = None
     map_T_odom: Floats | None = None
+    in_map: InPriorMap | None = None

@@ -18,10 +18,10 @@ SAME_POINT_WIDE = 16.266
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-The share 99.73 % is that of a Gaussian number within 3 standard deviations. A larger value tries less likely motions."""
+99.73 % of a Gaussian is within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
 """The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
-cost of a ray that fits no object. A larger deviation gives stray rays more influence on the solution."""
+cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
 OUTLIER_RAY = 4.0
 """The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
@@ -30,7 +30,7 @@ CLIPPED_RAY = 6.0
 this noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
-squared). A larger deviation gives stray rays more influence."""
+squared). A larger deviation gives rays of other things more influence."""
 HUBER_K = 1.345
 """The deviation above which Huber's loss grows linearly. This loss is 95 % efficient on Gaussian noise (Huber, Robust
 Statistics, 1981). A larger deviation is more efficient and less robust."""
@@ -61,7 +61,7 @@ keeps objects near the nominal noise for longer."""
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
     """Return for each group (N,) the factor >= 1 on the nominal noise of its rays, from the median of their deviations (R,).
 
-    index: (R,) the group of each ray. A group with fewer rays than `fewest` has the factor 1.
+    index: (R,) the group of each ray. count: the number of groups, N. A group of fewer than `fewest` rays has the factor 1.
     """
     number = np.bincount(index, minlength=count)
     median = np.where(number >= fewest, grouped_median(deviations, index, count), 0.0)
@@ -71,7 +71,8 @@ def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) 
 def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
     """Return the upper median of the values in each group. A group without values gives NaN.
 
-    index: (R,) the group of each value. Values (R,) give medians (N,). Values (R, D) give a median for each column (N, D).
+    index: (R,) the group of each value. count: the number of groups, N. Values (R,) give medians (N,). Values (R, D) give a
+    median for each column (N, D).
     """
     if values.ndim == 1:
         return grouped_quantile(values, index, count, 0.5)
@@ -79,7 +80,10 @@ def grouped_median(values: Floats, index: Ints, count: int) -> Floats:
 
 
 def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> Floats:
-    """Return for each group (N,) the value at the given share of its sorted values. A group without values gives NaN."""
+    """Return for each group (N,) the value at a share (0 to 1) of its sorted values (R,). A group without values gives NaN.
+
+    index: (R,) the group of each value. count: the number of groups, N.
+    """
     return grouped_quantiles(values, index, count, (share,))[0]
 
 

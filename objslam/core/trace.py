@@ -30,10 +30,10 @@ class Parameters:
 class Iteration:
     """The state after one step of a solver.
 
-    stage: `grow` adds keyframes to the graph, `solve` is one step of Levenberg-Marquardt. cost: the error of the graph, or
-    of its window. path: (k, 3) m, the robot in map at the first k poses, which are in the graph. Images of one stamp share a
-    pose.
-    positions: (N, 3) m, NaN for an object that is not in the graph. parameters: the shared errors, if this step moved them.
+    stage: `grow` adds keyframes to the graph, `solve` is one step of Levenberg-Marquardt. cost: the error of the graph. For
+    `grow`, it is the error of the newest part of the graph. path: (k, 3) m, the robot in map at the first k poses, which are
+    in the graph. Images of one stamp share a pose. positions: (N, 3) m, NaN for an object that is not in the graph.
+    parameters: the shared errors, None if this step does not change them.
     """
 
     stage: Stage

@@ -11,9 +11,9 @@ _SPAN = 0.4
 
 
 def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
-    """Return the speed, m/s, and the turn rate to the left, rad/s, of a path at stamps (K,).
+    """Return the speed (K,), m/s, and the turn rate to the left (K,), rad/s, of a path at stamps (K,), s.
 
-    Both are means over 0.4 s. At an end of the path, the time is shorter. A path of one pose has no speed.
+    Both are means over 0.4 s. At an end of the path, the time is shorter. A path of one pose gives 0 for both.
     """
     begin, end = (np.clip(stamps + half, path.stamps[0], path.stamps[-1]) for half in (-_SPAN / 2, _SPAN / 2))
     before, after = (interpolate(path.stamps, path.poses, at, np.inf)[0] for at in (begin, end))
@@ -25,14 +25,16 @@ def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
 
 
 def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats) -> Trajectory:
-    """Correct a path by its keyframes, which moved at `stamps` (K,) from poses `before` to poses `after` (K, 4, 4)."""
+    """Correct a path by keyframes at `stamps` (K,), s, whose poses the solve changed from `before` to `after` (K, 4, 4)."""
     return Trajectory(path.stamps, correct_poses(path.stamps, path.poses, stamps, before, after))
 
 
 def correct_poses(stamps: Floats, poses: Floats, keyframe_stamps: Floats, before: Floats, after: Floats) -> Floats:
-    """Correct poses (N, 4, 4) at stamps (N,) by keyframes, which moved from poses `before` to poses `after` (K, 4, 4).
+    """Correct poses (N, 4, 4) at stamps (N,), s, by keyframes, whose poses the solve changed from `before` to `after`
+    (K, 4, 4).
 
-    The correction is interpolated between keyframes. Before the first and after the last keyframe it is constant.
+    keyframe_stamps: (K,) s. The correction is interpolated between keyframes. Before the first and after the last keyframe
+    it is constant.
     """
     known, first = np.unique(keyframe_stamps, return_index=True)
     correction = after[first] @ inverse(before[first])

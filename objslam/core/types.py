@@ -112,7 +112,7 @@ class Images:
 class CameraLog:
     """The data of one camera.
 
-    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera holds all the time.
+    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera is valid all the time.
     """
 
     camera: Camera
@@ -170,10 +170,10 @@ class Keyframes:
     base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
     localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
     absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
-    None without odometry. drift: (K, 6, 6) covariance that the odometry has accumulated since its start, in the same
-    coordinate frame. stretch: (K,) the number of the odometry stretch of each keyframe, where gaps split the odometry into
-    stretches. None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no
-    meaning.
+    None without odometry. drift: (K, 6, 6) covariance, rotation first, that the odometry has accumulated since its start, in
+    the same coordinate frame. stretch: (K,) the number of the odometry stretch of each keyframe, where gaps split the
+    odometry into stretches. None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and
+    drift have no meaning.
     """
 
     stamps: Floats
@@ -219,9 +219,10 @@ class Rays:
 
     keyframe: (R,) index into Keyframes, non-decreasing. direction: (R, 3) unit, in the camera frame. sigma: (R,) rad, the
     nominal noise: the standard deviation of the angle along each of the two axes across the ray. range: (R,) m along the
-    ray, NaN if unknown. range_sigma: (R,) m. range_bias: (R,) m, the standard deviation of the error that all ranges of an
-    object share. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px. track_id: (R,) -1 if unknown.
-    offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the origin.
+    ray, NaN if unknown. range_sigma: (R,) m, the standard deviation of the range. range_bias: (R,) m, the standard deviation
+    of the error that all ranges of an object share. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px.
+    track_id: (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the
+    origin.
     """
 
     keyframe: Ints

@@ -9,13 +9,13 @@ from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 
 MAX_POSITION = 1e7
 """The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is further from the
-origin of its UTM zone, and a float still resolves a nanometre there."""
+origin of its UTM zone, and a float still resolves 2 nm there."""
 MAX_STAMP = 1e20
 """The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp in ns by mistake is below it, so the
 checks of a run can name this mistake."""
 MAX_LIVE_STAMP = 1e11
-"""The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. Above it, a float does not resolve
-10 us."""
+"""The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. At this bound, a float
+resolves 15 us."""
 MAX_PIXEL = 1e7
 """The bound of a box corner and of an element of a camera matrix, px. A larger bound accepts more wrong numbers. The largest
 image is a hundredth of it."""
@@ -34,18 +34,18 @@ _SHORTEST, _LONGEST = 1e-6, 1e3
 """The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
 some programs do not normalise theirs."""
 _ASYMMETRY = 1e-6
-"""How far two mirrored entries of a covariance may differ, as a share of their two standard deviations. A larger share
-accepts files with more rounded numbers."""
+"""The largest difference of two mirrored entries of a covariance, as a share of the product of the two standard deviations.
+A larger share accepts numbers that were rounded to fewer digits."""
 _NOTHING = 1e-200
-"""The variance, in the square of any unit, up to which it counts as 0. Products of smaller numbers have few digits left. A
-larger value leaves more correlations unjudged."""
+"""The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few digits left. A
+larger value leaves more correlations unchecked."""
 _NEGATIVE = 1e-6
-"""How far below zero the least eigenvalue of a correlation matrix may be. A larger value accepts covariances with more
-rounded numbers."""
+"""How far below zero the least eigenvalue of a correlation matrix may be, and how far beyond 1 a correlation. A larger value
+accepts numbers that were rounded to fewer digits."""
 
 
 def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
-    """Return which stamps (...), s, are finite and at most `bound`."""
+    """Return which stamps (...), s, are finite and at most `bound` in absolute value."""
     return np.asarray(np.abs(stamps) <= bound)
 
 
@@ -116,7 +116,7 @@ def covariance_fault(covariance: Floats) -> str | None:
 def camera_fault(camera: Camera) -> str | None:
     """Return what is wrong with a camera whose fields have the right types, in words that follow "camera"; None if valid.
 
-    The pose of the camera must be rigid already, because `rigid_pose` returns the exact one.
+    The pose of the camera is only checked. `rigid_pose` returns the exact pose.
     """
     matrix = camera.matrix
     if matrix.shape != (3, 3) or not (np.abs(matrix) < MAX_PIXEL).all():
@@ -149,7 +149,7 @@ def is_name(value: object) -> bool:
 
 
 def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
-    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop the others.
+    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop a box that does not.
 
     scores: (M,). names: (M,) whether the label of each box `is_name`.
     """

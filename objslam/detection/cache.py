@@ -1,6 +1,6 @@
 """A cache on disk of the boxes that a detector found, so that a second run does not detect again.
 
-Each detector has one file, named by its key (model and recipe). Each line holds a checksum and the results of one image as
+Each detector has one file, named by its key (model and recipe). Each line has a checksum and the results of one image as
 JSON: the SHA-256 of the image file, the image size and the boxes. The SHA-256 identifies an image even if the log is moved,
 copied or rendered again. Each line is appended in one write, so processes can share the file. A line whose checksum does not
 match is dropped.

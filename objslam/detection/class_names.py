@@ -15,7 +15,7 @@ from objslam.errors import ConfigError, DetectorError
 
 _GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers among COCO's 91 that have no class.
 _BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
-_MOST = 100_000  # The largest accepted number of names in a dictionary. It bounds memory.
+_MOST = 100_000  # The class numbers in a dictionary of names must be below this number. It bounds memory.
 
 
 def _coco91() -> tuple[str, ...]:
@@ -34,7 +34,8 @@ def is_background(name: str) -> bool:
 
 def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tuple[str, ...] | None:
     """Return the class names of the setting `detector.names`: a list, coco, coco91 or a file. A file is looked up as given,
-    then in the model's folder. Raises ConfigError if the file is missing or unreadable or a name is empty or unprintable."""
+    then in the model's folder. Raises ConfigError if the file is missing or unreadable, or a name is empty or not
+    printable."""
     if given is None:
         return None
     if isinstance(given, tuple):
@@ -64,7 +65,7 @@ def names_from_settings(given: tuple[str, ...] | str | None, model: Path) -> tup
 
 def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None:
     """Parse the names in a model's metadata, a list or dictionary in Python or JSON. Return None if there is no text.
-    Raises DetectorError if the text is something else."""
+    Raises DetectorError if the text is something else, and ConfigError if a name is empty or not printable."""
     if not text:
         return None
     try:
@@ -84,7 +85,8 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
 
 
 def default_names(count: int) -> tuple[tuple[str, ...], str] | None:
-    """Return the COCO list with `count` names and a warning that the list is a guess. Return None if no list matches."""
+    """Return the COCO list with `count` names, and a warning that the list is a guess. Return None if no list has `count`
+    names."""
     for key, names in KNOWN.items():
         if len(names) == count:
             return names, f"the model names no classes: the {count} names of {key} are used, because it has {count} classes"

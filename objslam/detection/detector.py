@@ -33,7 +33,7 @@ class Boxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Detector:
-    """A network with its recipe. batch: the number of images in one run. warnings: about the model, for the user."""
+    """A network with its recipe. batch: the most images in one run. warnings: about the model, for the user."""
 
     network: Network
     recipe: Recipe

@@ -21,7 +21,7 @@ DESCRIPTION = "objslam.detector"
 
 _USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
 _SIZE = 640  # The width and height of an input of free size, px, if the settings and the metadata have no size.
-_LARGEST = 8192  # The largest width or height in px that is accepted from the metadata.
+_LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. It bounds memory.
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
@@ -66,8 +66,8 @@ def input_size(network: Network, settings: config.Detector) -> InputSize:
 def settle(
     network: Network, settings: config.Detector, size: InputSize, outputs: Sequence[Output]
 ) -> tuple[Recipe, str | None]:
-    """Infer the recipe from the outputs for an image of this size. Return it, and a warning if class names are a guess or
-    missing. Raises ConfigError or DetectorError if the layout, the task, the settings or the names do not fit."""
+    """Infer the recipe from the outputs for an input of this size. Return the recipe, and a warning if class names are a
+    guess or missing. Raises ConfigError or DetectorError if the layout, the task, the settings or the names do not fit."""
     task = network.metadata.get("task", "detect")
     if task in ("classify", "obb"):
         message = f"the model's task is {task}, which gives no axis-aligned boxes"

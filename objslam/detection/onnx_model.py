@@ -151,8 +151,8 @@ def _as_image(tensor: Tensor) -> ImageInput | None:
 
 
 def _extra(tensor: Tensor, count: int, height: int, width: int) -> Array:
-    """Return the value of an input besides the image. A pixel mask keeps the whole image. The model gets the size of the
-    network input as the size of the original image, so that its boxes are in px of the input."""
+    """Return the value of an input besides the image, for `count` images. A pixel mask keeps the whole image. The model gets
+    the size of the network input as the size of the original image, so that its boxes are in px of the input."""
     kind = _KINDS[tensor.kind]
     if tensor.name == _SIZES:
         return np.tile(np.array([width, height], dtype=kind), (count, 1))

@@ -82,7 +82,10 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
 
 
 def rows_are_boxes(values: Array, classes: int | None) -> bool:
-    """Return whether each row of the predictions (..., A, B) is a box. Otherwise each column is a box, as in YOLOv8."""
+    """Return whether each row of the predictions (..., A, B) is a box. If not, each column is a box, as in YOLOv8.
+
+    classes: the number of class names, None if unknown.
+    """
     rows, columns = values.shape[-2:]
     if classes is not None and (rows == 4 + classes) != (columns == 4 + classes):
         return bool(columns == 4 + classes)

@@ -11,8 +11,8 @@ from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # Boxes are in fractions if no absolute coordinate is larger. In px, such boxes are too small to matter.
-_CANDIDATES = 1000  # The maximum number of boxes in non-maximum suppression, whose time grows with the square of it.
+_FRACTION = 1.5  # Boxes are in fractions if the absolute value of no coordinate is larger. Boxes of 1.5 px do not matter.
+_CANDIDATES = 1000  # The most boxes of an image. The time of non-maximum suppression grows with the square of this number.
 _Outputs = Mapping[Role, Array]
 
 

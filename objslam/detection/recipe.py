@@ -1,4 +1,4 @@
-"""The recipe of a detector model, which defines how an image becomes network input and how outputs become boxes."""
+"""The recipe of a detector model: how an image becomes the input of the network, and how its outputs become boxes."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -63,7 +63,7 @@ class Recipe(Habits):
     names: tuple[str, ...]  # The class names. The tuple is empty if the names are unknown.
     first_label: int  # The class number that the model gives to the first name.
     taken: tuple[int, ...] | None  # The indices into names (or class numbers) of the classes to keep. None keeps all.
-    channels: int | None  # The number of class scores per box.
+    channels: int | None  # The number of class scores per box that are read. None if the outputs have class numbers only.
     row_boxes: bool  # True if a row of the predictions is a box, False if a column is a box.
     min_score: float
     iou: float

@@ -20,12 +20,12 @@ _MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pair
 _DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences.
 _MAX_TRIPLED = 80  # If there are more correspondences than this, triples of them are sampled. 80 have 82,160 triples.
 _MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
-_MAX_TRIPLES = 1000  # The maximum number of initial transforms from triples. Fewer suffice, because more of them are right.
-_MAX_REFINED = 12  # This many of the best initial transforms are refined. A larger number is more reliable and slower.
+_MAX_TRIPLES = 1000  # The most initial transforms from triples. Triples are right more often than pairs, so fewer suffice.
+_MAX_REFINED = 12  # The number of the best initial transforms that are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _ON_A_LINE = 0.02
-"""The sine of a triangle's angle up to which its corners count as on a line. A larger value leaves more triples out. Chosen
-so that position errors of 2 % of a triangle's length do not turn it about its longest side."""
+"""The sine of a triangle's angle up to which its corners count as on a line. A larger value leaves more triples out. Such a
+triangle turns freely about its longest side if its corners err by 2 % of its length."""
 _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 and sim3 search.
 
 
@@ -84,7 +84,7 @@ def align_objects(
 
     From each initial transform, points are matched within the radius and aligned with their matches, until the matches
     converge. The function returns the transform from map to truth with the smallest sum of min(distance, radius)^2 over
-    the true objects. The distance is from a true object to its match.
+    the true objects. The distance is from a true object to its match, and infinite without a match.
 
     Args:
         source, target: map objects (N, 3) and true objects (M, 3) in m.
@@ -92,7 +92,7 @@ def align_objects(
         radius: maximum distance of a match in m.
         start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
             with the same labels and a similar distance. The kinds se3 and sim3 align triples of objects likewise. At most
-            3,000 of these alignments (1,000 of triples) are sampled, with a fixed seed.
+            3,000 of these alignments (1,000 of triples) are sampled, with a fixed seed. The best 12 are initial transforms.
     """
     if kind == "none" or not same.any():
         return IDENTITY
@@ -149,7 +149,7 @@ def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Al
     chosen = np.flatnonzero(likely)
     if len(chosen) > _MAX_STARTS:
         chosen = np.sort(np.random.default_rng(0).choice(chosen, _MAX_STARTS, replace=False))
-    if len(chosen) == 0:  # without a consistent pair, only positions are aligned
+    if len(chosen) == 0:  # Without a consistent pair, each start aligns one object.
         return [Transform(*align(source[[i[c]]], target[[k[c]]], kind)) for c in range(min(len(i), _MAX_REFINED))]
     first, second, a, b = first[chosen], second[chosen], a[chosen], b[chosen]
     yaw = np.arctan2(b[:, 1], b[:, 0]) - np.arctan2(a[:, 1], a[:, 0])
@@ -218,7 +218,7 @@ def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
     """Return the ground truth in the coordinate frame of the map, so that both can be drawn together.
 
     A map from odometry alone has its own frame. The truth is aligned with the map in the plane if fewer than half of the
-    possible matches are within the radius (m) and the alignment adds matches. Otherwise, it is returned unchanged.
+    possible matches are within the radius (m) and the alignment adds matches. If not, the truth is returned unchanged.
     """
     source, target, same = correspondences(objects.resolved(), truth.objects)
     matched = len(match_points(source, target, same, radius)[0])

@@ -16,9 +16,10 @@ from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_o
 MAX_TRUTH_GAP = 1.0
 """The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
 INSIDE_95 = 5.991
-"""The squared Mahalanobis distance within which 95 % of honest errors lie (chi-squared, 2 degrees of freedom)."""
+"""The squared Mahalanobis distance within which 95 % of the errors in x and y lie if their covariances are right
+(chi-squared, 2 degrees of freedom)."""
 INSIDE_95_3D = 7.815
-"""`INSIDE_95` for an error in x, y and z (chi-squared, 3 degrees of freedom)."""
+"""The squared Mahalanobis distance within which 95 % of the errors in x, y and z lie (chi-squared, 3 degrees of freedom)."""
 
 
 @dataclass(frozen=True)

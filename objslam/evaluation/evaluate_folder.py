@@ -20,8 +20,9 @@ _IN_SPACE = "the map has the frame of the odometry, which is not planar"
 def choose_alignment(out: Path) -> tuple[Alignment, str]:
     """Return the alignment that the frame of the result in `out` needs, and the reason for it.
 
-    A map in the frame of a localisation needs none. A map in the frame of the odometry has its own origin and heading, and
-    needs se2. If its path is not planar, the direction of gravity may be unknown too, and it needs se3.
+    A map in the frame of a localisation or of an older map needs none. A map in the frame of the odometry has its own origin
+    and heading, and needs se2. If its path is not planar, the direction of gravity may be unknown too, and the map needs
+    se3. A map of several sessions has the frame of the first session, and needs se2. A map of an unknown frame gets none.
     """
     summary = load_summary(out)
     if summary.get("map_frame") == "localization":

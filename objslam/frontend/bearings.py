@@ -10,13 +10,13 @@ from objslam.core.noise import range_noise
 from objslam.core.types import Keyframes, Log, Rays, label_table
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
-"""The reason to drop a box whose centre is wrong, because it ends at the image's edge."""
+"""The reason to drop a box that ends at the image's edge, because its centre is then wrong."""
 MAX_OF_LABEL = 1000
 """The most boxes that are used of one label in one frame. A larger number takes more memory and time in a crowd."""
 
 
 def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledger) -> Rays:
-    """Return one ray for each usable box of the keyframes, in the order of the keyframes.
+    """Return one ray for each usable box of the keyframes, in the order of the keyframes. Ranges are NaN without depth.use.
 
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
@@ -125,7 +125,7 @@ def _usable(
 
 
 def _where(camera: Camera, stamps: Floats | float, bad: Bools) -> str | None:
-    """Return the camera and the stamp of the first bad box; None if all boxes are good."""
+    """Return the camera and the stamp of the first bad box, None if all boxes are good."""
     if not bad.any():
         return None
     first = float(np.broadcast_to(stamps, len(bad))[np.argmax(bad)])

@@ -28,7 +28,7 @@ def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledg
     """Return the detections with the depth (m) of each box, from the depth image that is nearest in time.
 
     An unknown depth is NaN. The depth images must be registered to the camera's image. The ledger counts depth images that
-    cannot be used, and frames with boxes that have no depth image within 20 ms.
+    cannot be used, and frames with boxes that have no depth image within `MAX_IMAGE_LAG`.
     """
     depths = np.full(len(detections), np.nan)
     frames, start, count = np.unique(detections.frame, return_index=True, return_counts=True)

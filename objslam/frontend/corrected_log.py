@@ -14,7 +14,7 @@ from objslam.core.types import CameraLog, Images, Log, Trajectory
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 """The errors of odometry."""
 AXES = ("roll", "tilt", "yaw")
-"""The rotations of a camera on the base, about x, y and z."""
+"""The rotations of a camera on the robot, about the axes x, y and z of base."""
 _SQUEEZED = 1e-3
 """A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
@@ -25,7 +25,7 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
     """Return the log corrected by known errors: odometry, cameras, and stamps and depths of frames.
 
     error: values by name, as in `Calibration`. An absent name is 0. stay: whether frames on the path stay on it (see
-    `later`). Otherwise a clock offset may move them beyond its ends.
+    `later`). If False, a clock offset may move frames beyond an end of the path.
     """
     path, odometry = log.robot_path if stay else None, log.odometry
     if odometry is not None:
@@ -46,7 +46,7 @@ class CorrectablePath:
         """Measure the steps of the odometry."""
         self.odometry = odometry
         rotation, places = odometry.poses[:, :3, :3], odometry.poses[:, :3, 3]
-        turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # about the vertical axis
+        turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # About the vertical axis.
         self._turned = np.append(0.0, np.cumsum(turn))
         self._seconds = odometry.stamps - odometry.stamps[0]
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
@@ -85,8 +85,10 @@ class OdometryCorrection:
     def __init__(
         self, error: Mapping[str, float], said: Trajectory | None = None, corrected: Trajectory | None = None
     ) -> None:
-        """Start a correction. error: the errors by name. said, corrected: a path as the robot sent it, and corrected. The
-        next poses continue both."""
+        """Start a correction. error: the errors by name.
+
+        said, corrected: the path so far, as the robot sent it and after the correction. None at the start of a path.
+        """
         self._scale, self._turn_scale, self._turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
         self._stamp: float | None = None
         self._before = self._place = np.zeros(0)
@@ -97,7 +99,7 @@ class OdometryCorrection:
             self._turned = math.atan2(turn[1, 0], turn[0, 0])
 
     def correct(self, stamp: float, pose: Floats) -> Floats:
-        """Return the next pose (4, 4) without the errors."""
+        """Return the next pose (4, 4), corrected. stamp: s."""
         if self._scale == self._turn_scale == self._turn_bias == 0:
             return pose
         if self._stamp is None:
@@ -113,15 +115,20 @@ class OdometryCorrection:
 
 
 def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:
-    """Return camera poses on the base (..., 4, 4), turned about the axes of base and moved along them."""
+    """Return poses base_T_camera (..., 4, 4), turned about the axes of base and moved along them by the errors of a camera.
+
+    name: of the camera. error: by name, the turns in rad and the moves in m.
+    """
     turn = rotation_from_vector(np.array([error.get(f"{name}.{axis}", 0.0) for axis in AXES]))
     move = np.array([error.get(f"{name}.{axis}", 0.0) for axis in "xyz"])
     return make_pose(turn @ base_T_camera[..., :3, :3], base_T_camera[..., :3, 3] + move)
 
 
 def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
-    """Return unit directions (R, 3). Directions in the mask `mine` (R,) are for a longer focal length, by the share
-    `focal`."""
+    """Return unit directions (R, 3) after a change of the focal length.
+
+    The focal length is longer by the share `focal`. Only directions in the mask `mine` (R,) change.
+    """
     if focal == 0:
         return directions
     longer = np.where(mine[:, None], directions * [1.0, 1.0, 1 + focal], directions)
@@ -129,10 +136,11 @@ def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
 
 
 def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
-    """Return stamps (N,) plus an offset of their clock. A stamp that was on the path stays on it, and the order stays.
+    """Return stamps (N,), s, plus an offset `clock`, s. A stamp that was on the path stays on it, and the order stays.
 
-    Stamps that the offset moves beyond an end of the path are squeezed into the last millisecond before that end, where
-    they have the pose of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes.
+    Stamps that the offset moves beyond an end of the path are squeezed into the millisecond inside that end, where they have
+    nearly the pose of the end. All streams of a camera move alike, so an image keeps the stamp of its boxes. Without a path,
+    the offset is only added.
     """
     moved = stamps + clock
     if clock == 0 or path is None:
@@ -150,7 +158,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data without errors. path: the path on which its stamps stay (see `later`), or None."""
+    """Return a camera and its data, corrected by the errors. path: on which its stamps stay (see `later`), or None."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

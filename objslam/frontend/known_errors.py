@@ -1,5 +1,7 @@
-"""The shared errors that a log can have, and the errors in a calibration file. If the errors in the file are not estimated,
-they are corrected."""
+"""The shared errors that a log can have, and the errors in a calibration file.
+
+The errors in the file that a run does not estimate are corrected before it.
+"""
 
 from pathlib import Path
 
@@ -27,7 +29,7 @@ def error_names(log: Log) -> tuple[str, ...]:
 
 
 def prior_sigma(name: str, settings: Settings) -> float:
-    """Return the prior standard deviation of an error in the settings, 0 if the error is fixed.
+    """Return the prior standard deviation of an error in the settings, in the unit of the error, 0 if the error is fixed.
 
     In fixed mode, the errors are estimated from bearings and given poses. So the errors of odometry and of ranges are fixed.
     """
@@ -41,7 +43,7 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """Return whether the shared errors of a log are estimated.
 
     odometry: whether it is used. localized: whether there is a localisation. In fixed mode, odometry without a localisation
-    reveals no error, because the poses must be known.
+    reveals no error, because the poses must be known. In joint mode, calibration.use decides, and "auto" needs odometry.
     """
     use = settings.calibration.use
     if settings.mode == "fixed":
@@ -84,9 +86,9 @@ def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Led
 def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
     """Return the log corrected by the errors of calibration.file that the run does not estimate.
 
-    If the run estimates no errors, all errors in the file are corrected. Otherwise, only errors that the settings fix are.
-    The ledger warns of errors in the file that the log does not have. ConfigError if the file is wrong, or if it fits
-    nothing in the log.
+    If the run estimates no errors, all errors in the file are corrected. If it estimates some, the errors in the file that
+    `possible` does not list are corrected. The ledger warns of errors in the file that the log does not have. ConfigError if
+    the file is wrong, or if it fits nothing in the log.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:
@@ -102,7 +104,7 @@ def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
 
 
 def take_out_expected(log: Log, settings: Settings) -> Log:
-    """Return the log without all errors of calibration.file, whether a run estimates them or not."""
+    """Return the log corrected by all errors of calibration.file, whether a run estimates them or not."""
     of = settings.calibration.model_copy(update={"use": False})
     return take_out_known(log, settings.model_copy(update={"calibration": of}), Ledger())
 

@@ -14,9 +14,9 @@ Length = TypeVar("Length", float, Floats)
 
 
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
-    """Return the settings with the odometry noise scaled for distances that are longer by the scale in these errors.
+    """Return the settings with the odometry noise for distances that are longer by the error "odometry.scale".
 
-    Otherwise, the noise relative to the distances would depend on the size of the map.
+    error: by name. If the noise stayed the same, the noise relative to the distances would depend on the size of the map.
     """
     way = 1 + error.get("odometry.scale", 0.0)
     if way == 1:
@@ -29,7 +29,7 @@ def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
 
 
 def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> Floats:
-    """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), rotation first.
+    """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), s, rotation first.
 
     The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, where the
     steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. This covariance,
@@ -39,9 +39,9 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
 
 
 class DriftPath:
-    """The steps of an odometry, from which its drift with other noise, or at other stamps, is computed quickly.
+    """The steps of an odometry, from which its drift is computed quickly, for any noise and stamps.
 
-    On a planar path, it computes ten times fewer numbers.
+    On a planar path, ten times fewer numbers are computed.
     """
 
     def __init__(self, odometry: Trajectory) -> None:
@@ -60,7 +60,7 @@ class DriftPath:
         self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
         px, py = places[1:, 0], places[1:, 1]
         one, none = np.ones_like(px), np.zeros_like(px)
-        # By entry of `_PLANAR`: the factors of the step's variances of yaw, x and y.
+        # The factors of a step's variances of yaw, x and y, by the numbers in `_PLANAR`.
         self._parts = (
             np.stack([one, py, -px, py * py, -px * py, px * px], axis=1),
             np.stack([none, none, none, c * c, c * s, s * s], axis=1),
@@ -100,8 +100,8 @@ _PLANAR_TOLERANCE = 1e-6
 def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:
     """Return the covariance (N-1, 6, 6), rotation first, of the noise of each step between poses (N, 4, 4).
 
-    It is in the frame `start`. The noise of a step grows with its length and with its angle. On a planar path it affects x,
-    y and yaw of the base. On other paths it affects all six directions.
+    The covariance is in the frame `start`. The noise of a step grows with its length and with its angle. If `planar`, it
+    affects x, y and yaw of the base. If not, it affects all six directions.
     """
     turn, way = twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
     angle, x, y = _step_variances(turn, way, settings)

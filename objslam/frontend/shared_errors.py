@@ -27,12 +27,12 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""The largest absolute value of a parameter without a bound of its own, in standard deviations of its prior. A larger value
-lets a parameter move farther from its prior."""
+"""A parameter may be as large as its absolute prior mean plus this many standard deviations of its prior. MOST_SCALE bounds
+scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its prior."""
 
 
 _KEPT = 9
-"""The number of corrected paths, and of poses on them, that are kept. A larger number takes more memory. A round of
+"""For how many values of the errors the poses of the keyframes are kept. A larger number takes more memory. A round of
 derivatives needs seven."""
 
 
@@ -41,7 +41,7 @@ class SharedErrors:
     """The measurements of some keyframes of a log, as a function of its shared errors.
 
     keyframes, rays: as the log measured them. names: the P parameters. mean: (P,) and prior: (P, P), their expected
-    values and covariance before the solve.
+    values and covariance before the solve. noise: the factors on the nominal noise.
     """
 
     log: Log
@@ -56,7 +56,10 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements."""
+        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements.
+
+        The set is empty in fixed mode, and if odometry is not used.
+        """
         of, default = self.settings, Settings()
         if of.mode != "joint" or self.keyframes.odom_T_base is None:
             return frozenset()
@@ -71,8 +74,10 @@ class SharedErrors:
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
-        """The scales of the measured lengths, if each length has one. Then the log cannot tell a factor common to all
-        lengths. Else empty."""
+        """The names of the scales, if every measured length has an unknown scale. The set is empty if not.
+
+        If it is not empty, the log cannot tell a factor that all lengths have in common.
+        """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return frozenset()
         scales = {"odometry.scale"} | ({"range_scale"} if np.isfinite(self.rays.range).any() else set())
@@ -91,8 +96,8 @@ class SharedErrors:
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.
 
-        Without odometry, only the path reveals the offset of a clock. Then the clock's step is at least as long as two steps
-        of the path. So the noise of single poses is not in the derivative, where it would bias the offset.
+        If odometry is not used, only the localised path reveals the offset of a clock. Then the clock's step is at least as
+        long as two steps of the path, up to calibration.max_clock. So the noise of single poses does not bias the offset.
         """
         steps = {**_STEPS}
         path = self.log.robot_path
@@ -105,7 +110,7 @@ class SharedErrors:
 
     @property
     def bounds(self) -> Floats:
-        """(P,) the largest absolute values."""
+        """(P,) the largest absolute values of the parameters, in their units."""
         widest = np.abs(self.mean) + _MOST_SIGMAS * np.sqrt(np.diagonal(self.prior))
         kinds = np.array([kind(name) for name in self.names])
         clocks = np.maximum(self.settings.calibration.max_clock, np.abs(self.mean))
@@ -115,9 +120,9 @@ class SharedErrors:
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
-        The noise of distances and ranges follows their scale. Otherwise a smaller map would fit better. Keyframes stay on
-        their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
-        pose.
+        The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. Keyframes stay
+        on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
+        pose. drift: whether the drift is computed for the corrected odometry. If not, it stays as measured.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
@@ -168,11 +173,10 @@ class SharedErrors:
         return replace(self, keyframes=keyframes, rays=rays)
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
-        """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
-        turning, and without odometry noise.
+        """Return four pairs of keyframes and settings, each with one component of the noise of motions.
 
-        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the corrected
-        errors.
+        The components are odometry noise along the path, across it and in turning, all nominal, and the noise of `planar` in
+        the settings. values: (P,) the corrected errors.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         path = self._drift(error)
@@ -202,7 +206,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # The stamps of the poses, which end with the path.
+        known = stamps.copy()  # The stamps of the poses, which are all on the path.
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)
@@ -227,15 +231,17 @@ class SharedErrors:
         return RecentValues(1)
 
     def _odometry_at(self, stamps: Floats, error: Mapping[str, float]) -> Floats:
-        """Poses (Q, 4, 4) of the odometry without its errors. Only the poses around the stamps (Q,) are computed."""
+        """Poses (Q, 4, 4) of the corrected odometry at stamps (Q,), s. Only the poses around the stamps are computed."""
         odometry = self._correctable().odometry
         after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, max(len(odometry) - 1, 1))
-        around = np.unique(np.concatenate([after - 1, np.minimum(after, len(odometry) - 1)]))
+        needed = np.zeros(len(odometry), dtype=bool)
+        needed[after - 1] = needed[np.minimum(after, len(odometry) - 1)] = True
+        around = np.flatnonzero(needed)
         path = Trajectory(odometry.stamps[around], self._corrected(error, around))
         return _at_stamps(path, stamps, self.settings.poses.max_gap)
 
     def _corrected(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Poses of the odometry without its errors. Its distances compensate the shrinkage of the map, as the ranges do."""
+        """Poses (n, 4, 4) of the corrected odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
         named = dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
         return self._correctable().poses(named, which)
 
@@ -247,7 +253,7 @@ class SharedErrors:
         return self._path[0]
 
     def _drift(self, error: Mapping[str, float]) -> DriftPath:
-        """The steps of the odometry without its errors, which give its drift."""
+        """The steps of the corrected odometry, which give its drift."""
 
         def measured() -> DriftPath:
             return DriftPath(Trajectory(self._correctable().odometry.stamps, self._corrected(error)))
@@ -262,9 +268,10 @@ class SharedErrors:
 
 @dataclass(frozen=True)
 class _Poses:
-    """The poses (K, 4, 4) of K keyframes. stamps: (K,) s of the images. known: (K,) s of the poses, which end with the path.
+    """The poses (K, 4, 4) of K keyframes, corrected for the errors of clocks and odometry.
 
-    base_T_camera: without the errors of the camera's rotation and place.
+    stamps: (K,) s, of the images. known: (K,) s, of the poses, which are all on the path. base_T_camera: not yet corrected
+    for the errors of the camera's rotation and place.
     """
 
     stamps: Floats
@@ -277,7 +284,7 @@ class _Poses:
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
     """Return the errors that are estimated from a log by the settings, None if there are none.
 
-    keyframes, rays: the solved ones. An error is a parameter if its prior is not 0 and it affects some measurement.
+    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
     """
     names: tuple[str, ...] = ()
     if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
@@ -285,7 +292,7 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
         measured = {
             **cameras,
             "odometry": keyframes.odom_T_base is not None,
-            "": np.isfinite(rays.range).any(),  # range_scale belongs to no part
+            "": np.isfinite(rays.range).any(),  # The name range_scale has no part before a dot.
         }
         names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0]])
     mean = np.zeros(len(names))

@@ -9,18 +9,20 @@ from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Up
 
 _STEADY = 0.7
-"""How long the mean of the cameras' unit up vectors must be. A smaller value judges cameras that roll about, too."""
+"""The least length of the mean of the cameras' unit up vectors. If the mean is shorter, the cameras roll too much to tell
+where up is, and z is taken. A larger value takes z more often."""
 _TILT = np.radians(45)
-"""The angle, rad, between this mean and the map's z axis, above which the map lies on its side. Cameras on robots look up or
-down by less. A larger angle takes z more often."""
+"""The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
+robots look up or down by less. A larger angle takes z more often."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
 """The axes that point right and up in a view from above, so that right, up and the upward axis are a right-handed frame."""
 
 
 def up_axis(keyframes: Keyframes) -> Up:
-    """Return the axis of the map that points up: z, or that nearest to the cameras' mean up in a map that lies on its side.
+    """Return the axis of the map that points up. It is z, unless the map lies on its side.
 
-    Visual SLAM often has the first camera's frame, in which y points down. A planar path tells where up is by itself.
+    Then it is the axis that is nearest to the mean of the cameras' up vectors. The map of visual SLAM is often in the first
+    camera's frame, where y points down. If the path is planar, up is z.
     """
     if not len(keyframes) or is_planar(keyframes.map_T_base):
         return "z"

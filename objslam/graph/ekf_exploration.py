@@ -69,9 +69,10 @@ def explore(
 
 
 def is_sure(start: InitialEstimate) -> bool:
-    """Return whether an exploration explains enough rays to start from.
+    """Return whether an exploration explains enough rays for a solve to start from it.
 
-    Otherwise, neighbours of one label stand too close together for the odometry, and single frames cannot tell them apart.
+    If not, landmarks of one label stand closer together than the error of the odometry, and a single frame cannot tell them
+    apart.
     """
     return bool((start.association.object >= 0).mean() >= _EXPLAINED)
 

@@ -13,6 +13,10 @@ from objslam.graph.optimizers import build_graph
 Factors = Sequence[gtsam.NonlinearFactor]
 
 
+_OWN_KINDS = ("motion", "absolute", "landmark", "ray")
+"""The kinds of factors that every growing graph has. Their variables are poses X and points L only."""
+
+
 class Stored(NamedTuple):
     """The factors of one measurement, and the keys of their variables."""
 
@@ -28,9 +32,7 @@ class FactorStore:
     a `landmark` prior has the number of its landmark. A `ray` has its own number. The caller numbers other kinds.
     """
 
-    kinds: dict[str, dict[int, Stored]] = field(
-        default_factory=lambda: {kind: {} for kind in ("motion", "absolute", "landmark", "ray")}
-    )
+    kinds: dict[str, dict[int, Stored]] = field(default_factory=lambda: {kind: {} for kind in _OWN_KINDS})
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
         """Store one group of factors for each number. It replaces the factors of this kind that already have the number."""
@@ -47,6 +49,11 @@ class FactorStore:
         """Remove the factors of every measurement that involves one of these variables."""
         for kind, stored in self.kinds.items():
             self.kinds[kind] = {number: one for number, one in stored.items() if one.keys.isdisjoint(keys)}
+
+    def variables(self) -> set[int]:
+        """Return the keys of the variables in the factors of all kinds that the caller numbers."""
+        numbered = (stored for kind, stored in self.kinds.items() if kind not in _OWN_KINDS)
+        return {key for stored in numbered for one in stored.values() for key in one.keys}
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return a graph with all factors."""

@@ -7,7 +7,9 @@ import gtsam
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import inverse
 from objslam.graph.factor_store import Factors, FactorStore
+from objslam.graph.factors.frames import F0
 from objslam.graph.factors.odometry import between
 from objslam.graph.factors.priors import anchor, point_prior
 from objslam.graph.factors.rays import Bearings, ray_factors
@@ -113,14 +115,25 @@ class GrowingGraph(ABC):
         for k in keyframes.tolist():
             self._at.poses.pop(k, None)
 
+    def drop_kind(self, kind: str) -> None:
+        """Remove all factors of a kind from `add`, and the variables from `add_variable` that then have no factor."""
+        self._rebuild = None
+        self._store.kinds.pop(kind, None)
+        self._drop_free_variables()
+
     def drop_absolute(self) -> None:
         """Remove all absolute poses."""
         self._store.kinds["absolute"].clear()
 
     def move(self, new_T_old: Floats) -> None:
-        """Move the whole estimate by a pose (4, 4). The caller must remove the absolute poses before."""
+        """Move the whole estimate by a pose (4, 4). The caller must remove the absolute poses before.
+
+        A prior map stays where it is. So the pose F of this graph's frame in the prior map changes too.
+        """
         self.refresh()
         at, weak = self._at, self._settings.joint.prior_sigma
+        if F0 in at.others:
+            at.others[F0] = at.others[F0].compose(gtsam.Pose3(inverse(new_T_old)))
         at.poses = {k: new_T_old @ pose for k, pose in at.poses.items()}
         at.points = {j: new_T_old[:3, :3] @ point + new_T_old[:3, 3] for j, point in at.points.items()}
         self._store.add("landmark", list(at.points), [[point_prior(j, point, weak)] for j, point in at.points.items()])
@@ -146,3 +159,10 @@ class GrowingGraph(ABC):
         self.refresh()
         self._rebuild = None
         self._store.drop_variables(frozenset(keys.tolist()))
+        self._drop_free_variables()
+
+    def _drop_free_variables(self) -> None:
+        """Remove the variables from `add_variable` that no factor holds. They would make the linear system indeterminate."""
+        if self._at.others:
+            held = self._store.variables()
+            self._at.others = {key: value for key, value in self._at.others.items() if key in held}

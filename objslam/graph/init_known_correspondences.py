@@ -34,8 +34,9 @@ later. With fewer, false boxes agree by chance too often."""
 _SHORTEST = 4
 """The shortest step is joint.grow_step divided by this. A larger number allows shorter steps and slower growth."""
 _AGAIN = 1.05
-"""A landmark is triangulated again when its number of rays has grown by this factor. A larger factor is faster, but
-landmarks enter later. With a factor of 1, the time would grow with the square of the number of rays."""
+"""A landmark that is not yet in the graph is triangulated again when its number of rays has grown by this factor. A larger
+factor is faster, but landmarks come into the graph later. With a factor of 1, the time would grow with the square of the
+number of rays."""
 _RECORDED = 1.02
 """The trace records a step when the graph has grown by this factor. A larger factor records fewer steps. With a factor of 1,
 the trace of a long drive would take gigabytes, because each step records the whole path."""

@@ -4,6 +4,8 @@ If an update raises an exception, Levenberg-Marquardt solves the stored factors 
 rebuilt at this solution. Levenberg-Marquardt succeeds, because its damping determines the variables without measurements.
 """
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -83,9 +85,9 @@ class IncrementalGraph(GrowingGraph):
         """Return the poses (n, 4, 4) of keyframes at the last `refresh`."""
         return np.array([self._at.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4)
 
-    def variable(self, key: int) -> gtsam.Pose3 | Floats:
-        """Return the value that a variable from `add_variable` had at the last `refresh`."""
-        return self._at.others[key]
+    def variable(self, key: int) -> Any:
+        """Return the value that a variable from `add_variable` had at the last `refresh`. None if there is none."""
+        return self._at.others.get(key)
 
     def pose_covariance(self, k: int) -> Floats:
         """Return the covariance (6, 6) of X(k) in the camera frame, rotation first. It is NaN if iSAM2 cannot give it."""
@@ -101,11 +103,17 @@ class IncrementalGraph(GrowingGraph):
         It is NaN if iSAM2 cannot give it. A call takes about 1 ms for a keyframe near the root, such as the newest, and
         about 100 ms for other keyframes.
         """
-        try:
-            joint = self._isam.jointMarginalCovariance([X0 + k, L0 + j])
-        except (RuntimeError, IndexError):  # The system is indeterminate, or a variable is not in the graph yet.
+        joint = self.joint_covariance(X0 + k, L0 + j)
+        if joint is None:
             return np.full((3, 3), np.nan)
         return in_camera(joint, k, j, self.pose(k), self.points(np.array([j]))[0])
+
+    def joint_covariance(self, *keys: int) -> gtsam.JointMarginal | None:
+        """Return the joint marginal covariance of variables by their keys. None if iSAM2 cannot give it."""
+        try:
+            return self._isam.jointMarginalCovariance(list(keys))
+        except (RuntimeError, IndexError):  # The system is indeterminate, or a variable is not in the graph yet.
+            return None
 
     def save(self) -> tuple[FactorStore, Variables]:
         """Return a copy of the factors and variables, which `restore` takes."""
@@ -150,6 +158,7 @@ class IncrementalGraph(GrowingGraph):
         self._clear()
         self._rebuild = IncrementalRebuild(self._store.copy(), order.tolist(), self._at.copy())
         self._unfinished = True
+        self._outgrown = False  # The rebuilt graph knows the letters of all variables that there are now.
 
     @property
     def is_rebuilding(self) -> bool:

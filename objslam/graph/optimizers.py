@@ -92,29 +92,6 @@ def levenberg_marquardt(
     return Optimum(values, before, optimizer.error(), optimizer.iterations())
 
 
-def gauss_newton(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, max_iterations: int, relative_tolerance: float
-) -> Optimum:
-    """Minimise from near the optimum by Gauss-Newton, which takes two thirds of the time of Levenberg-Marquardt.
-
-    If the cost does not fall, or a linear system is indeterminate, Levenberg-Marquardt minimises from `start` instead.
-    SolveError as by `levenberg_marquardt`.
-    """
-    parameters = gtsam.GaussNewtonParams()
-    parameters.setMaxIterations(max_iterations)
-    parameters.setRelativeErrorTol(relative_tolerance)
-    parameters.setAbsoluteErrorTol(1e-12)
-    try:
-        optimizer = gtsam.GaussNewtonOptimizer(graph, start, parameters)
-        before = optimizer.error()
-        values = optimizer.optimize()
-    except RuntimeError:  # Damping may make the system determinate. If not, the other solver raises.
-        return levenberg_marquardt(graph, start, max_iterations, relative_tolerance)
-    if not optimizer.error() <= before:
-        return levenberg_marquardt(graph, start, max_iterations, relative_tolerance)
-    return Optimum(values, before, optimizer.error(), optimizer.iterations())
-
-
 def graduated(
     graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, max_iterations: int, known_inliers: Sequence[int]
 ) -> Optimum:

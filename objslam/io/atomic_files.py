@@ -89,7 +89,8 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
 
 @contextmanager
 def _replaced(file: Path) -> Iterator[BinaryIO]:
-    """Yield a stream to a temporary file, and rename that to `file` at the end. After an error, it is deleted."""
+    """Yield a stream to a temporary file, which is renamed to `file` at the end. After an error, the temporary file is
+    deleted."""
     temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
         remove_leftovers(file)
@@ -154,7 +155,7 @@ def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
 
 
 def _swap(staging: Path, folder: Path, files: FileSet) -> tuple[str, ...]:
-    """Replace the old files by the staged files. In this order, a killed process never leaves a mix of two sets."""
+    """Replace the old files by the staged files, in an order in which a killed process never leaves a mix of two sets."""
     old = files.names(folder)
     removed = tuple(name for name in old if (folder / name).exists() and not (staging / name).exists())
     _write(staging / _SWAPPING, b"")

@@ -54,7 +54,7 @@ def _refuse_duplicates(node: yaml.Node | None) -> None:
 
 
 def _calibration(data: Any) -> Calibration:
-    """Return the calibration that a file holds. ValueError says what is wrong."""
+    """Return the calibration in the data of a YAML file. ValueError says what is wrong."""
     if isinstance(data, dict) and "calibration" in data:  # the summary.json of a run
         data = data["calibration"]
     parameters = data.get("parameters") if isinstance(data, dict) else None
@@ -73,7 +73,7 @@ def _calibration(data: Any) -> Calibration:
 
 
 def _column(parameters: dict[Any, Any], key: str, default: float | None = None) -> Floats:
-    """Return one number of each parameter."""
+    """Return the number (P,) under `key` of each parameter. A parameter without the key has the number `default`."""
     numbers = []
     for name, of in parameters.items():
         value = of.get(key, default) if isinstance(of, dict) else None
@@ -87,7 +87,7 @@ def _column(parameters: dict[Any, Any], key: str, default: float | None = None) 
 
 
 def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Floats:
-    """Return the matrix (P, P) of a covariance."""
+    """Return the covariance (P, P) under `key`. ValueError says what is wrong."""
     size, rows = len(names), data.get(key)
     if not isinstance(rows, list) or len(rows) != size or any(not isinstance(r, list) or len(r) != size for r in rows):
         raise ValueError(f"{key} must be {size} x {size} numbers, as there are {size} parameters")
@@ -102,7 +102,7 @@ def _covariance(data: dict[str, Any], key: str, names: tuple[str, ...]) -> Float
     scale = np.sqrt(np.diagonal(matrix))
     matrix = (matrix + matrix.T) / 2
     try:
-        np.linalg.cholesky(matrix / np.outer(scale, scale))  # of the correlation, because the units differ
+        np.linalg.cholesky(matrix / np.outer(scale, scale))  # The correlation is tested, because the units differ.
     except np.linalg.LinAlgError:
         raise ValueError(f"{key} is not positive definite") from None
     return matrix

@@ -61,7 +61,8 @@ def read_calibrations(path: Path, ledger: Ledger) -> tuple[Calibration, ...]:
 
 
 def read_mounts(path: Path) -> tuple[Mount, ...]:
-    """Read the cameras for which a file has only base_T_camera, and perhaps a name. `read_calibrations` reads the others."""
+    """Read the cameras for which a file has only base_T_camera, and perhaps a name. `read_calibrations` reads all
+    other cameras."""
     named = [(name, keys) for name, keys in _sections(path) if _only_mount(keys)]
     return tuple(
         Mount(

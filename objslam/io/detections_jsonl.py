@@ -93,7 +93,7 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
     if len(boxes) > MAX_BOXES:
         raise Malformed(f"more than {MAX_BOXES} boxes")
     if any(type(box) is not list for box in boxes):
-        raise Malformed("boxes holds no lists x1, y1, x2, y2")
+        raise Malformed("boxes must hold lists x1, y1, x2, y2")
     boxes = [read_numbers(box, "a box") for box in boxes]
     labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
     unknown = [None] * len(boxes)

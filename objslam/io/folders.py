@@ -15,7 +15,7 @@ OLD = "old"
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """If the block raises an error, delete the folders of `path` and its parents that the block created and left empty."""
+    """If the block raises an error, delete `path` and its parent folders, if the block created them and left them empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield
@@ -28,16 +28,17 @@ def no_empty_folders(path: Path) -> Iterator[None]:
 
 
 def temporary_name(path: Path) -> str:
-    """Return the name of a temporary file or folder beside `path`. It names the machine and the process, for
-    `remove_leftovers`. A longer name that goes on with a dot belongs to the same process."""
+    """Return the name of a temporary file or folder beside `path`. It contains the machine and the process, so that
+    `remove_leftovers` knows whose it is. The process may also use this name with a dot and more letters after it."""
     return f".{path.name}.{_machine()}-{os.getpid()}"
 
 
 def remove_leftovers(path: Path) -> None:
     """Delete the temporary files and folders beside `path` that dead processes of this machine left (`temporary_name`).
 
-    If one of them holds the folder that was at `path`, and nothing is at `path` now, the folder is moved back first. Entries
-    of other machines stay, because a process on the same disk may be alive there. Raises OSError if the disk refuses.
+    A process that was killed while it replaced the folder `path` may have left the old folder in a temporary folder. If
+    nothing is at `path` now, the old folder is moved back first. Files of other machines stay, because their processes may
+    be alive. Raises OSError if the disk refuses.
     """
     ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)
     for entry in list(path.parent.iterdir()) if path.parent.is_dir() else []:
@@ -53,7 +54,7 @@ def remove_leftovers(path: Path) -> None:
 
 
 def _machine() -> str:
-    """Return a short mark of this machine. Process numbers of another machine or container mean nothing here."""
+    """Return a short mark of this machine or container. Process numbers have a meaning only on their own machine."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 

@@ -14,7 +14,8 @@ from objslam.io.text import drop_rows, in_order, parse_numbers, read_lines
 def read_images(path: Path, ledger: Ledger) -> Images:
     """Read an image list without opening the images. Raises LogError if no line is left.
 
-    A line is dropped and counted if it is malformed or out of time order, or if its file is missing or outside the folder.
+    A line is dropped and counted if it is malformed or out of time order, or if its file is missing, no regular file, or
+    outside the folder of the list.
     """
     inside = Inside(path.parent)
     name = path.name

@@ -1,7 +1,7 @@
 """Decode compressed images (PNG, JPEG, TIFF, ...) to pixels, except images that would take much memory or time.
 
-A PNG, JPEG or GIF file of some kB can state a size of gigabytes, and a JPEG file can go over its pixels thousands of times.
-The stated size and the number of these scans are therefore checked first.
+A PNG, JPEG or GIF file of some kB can state a size of gigabytes. A JPEG file can have thousands of scans, each of which
+changes all pixels. The stated size and the number of scans are therefore checked before the image is decoded.
 """
 
 from typing import Any
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from objslam.io.image_size import stated_size
 
 MAX_PIXELS = 1 << 26
-"""The most pixels of an image. With this number, a PNG takes 3 s. A larger number takes more memory and time. No robot's
+"""The most pixels of an image. A PNG with this number takes 3 s. A larger number takes more memory and time. No robot's
 camera has more."""
 _MAX_SCANNED = 1 << 29
-"""The most pixels of a JPEG, multiplied by its scans. A larger number takes more time: 16 million pixels in 100 scans are
-three times as much, and took 4 s. A progressive JPEG has about ten scans."""
+"""The largest product of the pixels and the scans of a JPEG. A larger number takes more time: 16 million pixels in 100 scans
+are three times this number, and took 4 s. A progressive JPEG has about ten scans."""
 _JPEG, _SCAN = b"\xff\xd8\xff", b"\xff\xda"  # The first bytes of a JPEG, and the marker before each scan.
 
 

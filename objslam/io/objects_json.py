@@ -17,7 +17,7 @@ from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
 _READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
-_UNIT = 1e-3  # The largest difference of the length of a direction from 1. A larger value accepts worse directions.
+_UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
 _T = TypeVar("_T")
 
 
@@ -26,7 +26,8 @@ class _Malformed(OutputError):
 
 
 def dump_objects(objects: ObjectMap) -> str:
-    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. NaN becomes null."""
+    """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. Other numbers become
+    null."""
     return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone])
 
 
@@ -183,7 +184,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
             raise _Malformed("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
         if not valid_positions(ray[0]) or not abs(float(np.linalg.norm(ray[1])) - 1) < _UNIT:
-            raise _Malformed("ray must have an origin in reach and a direction of length 1")
+            raise _Malformed(f"ray must have an origin below {MAX_POSITION:g} m and a direction of length 1")
     if labels is not None:
         if not isinstance(labels, dict):
             raise _Malformed("labels must be a mapping of labels to shares")
@@ -217,7 +218,7 @@ def _seen_from(value: Any) -> SeenFrom:
         raise _Malformed("seen_from must have near, far and a list of sides")
     near, far = (_number(value.get(name), f"seen_from.{name}") for name in ("near", "far"))
     if not 0 <= near <= far < MAX_POSITION:
-        raise _Malformed("seen_from must go from a least to a greatest distance in metres")
+        raise _Malformed("near and far of seen_from must be distances in metres, near not above far")
     sides = np.array([_vector(side, "a side of seen_from") for side in value["sides"]]).reshape(-1, 3)
     if not (np.abs(np.linalg.norm(sides, axis=1) - 1) < _UNIT).all():
         raise _Malformed("a side of seen_from must have the length 1")

@@ -11,7 +11,7 @@ _THREADS = 2  # The number of threads. A single thread decodes PNG images more s
 
 
 def ahead(work: Callable[[_In], _Out], items: Iterable[_In], depth: int) -> Iterator[_Out]:
-    """Yield work(item) for each item in order. Threads process up to `depth` items before the caller asks for them."""
+    """Yield work(item) for each item in order. Threads compute up to `depth` results before the caller asks for them."""
     waiting: deque[Future[_Out]] = deque()
     pool = ThreadPoolExecutor(_THREADS, thread_name_prefix="objslam-images")
     try:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
-_UNIT = 1e-3  # The largest difference of a squared length of a direction from 1. A larger value accepts worse directions.
+_UNIT = 1e-3  # The most that the squared length of a direction differs from 1. A larger value accepts worse directions.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,7 +36,7 @@ class RaysTable:
     camera: Any  # (R,) camera name.
     box: Floats  # (R, 4) x1, y1, x2, y2, px of the raw image.
     label: Any  # (R,) label of the box.
-    sigma: Floats  # (R,) standard deviation of the residual along one axis by the settings, rad.
+    sigma: Floats  # (R,) standard deviation of the residual along one axis, from the settings, rad.
     residual_before: Floats  # (R,) residual with the shared errors left in, rad, NaN if they were not estimated.
     image: Floats  # (R, 2) centre of the box, as a share of the image's width and height.
     speed: Floats  # (R,) speed of the robot, m/s.
@@ -89,7 +89,7 @@ def dump_rays(rays: RaysTable) -> bytes:
 
 
 def read_rays(file: Path) -> RaysTable:
-    """Read a rays.parquet. Raises OutputError if the file is missing, damaged, from an older version or not of a run."""
+    """Read a rays.parquet. Raises OutputError if the file is missing, damaged, from an older version or not from a run."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -147,7 +147,7 @@ def _fault(rays: RaysTable) -> str | None:
         (angles[0] & angles[1], "a residual that is not an angle"),
         ((rays.weight >= 0) & (rays.weight <= 1), "a weight outside 0 to 1"),
         (valid_depths(rays.sigma), "a sigma that is not above zero"),
-        ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that cannot be"),
+        ((np.abs(rates) < MAX_POSITION).all(axis=1), "a speed, turn rate or place in the image that is not valid"),
         *boxes,
     )
     return next((fault for fine, fault in rules if not fine.all()), None)

@@ -1,4 +1,4 @@
-"""Check that the files that a log lists are inside its folder."""
+"""Check that the files in the lists of a log are inside its folder."""
 
 import os
 import stat

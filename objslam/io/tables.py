@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def arrow_table(columns: Mapping[str, Any]) -> pa.Table:
-    """Return a pyarrow table. A column is an array, or (R, k) numbers, whose cells become lists of k numbers."""
+    """Return a pyarrow table of named columns. Each row of a numpy array (R, k) becomes a cell with a list of k numbers."""
     import pyarrow as pa
 
     def column(values: Any) -> Any:

@@ -1,6 +1,6 @@
 """Trajectories in TUM format. Each line is "stamp tx ty tz qx qy qz qw" or a comment after '#'.
 
-Other programs write commas and a header, and planar robots "stamp x y yaw". Both are read too.
+Files with commas, with a header or with planar poses "stamp x y yaw" are read too.
 """
 
 from dataclasses import replace
@@ -50,8 +50,8 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
 
 
 def _read_numbers(path: Path, ledger: Ledger) -> Table:
-    """Return a table with 8 columns, also of a file with "stamp x y yaw". The first line of 8 or 4 numbers shows which form
-    the file has."""
+    """Return a table with 8 columns, also for a file with "stamp x y yaw". The first line with 8 or 4 numbers shows the form
+    of the file."""
     lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
     names = lines[0][1].split() if lines else []
     if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):

@@ -21,7 +21,7 @@ _BETWEEN = "\n---\n"  # The line between the texts of two cameras.
 
 @dataclass(frozen=True)
 class Views:
-    """F camera frames in the order of time. margin, margin_share: as `rays.border` and `rays.border_share` of the run.
+    """F camera frames in the order of time. margin (px), margin_share: `rays.border` and `rays.border_share` of the run.
 
     stamps: (F,) s. camera: (F,) index into cameras. map_T_camera: (F, 4, 4).
     """
@@ -69,9 +69,9 @@ def read_views(file: Path) -> Views:
         flat = np.asarray(table["map_T_camera"].combine_chunks().flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
         poses, rigid = rigid_poses(flat.reshape(len(stamps), 4, 4))
         if not (rigid.all() and valid_stamps(stamps).all() and np.isfinite([margin, share]).all()):
-            raise ValueError("a pose, a stamp or a margin cannot be")
+            raise ValueError("a pose, a stamp or a margin is not valid")
         if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
-            raise ValueError("a frame of no camera")
+            raise ValueError("a frame names a camera that is not in the file")
     except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError, LogError) as error:
         raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
     return Views(stamps, camera, poses, cameras, margin, share)

@@ -8,7 +8,7 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.sources.journal.records import FrameMessage
 
-_WINDOW = 2000  # The newest update times in the percentiles. With a larger number, the percentiles react more slowly.
+_WINDOW = 2000  # How many of the newest update times make the percentiles. With a larger number, they react more slowly.
 
 
 class _Guarded(Ledger):

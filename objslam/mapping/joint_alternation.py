@@ -186,11 +186,11 @@ class JointState:
 
     @property
     def explained(self) -> float:
-        """The log odds of the agreeing rays against stray rays, beyond those of the least number of rays of an object.
+        """The sum over agreeing rays of the log odds that a ray belongs to its object and is not false.
 
-        A ray agrees with density 1 / (2 pi e sigma^2) on average, and is stray with density 1 / `_VIEW`. So a map in which
-        more rays agree, because the solve found them to be noisier, is no better map. A ray that is noisier than a view
-        tells nothing.
+        Each object costs as much as `association.min_rays` average rays give. The density is 1 / (2 pi e sigma^2) per sr for
+        an agreeing ray, on average, and 1 / `_VIEW` for a false one. If more rays agree only because their noise was
+        estimated larger, each of them counts less. A ray with more noise than a view counts 0.
         """
         assert self.association is not None
         gain = np.maximum(np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2)), 0.0)

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from objslam.association.registration.map_registration import Registration
-from objslam.association.registration.object_maps import placed, reason, register
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import split_se2
-from objslam.core.object_map import ObjectMap
+from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.trace import Round
 from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
@@ -21,6 +19,7 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.solution import Solution
 
 if TYPE_CHECKING:
+    from objslam.association.registration.map_registration import Registration
     from objslam.graph.maps.prior_map import MappedDrive
 
 
@@ -30,6 +29,11 @@ class PriorMap:
 
     name: str
     objects: ObjectMap
+
+    @property
+    def first_free_id(self) -> int:
+        """The first id that no object of the map has, nor any id after it."""
+        return max((o.id for o in (*self.objects.objects, *self.objects.gone)), default=-1) + 1
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,9 @@ def localize(
     objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
     the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
     """
+    # They import scipy.optimize, which takes longer than the map of a small log.
+    from objslam.association.registration.object_maps import placed, reason, register
+
     found = register(objects, known.objects)
     why = reason(found, objects, known.objects, ("the drive", "the map"))
     told: dict[str, Any] = {
@@ -137,20 +144,32 @@ def _solve(
 def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
     """Return the objects of a drive that was found in a map, at the places that the map gives them, with the ids of the map.
 
-    objects: the drive's, described in the frame of the map. Objects that the map does not have get new ids.
+    objects: the drive's, described in the frame of the map. Objects that the map does not have get the first free id of the
+    map, plus their id in the drive.
     """
     assert where.positions is not None
     assert where.covariance is not None
     ids = {int(i): known.objects[int(k)].id for i, k in where.registration.matches}
-    free = max((o.id for o in known.objects), default=-1) + 1
+    free = known.first_free_id
     moved = []
     for j, item in enumerate(objects.objects):
-        number = ids.get(j, free)
-        free += number == free
+        number = ids.get(j, free + item.id)
         covariance = where.covariance[j] if item.covariance is not None else None
         position = where.positions[j] if item.covariance is not None else item.position
         moved.append(replace(item, id=number, position=position, covariance=covariance))
     return ObjectMap(tuple(moved), known.objects.frame)
+
+
+def moved_object(item: MapObject, map_T_drive: Floats) -> MapObject:
+    """Return an object of a drive in the frame of the map. map_T_drive: (4, 4)."""
+    turn, shift = map_T_drive[:3, :3], map_T_drive[:3, 3]
+    return replace(
+        item,
+        position=turn @ item.position + shift,
+        covariance=None if item.covariance is None else turn @ item.covariance @ turn.T,
+        ray=None if item.ray is None else (turn @ item.ray[0] + shift, turn @ item.ray[1]),
+        seen_from=None if item.seen_from is None else replace(item.seen_from, sides=item.seen_from.sides @ turn.T),
+    )
 
 
 def moved_log(log: Log, map_T_drive: Floats) -> Log:

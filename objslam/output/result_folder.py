@@ -35,7 +35,7 @@ from objslam.sources.log_folder import resembles_log
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
 """The files that a new result replaces or deletes. They include the exports of the older result."""
 _ALL_BUT_OBJECTS = replace(RESULT_FILES, others=tuple(name for name in RESULT_FILES.others if name != files.OBJECTS))
-"""The files of an older result that a live session deletes."""
+"""The files of an older result that a live session deletes. objects.json is not among them, because it is replaced."""
 
 
 def prepare_output(out: Path) -> None:
@@ -101,7 +101,7 @@ def clear_result(out: Path) -> tuple[str, ...]:
     """Delete the files of an earlier run from the folder of a live session, and return their names.
 
     A remaining file would look like a file of the session. objects.json stays, because the session replaces it. If the
-    process is killed in between, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
+    process is killed meanwhile, the next `prepare_output` deletes the rest. Raises OutputError as `write_result` does.
     """
     return replace_files(out, _ALL_BUT_OBJECTS, {})
 

@@ -19,13 +19,13 @@ from objslam.results import files
 from objslam.results.files import dump_json
 
 _MOST_ISLANDS = 100
-"""The most islands of an earlier merge that are looked for. A larger number finds those of larger merges."""
+"""The highest number of an island of an earlier merge that is looked for. A larger number finds more of a large merge."""
 
 
 def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:
     """Write the largest island into the folder `out`, the others into `out`/island_2 and so on. Return their folders.
 
-    names: of all sessions. warnings: what the user is to know. OutputError if a folder cannot be written.
+    names: of all sessions, in their order. warnings: each summary.json gets them. OutputError if a folder cannot be written.
     """
     folders = [out if number == 0 else out / f"island_{number + 1}" for number in range(len(islands))]
     for folder, island in zip(folders, islands, strict=True):

@@ -12,7 +12,7 @@ TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
 PATH = "path.txt"  # The pose map_T_base at each pose of the recorded path.
 RAYS = "rays.parquet"  # Each ray with its object.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
-VIEWS = "views.parquet"  # The pose of each camera frame, which says what could have been seen.
+VIEWS = "views.parquet"  # The pose of each camera frame. It shows which objects the camera could have seen.
 CONFIG = "config.yaml"  # All settings of the run.
 SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
 DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
@@ -35,7 +35,7 @@ PARTS = (
 
 
 def hint_below(folder: Path) -> str | None:
-    """Return a hint that lists the results in the subfolders of a folder, or None if there are no results."""
+    """Return a hint that lists up to 5 results in the subfolders of a folder, or None if there are no results."""
     below = sorted(str(file.parent) for file in folder.glob(f"*/{SUMMARY}"))
     if not below:
         return None

@@ -60,7 +60,7 @@ def load_trajectory(out: Path) -> Trajectory:
 
 
 def load_path(out: Path) -> Trajectory:
-    """Read map_T_base at each pose of the recorded path. The errors are those of `load_trajectory`."""
+    """Read map_T_base at each pose of the recorded path. Raises the same errors as `load_trajectory`."""
     return _load_poses(_existing(out, files.PATH))
 
 
@@ -76,7 +76,8 @@ def _load_poses(file: Path) -> Trajectory:
 
 
 def load_motions(out: Path) -> Motions | None:
-    """Read the odometry between the poses of the folder `out`; None if it has no odometry. OutputError if it is invalid."""
+    """Read the odometry between the poses of the result folder `out`. None if its run used none. OutputError if the file is
+    invalid or there is no result."""
     _existing(out, files.OBJECTS)
     file = out / files.MOTIONS
     return read_motions(file) if file.is_file() else None
@@ -88,7 +89,8 @@ def load_rays(out: Path) -> RaysTable:
 
 
 def load_views(out: Path) -> Views | None:
-    """Read the camera frames of the folder `out`; None if an older version wrote it. OutputError if the file is damaged."""
+    """Read the camera frames of the result folder `out`. None if it has none, as from an older version. OutputError if the
+    file is damaged or there is no result."""
     _existing(out, files.OBJECTS)
     file = out / files.VIEWS
     return read_views(file) if file.is_file() else None

@@ -1,7 +1,7 @@
 """The shapes of summary.json and evaluation.json: which keys a command reads, and what type each has.
 
-A folder may come from somebody else, so a value of another type must give an error of one clear line. Other keys may hold
-anything.
+A folder may come from somebody else, so a value of a wrong type must give an error of one clear line. A key that no command
+reads may have any value.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -109,7 +109,7 @@ class EvaluationFile(_Shape):
 
 
 def fault_of(data: dict[str, Any], shape: type[BaseModel]) -> str | None:
-    """Return the first value in which data differ from a shape, as "key: what is wrong"; None if they fit."""
+    """Return the first fault of data that do not fit a shape, as "key: what is wrong"; None if they fit."""
     try:
         shape.model_validate(data)
     except ValidationError as error:

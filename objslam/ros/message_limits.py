@@ -9,7 +9,7 @@ _MAX_SMALL = 64 << 20  # The largest message that is not an image, bytes. A larg
 
 
 def check_size(type_: str, data: bytes, encoding: str) -> None:
-    """Raise DecodeError if a serialised message of a ROS type is larger, or says that it has more elements, than is used."""
+    """Raise DecodeError if a serialised message of a ROS type is too large, or has too many detections or transforms."""
     if is_boxes(type_) and read_head(data, encoding)[2] > MAX_BOXES:
         raise DecodeError(f"more than {MAX_BOXES} detections in one message")
     if type_ in TRANSFORMS and read_length(data, encoding) > MAX_TRANSFORMS:

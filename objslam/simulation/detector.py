@@ -32,7 +32,11 @@ class Views:
 
 @dataclass(frozen=True)
 class Boxes:
-    """M boxes of one camera in any order. object: (M,) the id of the object in each box, -1 for a false box."""
+    """M boxes of one camera in any order.
+
+    frame: (M,) the index of the image. object: (M,) the id of the object in each box, -1 for a false box. label: (M,) index
+    into the classes. box: (M, 4) x1, y1, x2, y2, px. score: (M,). depth: (M,) z, m, NaN without a depth.
+    """
 
     frame: Ints
     object: Ints
@@ -77,7 +81,8 @@ def _reach(settings: DriveSettings, size: Floats) -> Floats:
 def detect(
     settings: DriveSettings, camera: Camera, seen: Views, label: Ints, seed: np.random.SeedSequence, first_id: int = 0
 ) -> Boxes:
-    """Make boxes of visible objects, with noise and misses. label: (N,) of each object. first_id: the id of object 0."""
+    """Make boxes of visible objects, with noise and misses. label: (N,) the label of each object, as an index into the
+    classes. first_id: the id of object 0."""
     noise, miss, score, depth = (np.random.default_rng(s) for s in seed.spawn(4))
     count = len(seen.frame)
     centre = seen.centre + settings.pixel_sigma * noise.standard_normal((count, 2))

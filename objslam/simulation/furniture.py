@@ -26,9 +26,9 @@ class Lamp:
 class Room:
     """The content of a rendered room.
 
-    owner: (P,) the id of the object to which each part belongs, -1 for furniture and other things. labels: the label of each
-    object. middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear RGB colour of ambient
-    light.
+    owner: (P,) the id of the object to which each part belongs, -1 for furniture and other things. labels: the labels of the
+    N objects. middle: (N, 3) the centre of each object's bounding box in map, m. ambient: (3,) the linear RGB colour of
+    ambient light.
     """
 
     parts: tuple[Part, ...]

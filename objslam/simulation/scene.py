@@ -26,7 +26,7 @@ WALL = 0.3  # The least distance of random objects from the walls, m.
 CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
 """The largest number of images of each camera that are checked for views of a position. They are evenly spaced."""
-ROUNDS = 50  # How often a set of random positions is drawn. With a larger value, positions are found for more objects.
+ROUNDS = 50  # The most sets of random positions that are drawn. With a larger value, positions are found for more objects.
 
 
 @dataclass(frozen=True)

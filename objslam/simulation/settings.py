@@ -52,7 +52,7 @@ class DepthNoise(Section):
     sigma: NotNegative = 0.03  # The constant part of the standard deviation, m.
     sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
     missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
-    wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random up to max_range.
+    wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random from 0.3 m to max_range.
 
 
 class CourseSettings(Section):
@@ -62,7 +62,7 @@ class CourseSettings(Section):
     room: tuple[Positive, Positive] = (8.0, 6.0)
     """The size of the room along x and y, m. The origin of the map is the centre of the floor."""
     path: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (2, 3)
-    """The swings of a Lissajous curve along x and along y in a lap. They have no common divisor. (1, 1) is an ellipse."""
+    """The numbers of swings of a Lissajous curve along x and y in a lap, without a common divisor. (1, 1) is an ellipse."""
     margin: Positive = 1.0  # The distance between the path and the walls, m.
     frames: Annotated[int, Field(ge=2)] = 300
     """The number of images of each camera."""
@@ -71,7 +71,8 @@ class CourseSettings(Section):
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift: config.Odometry per distance and turn (without its floors), PoseNoise per image. None: no odometry."""
+    """The drift. config.Odometry: by distance and turn, without the floors. PoseNoise: by the time of one image. None: no
+    odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
@@ -93,7 +94,7 @@ class DriveSettings(CourseSettings):
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """All cameras together see a random object at least in this many images, as a share of the images of one camera."""
+    """The least number of images, of all cameras together, that show a random object, as a share of one camera's images."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""

@@ -68,7 +68,8 @@ def _integral(values: Floats, over: Floats) -> Floats:
 
 
 def frame_stamps(settings: DriveSettings) -> Floats:
-    """Return the stamps (F, C), s, of the images of each camera. Without `together`, they follow each other evenly."""
+    """Return the stamps (F, C), s, of the F images of each of the C cameras. Without `together`, the cameras take turns at
+    even intervals."""
     cameras = len(settings.cameras)
     later = np.zeros(cameras) if settings.together else np.arange(cameras) / cameras
     return START + (np.arange(settings.frames)[:, None] + later) / settings.frame_rate

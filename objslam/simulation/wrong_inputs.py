@@ -59,7 +59,7 @@ def _mount(change: Callable[[Floats], Floats]) -> Mistake:
 
 
 def _turned(roll: float, pitch: float, yaw: float) -> Mistake:
-    """A calibration that is turned about the axes of base, degrees."""
+    """Return the mistake that each camera is turned about the axes of base, by angles in degrees."""
     turn = exp_se3(np.append(np.zeros(3), np.radians([roll, pitch, yaw])))
     turn[:3, :3] = Rotation.from_euler("xyz", [roll, pitch, yaw], degrees=True).as_matrix()
     return _mount(lambda pose: make_pose(turn[:3, :3] @ pose[:3, :3], pose[:3, 3]))
@@ -108,7 +108,7 @@ def _w_first(poses: Floats) -> Floats:
 
 
 def _frozen(begin: float) -> Mistake:
-    """Poses that stop changing after the share `begin` of the log."""
+    """Return the mistake that the poses stay the same from the share `begin` (0 to 1) of the log on."""
 
     def change(poses: Floats) -> Floats:
         first = int(begin * (len(poses) - 1))
@@ -118,13 +118,13 @@ def _frozen(begin: float) -> Mistake:
 
 
 def _jumping(poses: Floats) -> Floats:
-    """A path that jumps 2 m aside three times."""
+    """Return poses (N, 4, 4) that jump aside by 2 m three times."""
     jump = np.floor(4 * np.arange(len(poses)) / len(poses))
     return make_pose(poses[:, :3, :3], poses[:, :3, 3] + jump[:, None] * [1.2, 1.6, 0.0])
 
 
 def _other_map(poses: Floats) -> Floats:
-    """The second half in the coordinates of another map."""
+    """Return poses (N, 4, 4), with the second half in the coordinates of another map."""
     other = make_pose(Rotation.from_euler("z", 100, degrees=True).as_matrix(), np.array([2.0, -1.0, 0.0]))
     return np.asarray(np.where((np.arange(len(poses)) < len(poses) // 2)[:, None, None], poses, other @ poses))
 
@@ -156,7 +156,8 @@ def _depth(factor: float) -> Mistake:
 
 
 def _camera_moved(log: Log) -> Log:
-    """A camera that somebody turned by 10 degrees in the middle of the log: the boxes move, the calibration does not."""
+    """Return a log in which somebody turned each camera by 10 degrees in the middle: the boxes move, but the calibration
+    stays."""
 
     def changed(one: CameraLog) -> CameraLog:
         found, camera = one.detections, one.camera
@@ -170,9 +171,9 @@ def _camera_moved(log: Log) -> Log:
 
 
 def join(first: Log, second: Log, *, interleaved: bool) -> Log:
-    """Return a log with the boxes of two recordings: frame by frame in turns, or one half of each.
+    """Return a log with boxes of two recordings: in turns frame by frame if `interleaved`, else one half of each.
 
-    Poses and calibration are from the first recording.
+    Poses, stamps and calibration are from the first recording.
     """
 
     def boxes_of(a: Detections, b: Detections) -> Detections:

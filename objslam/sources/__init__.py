@@ -116,9 +116,10 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
 def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:
     """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
-    Images inside a bag are extracted into a temporary folder beside the log folder. They are then linked into the log
-    folder, so that their bytes are written only once. Of a recording that has no camera, the path and the mounts that tf
-    knows are written, with a warning. Raises the errors of `read` and `log_folder.write_log_folder`.
+    Images inside a bag are extracted into a temporary folder beside the log folder, unless `options.extract` names another
+    folder. They are then linked into the log folder, so that their bytes are written only once. If the recording has no
+    camera, only the robot's path and the poses of cameras in tf are written, with a warning.
+    Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder
 
@@ -135,7 +136,10 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
 
 
 def choose(path: Path, name: str | None = None) -> Source:
-    """Return the kind called `name`, or if it is None the kind of the recording at `path`. Raises the errors of `read`."""
+    """Return the kind called `name`. If `name` is None, return the kind of the recording at `path`.
+
+    Raises ConfigError if no kind has this name, and LogError if no kind fits the path or the path cannot be read.
+    """
     if name is not None:
         named = {source.name: source for source in SOURCES}
         if name not in named:

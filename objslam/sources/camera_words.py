@@ -5,13 +5,13 @@ import numpy as np
 from objslam.core.camera import Camera, spoken_name, undistort
 
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
-_STEEP = 60.0  # The elevation, degrees, from which a camera counts as looking up or down. A larger value counts fewer so.
+_STEEP = 60.0  # The elevation, degrees, from which a camera looks up or down in the text. With a larger value, fewer do.
 _LEVEL = 5.0  # The elevation and tilt, degrees, up to which the text omits them. A larger value omits more of them.
-_ASPECT = 1.2  # The ratio of fx and fy above which a pixel would be odd. Real lenses stay below 1.1.
+_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is above this. Real lenses stay below 1.1. More reports fewer.
 
 
 def view_of(camera: Camera) -> str:
-    """Return where a camera looks, how high it sits and how wide it sees, such as "looks ahead, 0.30 m above base"."""
+    """Describe a camera's direction, tilt, height and angle of view: "looks ahead, 0.30 m above base, 70 degrees wide"."""
     right, down, forward = camera.base_T_camera[:3, :3].T
     height = float(camera.base_T_camera[2, 3])
     parts = [f"looks {_direction(forward)}"]
@@ -26,7 +26,7 @@ def view_of(camera: Camera) -> str:
 
 
 def doubts_of(camera: Camera) -> list[str]:
-    """Return a line for each property of a calibration that few cameras have."""
+    """Return a line for each unusual property of a camera's calibration."""
     doubts = []
     if np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6):
         doubts.append(
@@ -41,7 +41,7 @@ def doubts_of(camera: Camera) -> list[str]:
 
 
 def _direction(forward: np.ndarray) -> str:
-    """Return a direction (3,) in base in words."""
+    """Return in words where a unit vector (3,) in base points."""
     up = float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1))))
     if abs(up) >= _STEEP:
         return "up" if up > 0 else "down"
@@ -50,10 +50,10 @@ def _direction(forward: np.ndarray) -> str:
 
 
 def _width(camera: Camera) -> float:
-    """Return the angle, degrees, between the left and the right edge of the image, through the principal point."""
+    """Return the angle, degrees, between the left and the right edge of the image, in the row of the principal point."""
     row = camera.matrix[1, 2]
     edges, valid = undistort(camera, np.array([[-0.5, row], [camera.width - 0.5, row]]))
-    if not valid.all():  # The lens model has no inverse at the edge.
+    if not valid.all():  # The lens model has no inverse at an edge, so its distortion is left out.
         edges = np.linalg.solve(camera.matrix, np.array([[-0.5, camera.width - 0.5], [row, row], [1, 1]])).T
     angles = np.arctan2(edges[:, 0], edges[:, 2])
     return float(np.degrees(angles[1] - angles[0]))

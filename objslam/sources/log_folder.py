@@ -24,7 +24,7 @@ from objslam.sources.no_camera import NoCamera
 
 CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
-MOUNTS = "mounts.yaml"  # The poses of cameras on the robot, of a recording that has no camera.
+MOUNTS = "mounts.yaml"  # The poses of cameras on the robot, if a recording has no camera but tf knows the poses.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
@@ -67,9 +67,10 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
     """Write a log folder. Every number reads back as the same float. Rotations are written as unit quaternions.
 
     The content is written into a temporary folder that is renamed at the end. Images are linked or copied into rgb/ and
-    depth/. Images that are already in the camera's folder keep their relative path. Detections without frames are not
-    written. Raises OutputError if the log has no cameras, if it has neither odometry nor localisation, if the names of its
-    cameras cannot be folder names, if a file cannot be written, or if `check_target` refuses the path.
+    depth/. If all images of a stream are already in the camera's folder, they keep their relative paths. Detections without
+    frames are not written. Raises OutputError if the log has no cameras, if it has neither odometry nor localisation, if the
+    names of several cameras repeat or cannot be folder names, if a file cannot be written, or if `check_target` refuses the
+    path.
     """
     path = Path(os.path.realpath(path))
     if not log.cameras or log.robot_path is None:
@@ -85,7 +86,8 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple[str, ...]:
     """Write the path and the mounts of a recording without a camera, and return the names of the files.
 
-    A camera.yaml and a detections.jsonl beside them make it a log. Raises OutputError as `write_log_folder` does.
+    A camera.yaml and a detections.jsonl beside these files make the folder a log. Raises OutputError if a file cannot be
+    written, or if `check_target` refuses the path.
     """
     paths = {ODOMETRY: found.odometry, LOCALIZATION: found.localization}
     known = {name: trajectory for name, trajectory in paths.items() if trajectory is not None}
@@ -101,7 +103,7 @@ def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple
 
 
 def _write_whole(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
-    """Make the folder at `path`, with what `write` writes into it, whole or not at all."""
+    """Make the folder at `path` with the files that `write` writes into it. It is made whole or not at all."""
     check_target(path, overwrite)
     with beside(path) as work, _writing(path):
         fresh = work / "new"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class NoCamera(LogError):
-    """A recording without a camera. mounts: base_T_camera (4, 4) by the name of the optical frame, as tf tells them."""
+    """A recording without a camera. mounts: base_T_camera (4, 4) from tf, by the name of the optical frame."""
 
     def __init__(
         self,

@@ -25,7 +25,7 @@ class Option:
 
 WithRange = Annotated[bool, Option("--without-range", "MRCLAM, TUM, ROS bags: boxes without depths (bearings only).")]
 Label = Annotated[str | None, Option("--label", "Label of boxes that have no class.")]
-DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. They replace the boxes of the log.")
+DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. Its boxes replace those of the log.")
 """The option that chooses the detector, in `objslam run` and in live sessions."""
 
 
@@ -42,7 +42,7 @@ def names(*kinds: type[Any] | None) -> frozenset[str]:
 
 
 def flags(kind: type[Any]) -> dict[str, tuple[Any, Option]]:
-    """Return the type and the Option of each field with an Option, in the order of `--help`."""
+    """Return the type and the Option of each field that has an Option, by field name and in the order of `--help`."""
     hints = get_type_hints(kind, include_extras=True)
     extras = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in fields(kind)}
     return {name: (hints[name].__origin__, e) for name, found in extras.items() for e in found if isinstance(e, Option)}
@@ -51,7 +51,8 @@ def flags(kind: type[Any]) -> dict[str, tuple[Any, Option]]:
 def unused(options: Any, kind: type[Any], taken: Collection[str]) -> list[str]:
     """Return the flags of the options that are set but not used.
 
-    These are the fields of the class `kind` that are not in `taken` and whose value is not the default.
+    options: an instance of the class `kind`. taken: the names of the fields that are used. An option is set if its value is
+    not the default. A field without an Option has its name as flag.
     """
     called = {name: option.flag.partition("/")[0] for name, (_, option) in flags(kind).items()}
     return [

@@ -99,7 +99,10 @@ def in_words(found: Contents) -> list[str]:
 
 
 def off_path(where: str, frames: Floats, path: Trajectory | None) -> list[str]:
-    """Return one message if images have stamps (N,), s, but none of them is in the time of the path. Else return none."""
+    """Return one message if frames have stamps (N,), s, but none of them is within the time of the path.
+
+    The list is empty in all other cases. where: the name of the camera in the message.
+    """
     if path is None or len(frames) == 0 or ((frames >= path.stamps[0]) & (frames <= path.stamps[-1])).any():
         return []
     return [

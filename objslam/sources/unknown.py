@@ -13,7 +13,7 @@ from objslam.sources.log_folder import CAMERA, CAMERAS, LOCALIZATION, ODOMETRY, 
 _VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 _ARCHIVES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp"}
-_LOOKED_AT = 20  # The most subfolders in which a recording is looked for. A larger number takes longer on large folders.
+_LOOKED_AT = 20  # The most subfolders that are searched for recordings and images. A larger number takes longer.
 _SHOWN = 3  # The most names in a message. A larger number makes it longer.
 _NEEDED = f"a log folder has {CAMERA}, {ODOMETRY} or {LOCALIZATION}, and detections.jsonl or {RGB}.txt"
 
@@ -21,8 +21,8 @@ _NEEDED = f"a log folder has {CAMERA}, {ODOMETRY} or {LOCALIZATION}, and detecti
 def unknown_recording(path: Path, is_recording: Callable[[Path], bool], looked_for: str) -> LogError:
     """Return the error for a path that is no recording.
 
-    is_recording: whether some source reads a path. looked_for: what identifies each source. Raises LogError if the path
-    cannot be read.
+    is_recording: the function that returns whether some source reads a path. looked_for: what identifies each source, as
+    text. Raises LogError if the path cannot be read.
     """
     with reading(path):
         what, hint = _folder(path, is_recording, looked_for) if path.is_dir() else _file(path)

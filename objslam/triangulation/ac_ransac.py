@@ -33,9 +33,10 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
     """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
-    far ahead, on which nearly parallel rays agree. From the best candidate on, two steps alternate while the agreement
-    grows: select the rays that agree with the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all
-    its rays. `hypotheses` and `jitter` are as in `best_pair`.
+    far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
+    within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. `hypotheses` and `jitter` are
+    as in `best_pair`.
     """
     xp = module_of(bundle.origin)
     used = xp.ones_like(bundle.index, dtype=xp.bool)
@@ -107,7 +108,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
     objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
     `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
-    this pair in its part. The result of an object depends on its own rays alone.
+    the tried pair in each part. The result of an object depends on its own rays alone.
     """
     xp = module_of(bundle.origin)
     points = xp.full((len(bundle.number), 3), xp.nan, dtype=bundle.origin.dtype, device=bundle.origin.device)
@@ -131,8 +132,8 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pairs (B, H) of rays `first` < `second` of objects with `number` (B,) rays, and whether each pair exists.
-    which: (H,) indices of the hypotheses, with their jitter (H,)."""
+    """Return the indices (B, H) `first` < `second` of the two rays of each pair among the rays of an object, and whether the
+    pair exists. number: (B,) rays of each object. which: (H,) indices of the hypotheses, with their jitter (H,)."""
     xp = module_of(number)
     n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2

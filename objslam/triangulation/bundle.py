@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from objslam.core.array_module import Tensor, indices_of, module_of
 
 _SIMILAR = (2, 32)
-"""The numbers a and b. If the smallest object of a block has n rays, its largest object has at most a n + b rays. Larger
-numbers make fewer blocks with more filler. With these numbers, at most half of a block is filler. Only blocks of objects
-with very few rays have more, where filler costs nothing."""
+"""The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Larger values
+make fewer blocks with more filler. With these values, filler is at most about half of a block of objects with hundreds of
+rays. It may be more where objects have few rays, but costs little there."""
 
 
 @dataclass(frozen=True)
 class Bundle:
     """Rays of many objects, sorted by object. All arrays are numpy arrays, or all are torch tensors.
 
-    origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise along each
-    perpendicular axis. position_sigma: m, noise of the origins. index: (R,) object of each ray. number: (N,) number of rays
-    of each object.
+    origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise of a ray's angle
+    along each perpendicular axis. position_sigma: m, noise of the origins along each axis. index: (R,) object of each ray.
+    number: (N,) number of rays of each object.
     """
 
     origin: Tensor

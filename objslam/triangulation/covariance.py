@@ -16,11 +16,11 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
     Eq. 1 is an M-estimator with covariance A^-1 B A^-1, where A is the expected Hessian and B the gradient covariance (Huber
     & Ronchetti, Robust Statistics, ch. 6). The offset of ray i is Gaussian with standard deviation s_i along both axes
-    across the ray. Then its direction u has E[u u^T] = P / 2, where P projects across the ray. Its length d is independent
-    of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2 to B. Residuals above s_i
-    widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not reduce: rays miss a nearer
-    object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2 r_i / s_i, where r_i is the
-    length of the ray. The result includes the square of this bias.
+    across the ray. Then the direction u of the offset has E[u u^T] = P / 2, where P projects across the ray. The length d of
+    the offset is independent of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2
+    to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not
+    reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2
+    r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
     """
     xp = module_of(point)
     rays = bundle.select(use)
@@ -44,9 +44,9 @@ def fuse_ranges(
 
     It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
     range gets NaN. All ranges of an object share an error with the standard deviation range_bias (R,) m. It moves the point
-    along the rays and enters the covariance. The loss is squared across the rays, because their outliers are already
-    removed. It is Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is
-    robust in both directions and gives no covariance.
+    along the rays, and the covariance includes it. The loss is squared across the rays, because `use` has no outliers. It is
+    Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is robust in both
+    directions and gives no covariance.
     """
     xp = module_of(ranges)
     rays, count = bundle.select(use), len(bundle.number)
@@ -122,7 +122,8 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-    For an object with many rays, only the extreme rays in 64 directions are compared. The angle is then exact to 1 %."""
+    Of more than `_EVERY_PAIR` rays, only the ones nearest to 64 evenly spread axes are compared. The angle is then exact to
+    1 %."""
     xp = module_of(bundle.direction)
     rays = bundle.select(use)
     widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
@@ -168,8 +169,9 @@ def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation. miss: (R,)
-    normalised residuals. Their mean is used, because it is robust. The fit takes `taken` of the 2 n degrees of freedom of n
-    rays and leaves the rest. The excess over 1 is enlarged, because an estimate from few degrees of freedom is uncertain.
+    normalised residuals. Their mean is used, because it is more robust than their mean square. The fit takes `taken` of the
+    2 n degrees of freedom of n rays. `rest` is what is left. The excess over 1 is enlarged, because an estimate from few
+    degrees of freedom is uncertain.
     The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
     exact to 3 % from 4 rays on."""
     number = as_type(rays.number, miss)

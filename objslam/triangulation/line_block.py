@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from objslam.core.array_module import Tensor, as_type, contiguous, module_of, rows
 from objslam.triangulation.bundle import Bundle
 
-_FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # The place of each of the nine entries of a symmetric matrix among its six values.
+_FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # For each of the nine entries of a symmetric matrix, the index of its value in `outer`.
 
 
 @dataclass(frozen=True)
 class LineBlock:
-    """Lines of B objects with up to n lines each. foot: (3, n, B) the point of each line nearest to the coordinate origin.
-    direction: (3, n, B) unit. weight: (n, B) 1 for a line, 0 for a filler."""
+    """Lines of B objects with up to n lines each, in coordinates of their object. foot: (3, n, B) the point of each line
+    nearest to the coordinate origin. direction: (3, n, B) unit. weight: (n, B) 1 for a line, 0 for a filler."""
 
     foot: Tensor
     direction: Tensor
@@ -28,7 +28,8 @@ class LineBlock:
         return perpendicular(points[:, None], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Return the sum (6, B) of weight (n, B) times I - n n^T over the lines of each object with directions n."""
+        """Return the sum of weight (n, B) times I - d d^T over the lines of each object, (6, B) as in `outer`. d: a line's
+        direction."""
         result = -outer(self.direction * weight, self.direction)
         result[:3] += weight.sum(axis=0)
         return result
@@ -43,9 +44,10 @@ class LineBlock:
 
 
 def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return origins (3, n, B), directions (3, n, B) and weights (n, B) of the rays (B, n) of a block of the bundle.
+    """Return origins (3, n, B), directions (3, n, B) and weights (n, B) of one block of rays.
 
-    The longer one of the axes n and B is contiguous in memory, because a pass over a short one is slow.
+    rays, real: (B, n) as `Bundle.blocks` yields them. The longer one of the axes n and B is contiguous in memory, because a
+    pass over a short one is slow.
     """
     wide = rays.shape[0] >= rays.shape[1]
     weight = as_type(real, bundle.origin)
@@ -58,7 +60,7 @@ def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, 
 
 def through(origin: Tensor, direction: Tensor, weight: Tensor) -> LineBlock:
     """Return the lines through points (3, n, B), in coordinates of their object, along unit directions (3, n, B)."""
-    # The first projection leaves a rounding error along the line of the size of the origin. The second removes it.
+    # The first projection leaves a rounding error along the line, which grows with the origin. The second removes it.
     return LineBlock(perpendicular(perpendicular(origin, direction), direction), direction, weight)
 
 
@@ -95,8 +97,8 @@ def full(six: Tensor) -> Tensor:
 
 def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1. The regularity is the
-    determinant over the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x is
-    useless."""
+    determinant over the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x has no
+    meaning."""
     xx, yy, zz, xy, xz, yz = a
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * c0 + xy * c1 + xz * c2

@@ -1,4 +1,4 @@
-"""Lines of many objects in one list with an object index per line. `line_block` is for repeated passes over the lines."""
+"""Lines of many objects in flat arrays, with an object index per line. `line_block` is faster for repeated passes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from objslam.core.array_module import Tensor, group_sum, module_of
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of many objects. foot: (R, 3) the point of each line nearest to the coordinate origin. direction: (R, 3) unit.
-    index: (R,) the object of each line. count: the number N of objects."""
+    """Lines of many objects, in coordinates of the line's object. foot: (R, 3) the point of each line nearest to the
+    coordinate origin. direction: (R, 3) unit. index: (R,) the object of each line. count: the number N of objects."""
 
     foot: Tensor
     direction: Tensor
@@ -21,7 +21,7 @@ class Lines:
     @classmethod
     def through(cls, origin: Tensor, direction: Tensor, index: Tensor, count: int) -> Self:
         """Make lines through the points `origin` (R, 3), in coordinates of their object, along unit directions (R, 3)."""
-        # The first projection leaves a rounding error along the line of the size of the origin. The second removes it.
+        # The first projection leaves a rounding error along the line, which grows with the origin. The second removes it.
         return cls(_perpendicular(_perpendicular(origin, direction), direction), direction, index, count)
 
     def sum(self, values: Tensor) -> Tensor:
@@ -33,7 +33,7 @@ class Lines:
         return _perpendicular(points[self.index], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Return the sum (N, 3, 3) of weight (R,) times I - n n^T over the lines of each object with directions n."""
+        """Return the sum (N, 3, 3) of weight (R,) times I - n n^T over the lines of each object. n: a line's direction."""
         xp = module_of(weight)
         eye = xp.eye(3, dtype=weight.dtype, device=weight.device)
         return self.sum(weight)[:, None, None] * eye - self.outer(self.direction * weight[:, None], self.direction)

@@ -14,9 +14,10 @@ _WEIGHTED_STEPS = 3
 _SMOOTHING = 0.05
 """The smoothing (in mean distances) of the weighted steps. A larger one weakens outliers less."""
 _SINGLE_STEPS = 3
-"""The most Newton steps in single precision, which takes half of the time. More do not improve a single-precision point."""
+"""The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
+improve a single-precision point."""
 _STEPS = 6
-"""The most Newton steps in double precision. An object that needs more has a line near its solution."""
+"""The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
 _LINE_STEPS = 6
 """The number of Newton steps along the nearest line."""
 _SHORTER = 0.3
@@ -28,7 +29,7 @@ _TINY = 1e-30
 
 
 def approach(lines: LineBlock) -> tuple[Tensor, int]:
-    """Return points (3, B) near the optimum, exact to about 1e-6, and the number of steps. The start is the origin."""
+    """Return points (3, B) near the optimum, exact to about 1e-6, and the number of steps, from the coordinate origin on."""
     xp = module_of(lines.foot)
     rough = LineBlock(as_single(lines.foot), as_single(lines.direction), as_single(lines.weight))
     point = xp.zeros_like(rough.foot[:, 0])
@@ -42,7 +43,7 @@ def approach(lines: LineBlock) -> tuple[Tensor, int]:
 
 
 def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Take Newton steps from the start (3, B). A step that does not lower the cost enough is shortened.
+    """Take at most `steps` Newton steps from the start (3, B). A step that does not lower the cost enough is shortened.
 
     Returns:
         The points (3, B), the gradient norms (B,), which objects are solved up to rounding (B,), and the number of steps. An
@@ -85,11 +86,12 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 
 
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return values as `newton`.
+    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return what `newton` does.
 
-    The optimum of Eq. 1 lies on the line if the gradient of the other distances, across the line, is at most 1 (Kuhn, Math.
-    Programming 4, 1973). This proves the optimum, and the returned norm is the smallest subgradient. Otherwise the optimum
-    lies beside the line. Newton steps start there.
+    First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
+    has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
+    1973), and the returned norm is that of the smallest subgradient. If the gradient is larger, the optimum lies beside the
+    line, and Newton steps start there.
     """
     xp = module_of(start)
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))
@@ -120,7 +122,8 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradient (3, B) of Eq. 1, its curvature (B,) along unit vectors (3, B), and the sum (B,) of 1 + 1 / d."""
+    """Return, at points (3, B), the gradient (3, B) of Eq. 1, the second derivative (B,) of Eq. 1 along the unit vectors
+    `axis` (3, B), and the sum (B,) of 1 + 1 / d, at most 1e6."""
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse
@@ -130,7 +133,8 @@ def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tens
 
 
 def _hessian(direction: Tensor, u: Tensor, inverse: Tensor) -> Tensor:
-    """Return the sums (6, B) of t t^T / d with t = n x u. u: (3, n, B) zero for a filler. inverse: (n, B) of 1 / d."""
+    """Return the sums of t t^T / d with t = n x u, (6, B) as in `outer`. u: (3, n, B) and inverse: (n, B) 1 / d, both zero
+    for a filler."""
     x, y, z = direction
     a, b, c = u
     t0, t1, t2 = y * c - z * b, z * a - x * c, x * b - y * a

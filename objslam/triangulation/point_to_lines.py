@@ -24,11 +24,11 @@ from objslam.triangulation.newton import approach, newton, off_nearest_line
 from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most rays in one block. A smaller number needs more calls, and a call of torch costs more than a call of numpy. A
-larger number does not fit into the cache of a CPU, or needs more memory on CUDA: 1 kB a ray. On the CPU, blocks four times
-as large take 1.1 (numpy) and 1.2 times (torch) as long. The number for CUDA was not measured."""
+"""The most places for rays in one block, for each backend. A smaller number needs more calls, and a call of torch costs more
+than a call of numpy. A larger block does not fit into the cache of a CPU. On CUDA, it needs more memory: 1 kB a ray. On the
+CPU, blocks four times as large take 1.1 (numpy) and 1.2 times (torch) as long. The number for CUDA was not measured."""
 _ROUNDS = 3
-"""The most rounds with Newton steps for the objects with a line near the solution. `smoothed_newton` solves the rest."""
+"""The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest."""
 _LEAST_REGULAR = 1e-6
 """The regularity of a matrix, from 0 to 1, below which eigenvalues decide whether the lines fix a point."""
 
@@ -112,7 +112,7 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Ten
     """Return the least-squares points (3, B) of a block, as in `least_squares`, and which are unique (B,)."""
     xp = module_of(origin)
     number = weight.sum(axis=0)
-    base = (origin * weight).sum(axis=1) / number  # Map coordinates may be large.
+    base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.
     # One projection is exact enough for squared distances.
     lines = LineBlock(perpendicular(origin - base[:, None], direction), direction, weight)
     matrix, pull = lines.spread(weight), (lines.foot * weight).sum(axis=1)
@@ -137,7 +137,7 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Ten
 def _unit_lines(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[LineBlock, Tensor, Tensor]:
     """Return lines in units of their mean distance from the coordinate origin, this unit (B,) m, and which lines meet (B,).
 
-    origin: (3, n, B) m, relative to a point of the object. Lines of an object that meet there up to rounding have no unit.
+    origin: (3, n, B) m. Its coordinate origin is a point of the object. Lines that meet there, up to rounding, stay in m.
     """
     xp = module_of(origin)
     lines = through(origin, direction, weight)

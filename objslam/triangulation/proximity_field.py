@@ -79,6 +79,7 @@ def main_heading(directions: Floats) -> Floats:
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Return a mask (R,) of the rays of one object (R,) that have a weight above 0. If none has, it holds all its rays."""
+    """Return a mask (R,) of the rays of one object, those in the mask `object_` (R,), that have a weight (R,) above 0. If
+    none has one, return all rays of the object."""
     kept = object_ & (weight > 0)
     return kept if kept.any() else object_

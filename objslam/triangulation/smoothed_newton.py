@@ -8,7 +8,7 @@ from objslam.triangulation.line_block import LineBlock, apply, dot, full, norm, 
 _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block earlier.
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
 _LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
-_ON_LINE = (1e-7, 1e-5)  # The values of `on_line` that `_exact_optimum` is tried with (in mean distances).
+_ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried where 0 does not give the optimum.
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
 
@@ -35,8 +35,9 @@ def _smoothed_optimum(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
     """Minimise the sum of sqrt(distance^2 + epsilon^2) for all objects by primal-dual Newton, while epsilon goes to zero.
 
     The method is Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000), with Chan, Golub & Mulet's
-    linearisation. It returns the points (3, B), the dual (3, n, B) of each line, and the number of iterations. The dual is
-    the unit offset. If the solution lies on the line, the dual is another vector in the unit ball across the line.
+    linearisation. The result is the points (3, B), the dual (3, n, B) of each line, and the number of iterations. The dual
+    is the unit vector of the offset. If the solution lies on the line, the dual is a vector across the line that is at most
+    1 long.
     """
     xp = module_of(lines.foot)
     point, dual = xp.zeros_like(lines.foot[:, 0]), xp.zeros_like(lines.foot)
@@ -98,8 +99,8 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
     """Return the exact optimum (3, B) next to the smoothed one, and the norm (B,) of its smallest subgradient.
 
     Lines within the distance `on_line` of the smoothed solution are assumed to pass through the exact one. The point moves
-    onto these lines, and Newton steps use the remaining freedom. The subgradient shows whether the assumption holds. Its
-    norm is inf if these lines do not meet.
+    onto these lines. Newton steps then move it in the directions that the lines leave free. The subgradient shows whether
+    the assumption is right. Its norm is inf if the lines do not meet.
     """
     xp = module_of(point)
     on = xp.where(norm(lines.offset(point)) <= on_line, lines.weight, 0.0)
@@ -117,7 +118,7 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
         if newton:
             curvature = full(lines.spread(inverse_d) - outer(u * inverse_d, u))
             point = point - _short_newton(free @ curvature @ free, apply(free, pull))
-    # Each line through the point may add a vector of length up to 1. These vectors make the subgradient smallest.
+    # Each line through the point may add a vector of length up to 1. They are chosen to make the subgradient smallest.
     answer = perpendicular(dual, lines.direction) * on
     for _ in range(30 if bool((on > 0).any()) else 0):
         rest = pull + answer.sum(axis=1)
@@ -128,7 +129,8 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
 
 
 def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
-    """Return Newton steps (3, B) along directions in which the cost curves. They are short, because the solution is near."""
+    """Return Newton steps (3, B) in the directions in which the cost is curved. A step has at most the length 1e-3 (in mean
+    distances), because the solution is near."""
     xp = module_of(gradient)
     trace = hessian[:, 0, 0] + hessian[:, 1, 1] + hessian[:, 2, 2]
     scale = trace.clip(min=_TINY)

@@ -68,15 +68,17 @@ def triangulate(
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
     An object is ok if at least 2 rays agree more closely than by chance, if their parallax and the relative precision meet
-    the limits of the settings, and if the object lies ahead of most of these rays. Ranges are fused only for an object
-    whose rays fail these limits, or for which all ranges are more precise than all rays. Other objects keep the position of
-    Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object does not
-    depend on other objects or on ray order.
+    the limits of the settings, and if the object lies ahead of most of these rays. A measured range replaces the parallax.
+    Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only for an object whose rays
+    fail these limits, or for which all ranges are more precise than all rays. Other objects keep the position of Eq. 1,
+    because a range ends on the surface of an object and its rays meet inside. The result for an object does not depend on
+    other objects or on ray order.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
         object_index: (R,) the object of each ray, -1 for none, of `count` objects.
         sigma: (R,) or one number, rad, the noise of a ray's angle along each perpendicular axis.
+        seed: of the random pairs of rays that are tried.
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
@@ -231,7 +233,8 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray. A value must be finite and above 0 if `needed` (R,) is finite there, or without `needed`."""
+    """Return one value per ray. ValueError if one is not finite and above 0. Where `needed` (R,) is not finite, no value is
+    needed: a wrong one becomes 1."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():
@@ -257,8 +260,8 @@ def _bundle(
 def _sorted_bundle(
     m: Floats, n: Floats, index: Ints, count: int, sigma: Floats, position_sigma: float, backend: Backend
 ) -> tuple[Ints, Tensor, Bundle]:
-    """Return the same as `_bundle`, but with the rays of each object sorted by their distance from the closed form. So the
-    input order does not affect the tried pairs."""
+    """Return the same as `_bundle`, but with the rays of each object sorted by their distance from its closed-form point. So
+    the input order does not affect which pairs are tried."""
     where, base, rays = _bundle(m, n, index, count, sigma, position_sigma, backend)
     xp = module_of(rays.origin)
     points, _ = least_squares(rays)

@@ -157,8 +157,8 @@ def test_the_columns_of_shared_errors_are_those_of_measuring_anew():
         values = make_values(base, made.points, landmarks)
         return measured, graph, values
 
-    measured, graph, values = residuals(theta)
-    of = Linearised(graph, values, measured, made.association, base, made.points, which)
+    measured, _, values = residuals(theta)
+    of = Linearised(measured, made.association, base, made.points, which)
     system = linearise(of, errors, theta)
     rows = system.first_range
     for k, step in enumerate(0.01 * errors.steps):

@@ -120,7 +120,7 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         ({k: v for k, v in _GOOD.items() if k != "labels"}, "labels is missing or not a list"),
         ({k: v for k, v in _GOOD.items() if k != "scores"}, "scores is missing or not a list"),
         (_GOOD | {"boxes": {"0": [1, 2, 3, 4]}}, "boxes is missing or not a list"),
-        (_GOOD | {"boxes": [1, 2, 3, 4]}, "boxes holds no lists x1, y1, x2, y2"),
+        (_GOOD | {"boxes": [1, 2, 3, 4]}, "boxes must hold lists x1, y1, x2, y2"),
         (_GOOD | {"boxes": [[1, 2, 3, "4"]]}, "a box must hold numbers only"),
         (_GOOD | {"boxes": [[1, 2, 3, True]]}, "a box must hold numbers only"),
         (_GOOD | {"boxes": [[1, 2, 3, 10**400]]}, "a box holds an integer beyond the range of floats"),
@@ -219,7 +219,7 @@ def test_no_usable_frame_is_an_error_that_names_the_file(tmp_path, content):
         ),
         (
             '{"stamp": 1, "boxes": [1, 2, 3, 4], "labels": ["a"], "scores": [1]}',
-            "boxes holds no lists",
+            "boxes must hold lists",
             "[[x1, y1, x2, y2]]",
         ),
         ('[\n {"stamp": 1},\n {"stamp": 2}\n]', "not JSON", "one frame a line"),

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
@@ -128,3 +129,32 @@ def test_drops_name_the_first_places_only():
     count_drops("never", 0, iter(()), ledger)
     assert ledger.dropped == {"late": 5}
     assert ledger.examples["late"] == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1 2",
+        "1 -2.5e-7",
+        "1 nan",
+        "+inf 2",
+        "1. .5",
+        "0x10 1",
+        "1_0 2",
+        "1,2 3",
+        "1e400 2",
+        "'1' 2",
+        "1d2 2",
+        "1j 2",
+        "1 2 3",
+    ],
+)
+def test_a_table_is_the_same_whether_all_its_lines_are_clean_or_not(line, tmp_path):
+    """Numbers of clean files are parsed all at once, those of others line by line. Here a last line makes the difference."""
+    clean, dirty = tmp_path / "clean.txt", tmp_path / "dirty.txt"
+    clean.write_text(f"0.1 7\n{line}\n")
+    dirty.write_text(f"0.1 7\n{line}\nnothing\n")
+    found, told = (read_table(path, 2, Ledger(), "test") for path in (clean, dirty))
+    assert_array_equal(found.values, told.values)
+    assert_array_equal(found.lines, told.lines)
+    assert_array_equal(found.rows, told.rows)

@@ -87,6 +87,39 @@ def test_the_newest_image_counts_and_the_overtaken_are_counted(robot):
     assert messages.ledger.dropped == {"image replaced by a newer one before the detector was free": 9}
 
 
+class SlowDetector:
+    """A detector that needs a permit for each image, and notes the brightness of the images that it sees."""
+
+    def __init__(self):
+        self.permits, self.seen = threading.Semaphore(0), queue.Queue()
+
+    def detect(self, images):
+        self.seen.put(int(images[0].max()))
+        assert self.permits.acquire(timeout=LIMIT)
+        return [Boxes(np.zeros((0, 4)), (), np.zeros(0))]
+
+
+def test_topics_whose_images_come_faster_than_the_detector_take_turns():
+    maker, detector = Maker(), SlowDetector()
+    worker = DetectorWorker(detector, lambda: 0.0)
+    worker.start(lambda boxes: None, lambda reason, place: None, lambda line: None)
+    images = {topic: np.full((48, 64, 3), value, np.uint8) for topic, value in (("/a", 50), ("/b", 100))}
+    try:
+        for i in range(10):
+            for _ in range(3):
+                for topic, image in images.items():
+                    message = maker.image(i * 10**9, image, "rgb8", FRAME)
+                    worker.offer(topic, message, float(i))
+            detector.permits.release()
+            wait_for(lambda least=i + 2: detector.seen.qsize() >= least)  # One was seen before the first permit.
+    finally:
+        detector.permits.release(100)
+        worker.close()
+    counts = np.unique([detector.seen.get() for _ in range(10)], return_counts=True)[1]
+    assert len(counts) == 2
+    assert counts.min() >= 4
+
+
 def test_a_detector_that_breaks_on_one_image_goes_on_with_the_next(robot):
     maker, sink, detector, messages, worker = robot
     detector.go.set()

@@ -188,7 +188,8 @@ def test_the_command_writes_what_was_mapped_and_ends_with_one_line(folder, break
     assert code == 1
     (line,) = [line for line in lines if not line.startswith("warning: ")]
     said = "the session ended early: internal error, RuntimeError: it broke in two lines"
-    assert line == f"objslam: {said} (the map holds the messages until then; `objslam run {out}` maps all received messages)"
+    hint = f"the map covers the messages until then; `objslam run {out}` maps all received messages"
+    assert line == f"objslam: {said} ({hint})"
     assert len(load_map(out).resolved()) >= least
     assert "ended early" in json.loads((out / "summary.json").read_text())["warnings"][-1]
 
@@ -197,7 +198,7 @@ def test_the_command_tells_an_error_of_ours_as_it_is(folder, breaks, command, tm
     breaks(Mapper, "take", 120, SolveError("no\nway", hint="go\nround"))
     code, lines = command(folder, tmp_path / "out", "--speed", "0", "--no-journal")
     assert code == 1
-    assert lines[-1] == "objslam: the session ended early: no way (go round) (the map holds the messages until then)"
+    assert lines[-1] == "objslam: the session ended early: no way (go round) (the map covers the messages until then)"
 
 
 def test_the_command_leaves_the_last_snapshot_where_no_result_can_be_made(folder, breaks, command, tmp_path, monkeypatch):

@@ -162,7 +162,7 @@ def test_lists_are_as_good_as_arrays():
         ({"base_T_camera": [1, 2]}, "whose mount is not a rigid pose"),
         ({"depth_scale": "1000"}, "whose depth scale is not above zero"),
         ({"sees_size": 2}, "whose sees_size is neither true nor false"),
-        ({"depth_noise": 0.01}, "whose depth noise is none"),
+        ({"depth_noise": 0.01}, "whose depth_noise is not a RangeNoise"),
         (
             {"depth_noise": RangeNoise(0.0, 0.01, 0.02)},
             "whose depth noise is not a finite sigma above zero, and sigma_per_m and bias of at least zero",

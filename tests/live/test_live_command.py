@@ -13,8 +13,9 @@ from waiting import LIMIT, wait_for
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
+from objslam.core.object_map import MapObject, ObjectMap
 from objslam.io.calibration_yaml import dump_calibration
-from objslam.io.objects_json import read_objects
+from objslam.io.objects_json import dump_objects, read_objects
 from objslam.live.session.session import Session
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
@@ -68,6 +69,22 @@ def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
     kept, original = read(out, Ledger()), read(log, Ledger())
     assert len(kept.odometry) == len(original.odometry)
     assert len(kept.cameras[0].detections) == len(original.cameras[0].detections)
+
+
+@pytest.mark.parametrize(("objects", "code", "line"), [(12, 0, "localised in"), (0, 3, "not localised in")])
+def test_a_session_in_the_map_of_another_day(log, tmp_path, objects, code, line):
+    """The same room, and an empty map."""
+    known = simulate(preset("demo", frames=150, classes=12, false=0.0), 0).truth.objects[:objects]
+    noise = 0.02**2 * np.eye(3)
+    made = tuple(MapObject(i, o.label, o.position, noise, "ok", 9, 9, 30.0, 0.1, 0.0, 1.0) for i, o in enumerate(known))
+    (tmp_path / "objects.json").write_text(dump_objects(ObjectMap(made)))
+    out = tmp_path / "out"
+    run = command(log, out, "--speed", "0", "--no-journal", "--map", str(tmp_path / "objects.json"))
+    done = subprocess.run(run, capture_output=True, text=True, timeout=LIMIT)
+    assert done.returncode == code, done.stderr
+    assert line in done.stderr + done.stdout
+    told = json.loads((out / "summary.json").read_text())["localisation"]
+    assert told["localised"] == (code == 0)
 
 
 def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):

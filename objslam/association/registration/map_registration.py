@@ -67,7 +67,7 @@ class Registration:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the evidence is enough for the transform, and whether it is enough for another place too."""
+        """Whether the log odds are enough for the transform, and if so, whether its lead over another place is enough."""
         if self.log_odds < MIN_LOG_ODDS:
             return "too little evidence"
         return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"

@@ -1,4 +1,4 @@
-"""The command `objslam live`: its options, the loop of a session until it ends, and the line that shows its state.
+"""The command `objslam live`: its options, the loop that runs until the session ends, and the status line.
 
 The session itself is in `objslam.live`.
 """

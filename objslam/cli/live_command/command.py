@@ -11,7 +11,7 @@ import typer
 
 from objslam.cli.console import progress_bar, say
 from objslam.cli.live_command.drive import LatestObjects, drive, finish
-from objslam.cli.options import CalibrationFile, Config, Out, Set, settings_of, with_options
+from objslam.cli.options import CalibrationFile, Config, Out, PriorMapPath, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
@@ -55,11 +55,17 @@ def live(
     *,
     options: LiveOptions,
     calibration: CalibrationFile = None,
+    map_: PriorMapPath = None,
     publish: Publish = False,
     publish_tf: PublishTf = False,
     view: View = None,
 ) -> None:
-    """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C)."""
+    """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C).
+
+    With --map, the exit code is 3 if the drive is not found in that map.
+    """
+    from objslam.api.mapping import prior_map
+    from objslam.cli.run import NOT_LOCALISED
     from objslam.errors import ConfigError, OutputError
     from objslam.live.adapters.replay import ReplayAdapter
     from objslam.live.session.session import Session
@@ -75,13 +81,15 @@ def live(
         raise ConfigError("--publish-tf and rclpy: the session would hear its own tf", hint="use the source dds")
     settings = settings_of("joint", config, set_, calibration)
     _say_what_is_not_used(source, options, speed, publish or publish_tf)
+    known = None if map_ is None else prior_map(map_)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
     recording = None if source in ADAPTERS else _read(Path(source), options, settings)
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)
         patient = recording is not None and speed == 0
-        session = Session(settings, out / NAME if journal else None, resume, name=Path(source).name, patient=patient)
+        kept = out / NAME if journal else None
+        session = Session(settings, kept, resume, name=Path(source).name, patient=patient, known=known)
         stack.callback(session.abort)
         truth = None
         if recording is None:
@@ -104,11 +112,13 @@ def live(
             feed = replace(feed, views=(*feed.views, stack.enter_context(open_view(view, say, image)).show))
         session.start()
         if resume:
-            kept = session.counters.accepted()
-            say(f"continued {out / NAME}: {', '.join(f'{n} {kind}' for kind, n in kept.items())}", stderr=True)
+            taken = session.counters.accepted()
+            say(f"continued {out / NAME}: {', '.join(f'{n} {kind}' for kind, n in taken.items())}", stderr=True)
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval)
-        finish(session, feed, out, latest, truth, broken)
+        result = finish(session, feed, out, latest, truth, broken)
+    if known is not None and not result.summary["localisation"]["localised"]:
+        raise typer.Exit(NOT_LOCALISED)
 
 
 def _publishing(feed: Feed, options: LiveOptions) -> Feed:
@@ -142,7 +152,7 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
 
 
 def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:
-    """Read a recording to replay. A detector finds its boxes first. LogError if the recording has no boxes then."""
+    """Read a recording to replay. If the options name a detector, it finds the boxes. LogError if there are no boxes."""
     from objslam.api.mapping import find_boxes
     from objslam.core.diagnostics import Ledger
     from objslam.errors import LogError
@@ -162,7 +172,8 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """With `resume`, check that a journal exists. Else rename it, and restore it if the new session gets no message.
+    """With `resume`, check that a journal exists. Without it, rename an existing journal, and restore this journal at the
+    end if the new session got no message.
 
     If the last session was killed before its first message, the journal that it renamed is restored first.
     """

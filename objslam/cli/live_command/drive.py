@@ -16,13 +16,14 @@ from objslam.cli.live_command.status import status_line, times
 from objslam.errors import ObjslamError, OutputError, one_line
 
 if TYPE_CHECKING:
+    from objslam.core.result import RunResult
     from objslam.core.snapshot import Snapshot
     from objslam.core.types import Truth
     from objslam.live.adapters import Feed
     from objslam.live.session.session import Session
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
-_POLL = 0.1  # The time in s between two checks for the end of the source.
+_POLL = 0.1  # The time in s between two checks for the end of the source, and between two ticks of the feed.
 
 
 class LatestObjects:
@@ -32,7 +33,7 @@ class LatestObjects:
         self._out, self._begun, self._refused = out, False, False
 
     def try_write(self, snapshot: Snapshot) -> None:
-        """Write as `write` does, but let an error of the disk cost no map: warn of the first one, and of its end."""
+        """Write as `write` does, but do not raise an OutputError: warn of the first one, and say when it is over."""
         refused = None
         try:
             self.write(snapshot)
@@ -61,12 +62,13 @@ class LatestObjects:
 
 def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
     """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
-    the views and the status line. An error of a view also ends the loop. It is returned instead of raised,
-    so that `finish` can write the map first."""
+    the views and the status line. Ten times a second, call the ticks of the feed and print new warnings. An error of a view
+    or a tick also ends the loop. It is returned instead of raised, so that `finish` can write the map first. An error of the
+    adapter is only a warning."""
     from objslam.live.session import low_latency
 
     low_latency.configure()
-    stop, ended, broken = threading.Event(), list[Exception](), None
+    stop, ended, broken, localised = threading.Event(), list[Exception](), None, False
 
     def bring() -> None:
         try:
@@ -91,6 +93,10 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
                 if time.monotonic() >= due:
                     due = time.monotonic() + interval
                     snapshot = session.snapshot()
+                    found = snapshot.in_map is not None and snapshot.in_map.objects > 0
+                    if snapshot.in_map is not None and found and not localised:
+                        say(snapshot.in_map.line, stderr=True)
+                    localised = found
                     latest.try_write(snapshot)
                     for view in feed.views:
                         view(snapshot)
@@ -106,9 +112,12 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 
 def finish(
     session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
-) -> None:
-    """End the session, write its result, and print a summary. Then raise the error of the session or `broken`, if any.
-    An error of the session becomes an ObjslamError. If there is no result, the last snapshot is written to objects.json."""
+) -> RunResult:
+    """End the session, write its result, print a summary, and return the result.
+
+    Then the error of the session or `broken`, if any, is raised. An error of the session becomes an ObjslamError. If there
+    is no result, the last snapshot is written to objects.json.
+    """
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result
 
@@ -130,9 +139,10 @@ def finish(
     for view in feed.views if broken is None else ():
         view(last)
     if session.failure is not None:
-        raise _ended_early(session.failure, out, "the map holds the messages until then") from session.failure
+        raise _ended_early(session.failure, out, "the map covers the messages until then") from session.failure
     if broken is not None:
         raise broken
+    return result
 
 
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
@@ -147,7 +157,7 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
 def _ends_by_signal(stop: threading.Event) -> Iterator[None]:
     """Set `stop` at Ctrl-C, SIGTERM, or when the terminal closes (SIGHUP). A second signal interrupts immediately.
 
-    A signal that is ignored, as nohup ignores SIGHUP, stays so.
+    A signal that is ignored, as nohup ignores SIGHUP, stays ignored.
     """
 
     def end(number: int, frame: object) -> None:

@@ -60,10 +60,14 @@ class _Rates:
         shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
         resolved = len(snapshot.map.resolved())
         found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
+        place = snapshot.in_map
+        mapped = (
+            "" if place is None else f"localised by {place.objects} objects | " if place.objects else "not localised yet | "
+        )
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
             f"{found if snapshot.keyframes else ''}{_lost(snapshot, ledger)} | {shown} | lag {1e3 * snapshot.lag:.0f} ms | "
-            f"{snapshot.keyframes} keyframes | {calibrated}{times(snapshot, '')}"
+            f"{snapshot.keyframes} keyframes | {mapped}{calibrated}{times(snapshot, '')}"
         ).rstrip(" |")
 
 

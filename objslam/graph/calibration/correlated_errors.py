@@ -7,7 +7,7 @@ variance of these sums. Noise need not be white inside a window (cluster-robust 
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, factor
+from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem
 from objslam.graph.calibration.variance_components import TOGETHER
 
 
@@ -15,12 +15,11 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
     A factor is the standard deviation by sums over windows of `TOGETHER` seconds, divided by the one for white noise.
-    system: of the graph. SolveError if the linear system is singular.
+    system: of the graph.
     """
     jacobian = system.jacobian
-    factored = factor(jacobian)
     told = np.column_stack([system.residual, system.instruments, system.sides])
-    left = told - jacobian @ factored.solve(jacobian.T @ told)
+    left = told - jacobian @ system.normal.solve(jacobian.T @ told)
     count = system.sides.shape[1]
     parts, reduced = left[:, 1 : 1 + count] * left[:, :1], left[:, 1 + count :]
     window = np.floor(_seconds(of, system) / TOGETHER).astype(np.int64)

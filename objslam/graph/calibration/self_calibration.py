@@ -7,34 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
-from objslam.core.geometry import exp_se3
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
-from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, ReducedSystem, linearise
+from objslam.graph.calibration.inner_solve import InnerSolve
+from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
-from objslam.graph.optimizers import build_graph, gauss_newton
-from objslam.graph.outlier_rejection import JointSolution, reject_outliers, supported
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.outlier_rejection import JointSolution, reject_outliers
 
 _ROUNDS = 8
 """The most outer steps. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6. A larger number is slower."""
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
-_INNER = 3
-"""The iterations of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
-_TOLERANCE = 1e-4
-"""An inner solve ends if an iteration decreases the cost by less than this share. A larger share ends it sooner."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. After that, the parameters stay as they are."""
 _LEAST_SIGNAL = 0.05
@@ -95,7 +88,7 @@ def calibrate(
         SolveError: a linear system has no single solution.
     """
     fit = _Fit(errors, measure, trace)
-    state = _State.of(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
+    state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used).ordered()
     at = fit.shared_errors(state, theta)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
@@ -109,7 +102,7 @@ def calibrate(
         state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
-    state = _State.of(state.measured, association, final.map_T_camera, final.positions, final.used)
+    state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered()
     system = linearise(state, fit.errors, theta)
     reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
     prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
@@ -131,7 +124,7 @@ class _Found:
     """
 
     theta: Floats
-    state: _State
+    state: InnerSolve
     system: LinearSystem
     noisy: Floats
     steps: int
@@ -150,7 +143,7 @@ class _Fit:
         """The number of residuals for which the nominal noise counts."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: _State, theta: Floats, noisy: Floats | None = None) -> _Found:
+    def shared_errors(self, state: InnerSolve, theta: Floats, noisy: Floats | None = None) -> _Found:
         """Return the parameters that fit best, from theta (P,) on. noisy: (P, P) the shares of noise, if they are known."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
@@ -197,7 +190,7 @@ class _Fit:
                 self.trace.iteration("solve", state.cost, state.map_T_camera, state.positions, moved)
         return _Found(theta, state, linear, noisy, steps)
 
-    def noise_shares(self, state: _State, system: ReducedSystem, theta: Floats) -> Floats:
+    def noise_shares(self, state: InnerSolve, system: ReducedSystem, theta: Floats) -> Floats:
         """Return the part of the information (P, P) that comes from noise, as shares of its diagonal.
 
         Only clocks and odometry scales have such a part. The derivative of a motion by a clock is a difference of measured
@@ -223,15 +216,14 @@ class _Fit:
         noisy[block] = lost @ (root @ axes).T
         return noisy
 
-    def gradient(self, state: _State, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
+    def gradient(self, state: InnerSolve, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
         """Return the gradient by some parameters at the optimum after a step (P,) of the parameters."""
         side = state.predicted(system, step, self.measure(*self.errors.at(theta + step))).solved()
         return linearise(side, self.errors, theta + step, which).reduce().gradient
 
-    def remeasured(self, state: _State, theta: Floats) -> _State:
+    def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the optimum for the measurements with the present noise."""
-        measured = self.measure(*self.errors.at(theta))
-        return _State.of(measured, state.association, state.map_T_camera, state.positions, state.used).solved()
+        return replace(state, measured=self.measure(*self.errors.at(theta))).solved()
 
 
 def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
@@ -263,7 +255,9 @@ def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats 
     return curvature, np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
 
 
-def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
+def _without_shrinking(
+    state: InnerSolve, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats
+) -> ReducedSystem:
     """Return the system without the force that makes a solution too small, because this force would move the parameters.
 
     The force acts on a parameter as far as the size of the map depends on the parameter. If all lengths have an unknown
@@ -283,46 +277,3 @@ def _without_shrinking(state: _State, system: ReducedSystem, errors: CalibratedM
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
     project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
     return replace(system, gradient=project @ system.gradient, information=project @ system.information @ project.T)
-
-
-@dataclass(frozen=True)
-class _State(Linearised):
-    """A graph at its optimum for given parameters, and its cost."""
-
-    cost: float
-
-    @classmethod
-    def of(
-        cls, measured: Measurements, association: Association, map_T_camera: Floats, positions: Floats, used: Bools
-    ) -> Self:
-        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
-        graph = build_graph(measured.factors(association.object, np.flatnonzero(used), landmarks, positions))
-        values = make_values(map_T_camera, positions, landmarks)
-        return cls(graph, values, measured, association, map_T_camera, positions, used, graph.error(values))
-
-    def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
-        """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
-        landmarks = self.landmarks
-        change = system.sensitivity @ step + system.newton
-        positions = self.positions.copy()
-        positions[landmarks] += change[: 3 * len(landmarks)].reshape(-1, 3)
-        map_T_camera = self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6))
-        return type(self).of(measured, self.association, map_T_camera, positions, self.used)
-
-    def solved(self) -> Self:
-        """Return the state after a few iterations of the inner solve."""
-        optimum = gauss_newton(self.graph, self.values, _INNER, _TOLERANCE)
-        return replace(
-            self,
-            map_T_camera=read_poses(optimum.values),
-            positions=with_points(self.positions, self.landmarks, optimum.values),
-            values=optimum.values,
-            cost=optimum.cost_after,
-        )
-
-    def settled(self) -> Self:
-        """Return the state with the rays that now agree with their objects."""
-        used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
-        if np.array_equal(used, self.used):
-            return self
-        return type(self).of(self.measured, self.association, self.map_T_camera, self.positions, used)

@@ -3,24 +3,21 @@
 The shared errors are no variables of the graph. Their columns of the Jacobian are differences of the whitened residuals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
-import gtsam
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse, log_se3
-from objslam.core.statistics import CAUCHY_K, HUBER_K
-from objslam.core.types import Association, Rays
-from objslam.errors import SolveError
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
-from objslam.graph.factors.bearing import EQ1_SIGMA, ray_residuals, residual_axes
-from objslam.graph.factors.localization import localization_covariance
-from objslam.graph.factors.priors import ANCHOR
+from objslam.graph.least_squares.joint_rows import JointGraph, JointRows, from_origins
+from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
@@ -32,18 +29,18 @@ choice itself then depends on the noise. With 30, a stereo rig that often stands
 
 @dataclass(frozen=True)
 class Linearised:
-    """A graph by `Measurements.factors`, with its variables at the values of its last solve.
+    """The graph of a joint solve with Huber's loss, and values of its variables.
 
     map_T_camera: (K, 4, 4). positions: (N, 3) m, NaN for a landmark outside the graph. used: (R,) the rays in the graph.
+    order: (D,) the order in which the columns of the Jacobian are eliminated. None means that it is not known yet.
     """
 
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
     measured: Measurements
     association: Association
     map_T_camera: Floats
     positions: Floats
     used: Bools
+    order: Ints | None = None
 
     @property
     def which(self) -> Ints:
@@ -55,30 +52,47 @@ class Linearised:
         """(m,) the landmarks in the graph."""
         return np.flatnonzero(np.isfinite(self.positions[:, 0]))
 
+    @cached_property
+    def graph(self) -> JointGraph:
+        """The graph. The means of the weak priors of landmarks are these positions."""
+        return JointGraph.of(self.measured, self.association, self.used, self.positions)
+
+    @cached_property
+    def rows(self) -> JointRows:
+        """The rows of the graph at these values."""
+        return self.graph.rows(self.map_T_camera, self.positions[self.landmarks])
+
+    @cached_property
+    def normal(self) -> NormalEquations:
+        """The normal equations of these rows. SolveError if they are singular."""
+        jacobian = self.rows.jacobian
+        order = elimination_order(jacobian, self.graph.blocks) if self.order is None else self.order
+        return NormalEquations.of(jacobian, order)
+
 
 @dataclass(frozen=True)
 class LinearSystem:
     """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
 
     The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
-    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. sides: (M, P) by the
-    shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions. instruments:
-    (M, P). At the optimum, the residuals do not correlate with these columns. They equal the sides, except for the scales of
-    the odometry: their sides contain the noise of the odometry, and so do the residuals.
+    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. normal: its normal
+    equations. sides: (M, P) by the shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges
+    and of the motions. instruments: (M, P). At the optimum, the residuals do not correlate with these columns. They equal
+    the sides, except for the scales of the odometry: their sides contain the noise of the odometry, and so do the residuals.
     """
 
-    jacobian: sparse.csc_matrix
+    jacobian: sparse.csr_matrix
     sides: Floats
     instruments: Floats
     residual: Floats
     first_range: int
     first_motion: int
+    normal: NormalEquations
 
     def reduce(self) -> "ReducedSystem":
-        """Eliminate poses and landmarks by a Schur complement. SolveError if the linear system is singular."""
-        factored = factor(self.jacobian)
-        sensitivity = -factored.solve(self.jacobian.T @ self.sides)
-        newton = -factored.solve(self.jacobian.T @ self.residual)
+        """Eliminate poses and landmarks by a Schur complement."""
+        both = -self.normal.solve(self.jacobian.T @ np.column_stack([self.sides, self.residual]))
+        sensitivity, newton = both[:, :-1], both[:, -1]
         reduced, left = self.sides + self.jacobian @ sensitivity, self.residual + self.jacobian @ newton
         across, diagonal = np.einsum("mp,mp->p", self.instruments, reduced), np.einsum("mp,mp->p", reduced, reduced)
         signal = np.clip(across / np.maximum(diagonal, 1e-300), 0.0, 1.0)
@@ -107,105 +121,102 @@ class ReducedSystem:
 def linearise(
     of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int] | None = None
 ) -> LinearSystem:
-    """Return the linear system of a graph at its values, and at the shared errors theta (P,).
+    """Return the linear system of a graph at its values, and at the shared errors theta (P,). SolveError if it is singular.
 
     which: the indices of the parameters in the system. None means all parameters.
     """
     which = range(len(theta)) if which is None else which
     names = [errors.names[k] for k in which]
-    columns = 3 * len(of.landmarks) + 6 * len(of.map_T_camera)
-    keyframes = of.measured.keyframes
-    motions = 6 * int(keyframes.measured.sum()) if of.measured.motion is not None else 0
-    absolute = 6 * (len(keyframes) if keyframes.localized_every else 1)
-    ranged = int(np.isfinite(of.measured.rays.range[of.used]).sum())
-    first_range = 2 * len(of.which)
-    first_motion = first_range + ranged + 3 * len(of.landmarks)
-    jacobian, residual = _whitened(of.graph, of.values, first_motion + motions + absolute, columns)
-    sides = _parameter_columns(of, errors, theta, which, (len(residual), first_range, first_motion))
-    instruments = _instruments(of, names, sides, slice(first_motion, first_motion + motions))
-    return LinearSystem(jacobian, sides, instruments, residual, first_range, first_motion)
+    graph, rows = of.graph, of.rows
+    sides = _parameter_columns(of, errors, theta, which)
+    motions = slice(graph.first_motion, graph.first_motion + 6 * len(graph.steps))
+    instruments = _instruments(of, names, sides, motions)
+    return LinearSystem(rows.jacobian, sides, instruments, rows.residual, graph.first_range, graph.first_motion, of.normal)
 
 
-def factor(jacobian: sparse.csc_matrix) -> SuperLU:
-    """Factor the normal equations of a sparse Jacobian. SolveError if they are singular."""
-    try:
-        return splu(
-            sparse.csc_matrix(jacobian.T @ jacobian),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:
-        raise SolveError(f"the calibration's linear system has no single solution: {error}") from error
+def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int]) -> Floats:
+    """Return derivatives (M, p) of the whitened residuals by some parameters: central differences.
 
-
-def _whitened(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: int, columns: int
-) -> tuple[sparse.csc_matrix, Floats]:
-    """Return the whitened Jacobian (rows, columns) of a graph and its whitened residuals (rows,), in the factors' order."""
-    linear = graph.linearize(values)
-    row, column, value = linear.sparseJacobian_()  # The numbers start at 1. The last column is the right-hand side.
-    row, column = row.astype(np.int64) - 1, column.astype(np.int64) - 1
-    side = column == columns
-    residual = np.zeros(rows)
-    residual[row[side]] = -value[side]
-    return sparse.csc_matrix((value[~side], (row[~side], column[~side])), shape=(rows, columns)), residual
-
-
-def _parameter_columns(
-    of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int], rows: tuple[int, int, int]
-) -> Floats:
-    """Return derivatives (M, p) of the whitened residuals by some parameters: central differences with fixed robust weights.
-
-    rows: the number of rows, and the first rows of the ranges and of the motions.
+    The robust weights are kept fixed.
     """
-    measured, map_T_camera = of.measured, of.map_T_camera
-    keyframes, rays, landmark = measured.keyframes, measured.rays.take(of.which), of.association.object[of.which]
-    steps, ranged = np.flatnonzero(keyframes.measured), np.flatnonzero(np.isfinite(rays.range))
-    seen = _seen(map_T_camera[rays.keyframe], of.positions[landmark])
-    metric = measured.settings.joint.factor != "bearing"
-    axes = residual_axes(rays.direction, _from(rays, seen), rays.offset, metric)
-    bearing_root = _bearing_roots(rays, ray_residuals(rays.direction, _from(rays, seen), axes, metric), metric)
-    range_, range_sigma = rays.range[ranged], rays.range_sigma[ranged]
-    deviation = (np.linalg.norm(_from(rays, seen)[ranged], axis=1) - range_) / range_sigma
-    range_root = 1 / range_sigma / np.sqrt(1 + (deviation / CAUCHY_K) ** 2)
-    has_odometry = measured.motion is not None and len(steps) > 0
-    motion_root = whitening(measured.odometry()[1][steps]) if has_odometry else np.zeros((0, 6, 6))
-    moved = inverse(map_T_camera[:-1]) @ map_T_camera[1:]
-    absolute = map_T_camera if keyframes.localized_every else map_T_camera[:1]
-    absolute_root = _absolute_roots(measured, absolute)
-
-    def residuals(parameters: Floats) -> tuple[Floats, Floats, Floats]:
-        images, other_rays, settings = errors.at(parameters, drift=False)
-        other, other_rays = (
-            measured.multiframes.keyframes(images),
-            measured.multiframes.rays(images, other_rays.take(of.which)),
-        )
-        to_landmark = _from(other_rays, seen)
-        bearings = (bearing_root * ray_residuals(other_rays.direction, to_landmark, axes, metric)).ravel()
-        longer = other_rays.range[ranged] / range_
-        distances = range_root * (np.linalg.norm(to_landmark[ranged], axis=1) - longer * range_) / longer
-        parts = []
-        if has_odometry and other.odom_T_base is not None:
-            odom_T_camera = other.odom_T_base @ other.base_T_camera
-            said = inverse(odom_T_camera[:-1]) @ odom_T_camera[1:]
-            way = settings.odometry.floor_xy / measured.settings.odometry.floor_xy
-            off = log_se3(inverse(said[steps]) @ moved[steps]) / np.repeat([1.0, way], 3)
-            parts.append(np.einsum("kij,kj->ki", motion_root, off).ravel())
-        off = log_se3(inverse(other.map_T_camera[: len(absolute)]) @ absolute)
-        parts.append(np.einsum("kij,kj->ki", absolute_root, off).ravel())
-        return bearings, distances, np.concatenate(parts)
-
-    total, first_range, first_motion = rows
-    result = np.zeros((total, len(which)))
+    parts = _parts(of)
+    result = np.zeros((len(of.rows.residual), len(which)))
     for column, k in enumerate(which):
-        step = errors.steps[k]
-        up, down = (residuals(theta + sign * step * np.eye(len(theta))[k]) for sign in (1, -1))
-        bearings, distances, others = ((more - less) / (2 * step) for more, less in zip(up, down, strict=True))
-        result[:first_range, column] = bearings
-        result[first_range : first_range + len(ranged), column] = distances
-        result[first_motion:, column] = others
+        step = errors.steps[k] * np.eye(len(theta))[k]
+        sides = []
+        for moved in (theta + step, theta - step):
+            images, rays, settings = errors.at(moved, drift=False)
+            joined = of.measured.multiframes
+            sides.append((joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings))
+        for part in parts:
+            ahead, behind = (part.measured(*side) for side in sides)
+            if any(not np.array_equal(one, other) for one, other in zip(ahead, behind, strict=True)):
+                change = (part.residuals(*ahead) - part.residuals(*behind)).ravel()
+                result[part.first : part.first + len(change), column] = change / (2 * errors.steps[k])
     return result
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The rows of one kind of measurement, from the row `first` on.
+
+    measured: the measured values in these rows, of keyframes and rays. Parameters that do not change them have no derivative
+    here, and most parameters change only one kind. residuals: the whitened residuals of these values.
+    """
+
+    first: int
+    measured: Callable[[Keyframes, Rays, Settings], tuple[Floats, ...]]
+    residuals: Callable[..., Floats]
+
+
+def _parts(of: Linearised) -> tuple[_Part, ...]:
+    """Return the kinds of measurements that shared errors may change."""
+    graph, map_T_camera = of.graph, of.map_T_camera
+    steps, ranged = graph.steps, graph.ranged
+    seen = graph.seen(map_T_camera, of.positions[of.landmarks])
+    to_landmark = from_origins(graph.rays, seen)
+    axes = graph.bearing_axes(to_landmark)
+    bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
+    range_ = graph.rays.range[ranged]
+    range_root, _ = graph.range_roots(np.linalg.norm(to_landmark[ranged], axis=1))
+    moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[steps]
+    floor = of.measured.settings.odometry.floor_xy
+    _, absolute_root, _ = graph.absolute_roots(map_T_camera)
+    absolute = map_T_camera[: len(absolute_root)]
+
+    def bearings(direction: Floats, to_landmark: Floats) -> Floats:
+        return bearing_root * graph.bearing_residuals(direction, to_landmark, axes)
+
+    def distances(measured: Floats, to_landmark: Floats) -> Floats:
+        return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
+
+    def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
+        if not len(steps) or keyframes.odom_T_base is None:
+            return ()
+        odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
+        return (inverse(odom_T_camera[:-1]) @ odom_T_camera[1:])[steps], np.array(settings.odometry.floor_xy / floor)
+
+    def motions(motion: Floats, way: Floats) -> Floats:
+        off = log_se3(inverse(motion) @ moved) / np.repeat([1.0, float(way)], 3)
+        return np.einsum("kij,kj->ki", graph.motion_roots, off)
+
+    def poses(measured: Floats) -> Floats:
+        return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
+
+    return (
+        _Part(0, lambda _, rays, settings: (rays.direction, from_origins(rays, seen)), bearings),
+        _Part(
+            graph.first_range,
+            lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),
+            distances,
+        ),
+        _Part(graph.first_motion, said, motions),
+        _Part(
+            graph.first_motion + 6 * len(steps),
+            lambda keyframes, rays, settings: (keyframes.map_T_camera[: len(absolute)],),
+            poses,
+        ),
+    )
 
 
 def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: slice) -> Floats:
@@ -220,10 +231,8 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
     which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
         return sides
-    keyframes = of.measured.keyframes
-    steps = np.flatnonzero(keyframes.measured)
+    keyframes, steps, root = of.measured.keyframes, of.graph.steps, of.graph.motion_roots
     covariance = of.measured.odometry()[1][steps]
-    root = whitening(covariance)
     to_base = adjoint(keyframes.base_T_camera[1:][steps])
     seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
     in_base = to_base @ covariance @ np.swapaxes(to_base, 1, 2)
@@ -248,36 +257,3 @@ def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
 
     time = near(seconds[:, None])
     return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
-
-
-def _seen(map_T_camera: Floats, positions: Floats) -> Floats:
-    """Return positions (n, 3), m, in the frames of poses (n, 4, 4)."""
-    return np.asarray(np.einsum("nji,nj->ni", map_T_camera[:, :3, :3], positions - map_T_camera[:, :3, 3]))
-
-
-def _from(rays: Rays, seen: Floats) -> Floats:
-    """Return positions (n, 3), m, relative to the points where their rays begin."""
-    return seen if rays.offset is None else seen - rays.offset
-
-
-def _bearing_roots(rays: Rays, residuals: Floats, metric: bool) -> Floats:
-    """Return the factors (n, 1) that whiten the residuals (n, 2) of rays, with the weights of Huber's loss."""
-    sigma = np.full(len(rays), EQ1_SIGMA) if metric else rays.sigma
-    off = np.linalg.norm(residuals, axis=1) / sigma
-    return np.asarray((np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12))) / sigma)[:, None])
-
-
-def whitening(covariance: Floats) -> Floats:
-    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does."""
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
-
-
-def _absolute_roots(measured: Measurements, poses: Floats) -> Floats:
-    """Return matrices (n, 6, 6) that whiten absolute poses (n, 4, 4), with the weights of Huber's loss. The anchor has no
-    loss."""
-    keyframes = measured.keyframes
-    if not keyframes.localized_every:
-        return np.eye(6)[None] / ANCHOR
-    roots = whitening(localization_covariance(keyframes, measured.settings))
-    off = np.linalg.norm(np.einsum("kij,kj->ki", roots, log_se3(inverse(keyframes.map_T_camera) @ poses)), axis=1)
-    return np.asarray(roots * np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(off, 1e-12)))[:, None, None])

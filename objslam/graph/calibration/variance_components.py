@@ -15,9 +15,11 @@ from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 from objslam.graph.calibration.anderson import MEMORY, accelerated
-from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, factor, from_neighbours, whitening
+from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, from_neighbours
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
+from objslam.graph.least_squares.joint_rows import whitening
+from objslam.graph.least_squares.normal_equations import NormalEquations
 
 _PROBES = 12
 """The number of random probes. With n residuals, the relative error of the redundancy is sqrt(2 / (n * probes)). More probes
@@ -75,14 +77,14 @@ def estimate_noise(
     """
     kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
     root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
-    jacobian, residual = system.jacobian.tocsr(), np.append(system.residual, root @ (theta - errors.mean))
+    jacobian, residual = system.jacobian, np.append(system.residual, root @ (theta - errors.mean))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), _PROBES))
     begin = errors.noise
     noise, history = begin, list[tuple[Floats, Floats]]()
     for _ in range(_ITERATIONS):
         rescale = _rescaling(system, rows, begin, noise, len(system.residual))
         told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
-        left = _left(sparse.csc_matrix(rescale @ jacobian), rescale @ system.sides, root, told)
+        left = _left(rescale @ jacobian, system.normal.order, rescale @ system.sides, root, told)
         other = _updated(system, rows, noise, kinds, probes, left, prior_residuals)
         if other.like(noise, _CONVERGED):
             noise = other
@@ -133,15 +135,15 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     )
 
 
-def _left(jacobian: sparse.csc_matrix, sides: Floats, prior: Floats, told: Floats) -> Floats:
+def _left(jacobian: sparse.csr_matrix, order: Ints, sides: Floats, prior: Floats, told: Floats) -> Floats:
     """Return the residuals of `told` (M + P, n) after a least-squares solution.
 
-    jacobian: (M, D) by poses and landmarks. sides: (M, P) by the shared errors. prior: (P, P) the last P rows by the shared
-    errors. The sides are dense, so a Schur complement eliminates them last. As columns of the sparse matrix, they would slow
-    its factorisation down by a factor of four.
+    jacobian: (M, D) by poses and landmarks. order: (D,) of their elimination. sides: (M, P) by the shared errors. prior: (P,
+    P) the last P rows by the shared errors. The sides are dense, so a Schur complement eliminates them last. As columns of
+    the sparse matrix, they would slow its factorisation down by a factor of four.
     """
     both = np.hstack([sides, told[: len(sides)]])
-    both = both - jacobian @ factor(jacobian).solve(jacobian.T @ both)
+    both = both - jacobian @ NormalEquations.of(jacobian, order).solve(jacobian.T @ both)
     reduced = np.vstack([both[:, : sides.shape[1]], prior])
     rest = np.vstack([both[:, sides.shape[1] :], told[len(sides) :]])
     return np.asarray(rest - reduced @ np.linalg.solve(reduced.T @ reduced, reduced.T @ rest))

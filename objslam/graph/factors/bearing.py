@@ -1,4 +1,7 @@
-"""Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray (Eq. 1)."""
+"""Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray.
+
+The distance is that of Eq. 1 of Staszak & Belter.
+"""
 
 import gtsam
 import numpy as np
@@ -62,7 +65,7 @@ def point_to_line(
 
 
 def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noise: Noise) -> list[gtsam.NonlinearFactor]:
-    """Return a factor for each fixed ray on the distance (m, Eq. 1) of L(landmark) from the ray.
+    """Return a factor for each ray with a known origin on the distance (m, Eq. 1) of L(landmark) from the ray.
 
     Origins (R, 3) and directions (R, 3) are in map. The norm of the residual is the distance.
     """
@@ -108,14 +111,39 @@ def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric:
     """Return the residuals (R, 2) of the factors of rays, along axes (R, 3, 2).
 
     directions: (R, 3) unit. to_landmark: (R, 3) m, from the origin of the ray, in the same frame. metric: whether residuals
-    are distances from the ray (m, Eq. 1), or angles (rad).
+    are distances from the ray (m, Eq. 1), or angles (rad) below pi / 2.
     """
     along = np.einsum("ri,ri->r", directions, to_landmark)
     across = to_landmark - along[:, None] * directions
+    residuals = np.einsum("rij,ri->rj", axes, across)
     if not metric:
-        length = np.linalg.norm(across, axis=1)
-        across *= (np.arctan2(length, along) / np.maximum(length, 1e-300))[:, None]
-    return np.asarray(np.einsum("rij,ri->rj", axes, across))
+        angle = np.arctan2(np.linalg.norm(across, axis=1), along)
+        residuals *= (angle / np.maximum(np.linalg.norm(residuals, axis=1), 1e-300))[:, None]
+    return np.asarray(residuals)
+
+
+def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset: Floats | None, metric: bool) -> Floats:
+    """Return the derivatives (R, 2, 3) of `ray_residuals` by the position of the landmark, as GTSAM's factors compute them.
+
+    The derivative of GTSAM's bearing factor leaves out terms that vanish with the residual.
+    """
+    across = np.swapaxes(axes, 1, 2)
+    if metric:
+        return across
+    length = np.linalg.norm(to_landmark, axis=1)
+    by_position = across / length[:, None, None]
+    away = np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
+    if away.any():  # The equidistant camera of `bearings`, at depth z and at distance r from its axis.
+        flat = (across[away] @ to_landmark[away, :, None])[..., 0]
+        r, z = np.linalg.norm(flat, axis=1), np.einsum("ri,ri->r", directions[away], to_landmark[away])
+        outward = flat / np.maximum(r, 1e-300)[:, None]
+        turning = (np.where(r > 1e-9 * np.abs(z), np.arctan2(r, z) / np.maximum(r, 1e-300), 1 / z))[:, None, None]
+        radial = (z / (r**2 + z**2))[:, None, None]
+        outer = outward[:, :, None] * outward[:, None, :]
+        by_flat = turning * (np.eye(2) - outer) + radial * outer
+        by_depth = -(r / (r**2 + z**2))[:, None] * outward
+        by_position[away] = by_flat @ across[away] + by_depth[:, :, None] * directions[away, None, :]
+    return np.asarray(by_position)
 
 
 def _poses(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:

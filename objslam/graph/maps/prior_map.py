@@ -25,7 +25,7 @@ from objslam.graph.factors.frames import F0, P0, frame_prior, object_priors, own
 from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marquardt
 from objslam.graph.variables import L0, make_values, read_poses, with_points
 
-_LEAST = 1e-3
+LEAST = 1e-3
 """The least standard deviation (m) of an error of an object. A larger value makes exact maps less exact. It was chosen far
 below the errors of real maps, and keeps the linear system well conditioned."""
 _ITERATIONS = 50
@@ -79,7 +79,7 @@ def solve_in_map(
     solved = there if measured is None else np.flatnonzero(estimate.solved & np.isfinite(estimate.positions[:, 0]))
     keep = np.isin(known.index, there)
     index, anchor = known.index[keep], known.positions[keep]
-    prior = known.covariance[keep] + _LEAST**2 * np.eye(3)
+    prior = known.covariance[keep] + LEAST**2 * np.eye(3)
     values = make_values(_poses(estimate, measured), estimate.positions, solved)
     drive, plain = (_drive_factors(estimate, association, solved, measured, robust=robust) for robust in (True, False))
     rotation = map_T_drive[:3, :3]
@@ -135,8 +135,8 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return what the covariance of each object (n, 3, 3) holds beyond that of the graph. `_LEAST` is its floor."""
-    floor = _LEAST**2 * np.eye(3)
+    """Return what the covariance of each object (n, 3, 3) holds beyond that of the graph. `LEAST` is its floor."""
+    floor = LEAST**2 * np.eye(3)
     if measured is None:  # Half on each side of a factor conditions the linear system best.
         return estimate.covariance[there] / 2 + floor
     try:
@@ -144,8 +144,13 @@ def _unknown_to(
         alone = np.array([marginals.marginalCovariance(L0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
     except RuntimeError as error:
         raise indeterminate(error) from error
-    size, axes = np.linalg.eigh(estimate.covariance[there] - alone)
-    return np.asarray((axes * np.maximum(size, _LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+    return beyond(estimate.covariance[there], alone)
+
+
+def beyond(covariance: Floats, alone: Floats) -> Floats:
+    """Return what covariances (n, 3, 3), m^2, hold beyond the covariances `alone` (n, 3, 3). `LEAST` is its floor."""
+    size, axes = np.linalg.eigh(covariance - alone)
+    return np.asarray((axes * np.maximum(size, LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
 
 def _covariances(
@@ -182,7 +187,11 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances (n, 3, 3) of points (n, 3) with the doubt about the frame. A prior holds a point against it."""
+    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, with the error that all can share.
+
+    doubt: (4, 4) the covariance of this error, as from `shared_at_most`. The points `index` of the objects `there` have
+    priors with covariances `prior`. The better a prior determines a point, the less the shared error moves it.
+    """
     move = np.zeros((len(there), 3, 4))
     move[:, :, :3] = np.eye(3)
     move[:, :, 3] = np.array([_turned(p - pivot) for p in placed]).reshape(-1, 3)

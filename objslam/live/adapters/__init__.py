@@ -73,7 +73,7 @@ class Feed:
     """An adapter with its helpers. views: the functions that receive each snapshot. close: the functions to call at the end.
 
     image: the function that returns the image of a camera, by its name, at a stamp, s. None if the adapter has no images.
-    odom_frame: the function that returns the name of the odometry's frame, None if nobody may place this frame in a map.
+    odom_frame: the function that returns the name of the odometry's frame, None if the session may not publish its pose.
     ticks: the functions to call ten times a second.
     """
 
@@ -122,7 +122,7 @@ def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions) -> Feed:
 def _ros(
     sink: Sink, settings: Settings, options: LiveRosOptions, make: Callable[[RosMessages, TopicChoice], Adapter]
 ) -> Feed:
-    """Return the feed of an adapter for ROS messages, with a detector if the options name one. make: makes the adapter."""
+    """Return the feed of an adapter for ROS messages, with a detector if the options name one. make: returns the adapter."""
     from objslam.live.ros.detector_worker import DetectorWorker
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice

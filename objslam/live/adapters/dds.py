@@ -15,10 +15,10 @@ from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
-_TAKE = 200  # The most messages taken from a reader at once. A larger number lets other topics wait longer.
-_MAX_READERS = 256  # The most open readers. It bounds the memory.
-_MIN_BUFFER = 2 << 20  # The smallest socket buffer that holds a raw image, bytes. A larger value warns on more systems.
-_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether it is transient-local, so that old messages are kept.
+_TAKE = 200  # The most messages of one call to a reader. A larger number makes fewer calls, and takes more memory.
+_MAX_READERS = 256  # The most open readers. A larger number costs memory.
+_MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images bring a warning. A larger value warns more often.
+_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
 
 @dataclass
@@ -115,7 +115,7 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # transforms and calibrations first
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Transforms and calibrations first.
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
@@ -138,7 +138,7 @@ class DdsAdapter:
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(1 if images else QUEUE),
             Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.IgnoreLocal.Participant,  # The tf map -> odom that this session sends is no localisation.
+            Policy.IgnoreLocal.Participant,  # This session's own tf map -> odom must not come back as a localisation.
         )
         if images and (receive_buffer() or _MIN_BUFFER) < _MIN_BUFFER:
             self.ledger.warn("the system's socket buffers are too small for images: run sysctl -w net.core.rmem_max=4194304")
@@ -152,7 +152,7 @@ class DdsAdapter:
         return _Reader(publication, entity, make_decoder(Connection(topic, type_, "cdr")), time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        """Push the messages that wait in a reader. At most QUEUE are pushed, so that a busy reader does not delay a stop."""
+        """Push the messages that wait in a reader, at most QUEUE, so that other readers and a stop do not wait long."""
         for _ in range(QUEUE // _TAKE):
             samples = reader.entity.take(_TAKE)
             for sample in samples:
@@ -170,7 +170,11 @@ class DdsAdapter:
                 return
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
-        """Return whether a reader is for a publisher. A best-effort reader receives from the reliable publishers too."""
+        """Return whether a message is for this reader, by the handle of its publisher.
+
+        A best-effort reader receives from the reliable publishers too, so two readers may receive one message. If the
+        publisher is unknown, the reader with the strictest QoS takes the message.
+        """
         if handle not in self._publications:
             self._look_around(found)
         publication = self._publications.get(handle)

@@ -20,9 +20,9 @@ _BEHIND = 1.0  # The delay of a replay, s, above which the user is warned. A lar
 class ReplayAdapter:
     """Pushes the content of a log in the order of `events`.
 
-    speed: 2 replays twice as fast as recorded, None as fast as possible. wait: the function that is called after each frame
-    if `speed` is None. It returns once the map contains the frame. after: the function that returns the stamp, s, before
-    which a resumed session already has all messages.
+    speed: 2 replays twice as fast as recorded. None replays as fast as possible. wait: the function that is called after
+    each frame if `speed` is None. It returns once the map contains the frame. after: the function that returns the stamp, s,
+    before which a resumed session already has all messages.
     """
 
     sink: Sink
@@ -63,8 +63,9 @@ Push = Callable[[Sink], bool]
 def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, bool, Push]]:
     """Yield the events of a log in time order: the time, s, whether the event is a frame, and the push of the event.
 
-    The time of an event is its stamp, except for a frame. A frame directly follows the first pose at or after its stamp, and
-    has the time of this pose. So no frame waits for a pose (live.max_lag).
+    The time of an event is its stamp, except for a frame. A frame directly follows the first pose of the robot's path at or
+    after its stamp, and has the time of this pose. So no frame waits for a pose (live.max_lag). If this pose is more than
+    live.max_late later, or if there is none, the frame keeps the time of its stamp.
     """
     settings = settings or Settings()
     kinds: list[tuple[np.ndarray, int, Callable[[int], Push]]] = []  # stamps, rank at the same stamp, push by index
@@ -86,7 +87,10 @@ def events(log: Log, settings: Settings | None = None) -> Iterator[tuple[float, 
 
 
 def _covered(log: Log, settings: Settings, detections: Detections) -> Floats:
-    """Return the stamp (F,) of the first pose at or after each frame, or its own stamp if live.max_late is exceeded."""
+    """Return the stamp (F,), s, of the first pose at or after each frame, or the frame's own if that is too late.
+
+    A pose is too late for a frame if it comes more than live.max_late after the frame.
+    """
     path = log.localization if log.odometry is None or settings.poses.use == "localization" else log.odometry
     own = detections.frame_stamps
     if path is None:

@@ -7,7 +7,7 @@
 {"type": "detections", "camera": "front", ...a line of detections.jsonl...}
 
 A planar pose has "x", "y", "yaw" instead of translation and rotation. Odometry and localization may have a "covariance" of
-36 numbers. With a single camera, "camera" and "name" may be left out. The camera is then called "camera".
+36 numbers, as in ROS. With a single camera, "camera" and "name" may be left out. The camera is then called "camera".
 """
 
 import json
@@ -61,7 +61,7 @@ class StdinAdapter:
             self._take(rest, number + 1)
 
     def _read(self, stop: threading.Event) -> bytes:
-        """Return the next bytes; b"" at the end of the stream or when `stop` is set."""
+        """Return the next bytes. They are b"" at the end of the stream, or when `stop` is set."""
         source = self.stream.fileno()
         while not stop.is_set():
             if select.select([source], [], [], _WAIT)[0]:

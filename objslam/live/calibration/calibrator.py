@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""The growth factor of keyframes between two calibrations. A larger factor calibrates more rarely. With any factor above 1,
-the work of all calibrations together grows linearly with the session."""
+"""The growth factor of the number of keyframes between two calibrations. A larger factor calibrates more rarely. With any
+factor above 1, the work of all calibrations together grows linearly with the session."""
 _DELAY = 0.15
-"""The keyframes between the start of a calibration and the correction of the map, as a share of all keyframes. With a larger
-share, the correction comes later, but its keyframe depends less on the speed of the machine."""
+"""The keyframes between the start of a calibration and the correction of the map, as a share of the keyframes at the start.
+With a larger share, the correction comes later, but its keyframe depends less on the speed of the machine."""
 _CHANGED = 1.0
 """The change of an error, in standard deviations, from which the map is corrected. With a larger value, corrections are
 rarer."""
@@ -36,8 +36,8 @@ rarer."""
 def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which the errors that the session cannot observe stay at their values `now` (P,).
 
-    The other errors get their most probable values, given the values `now`. Otherwise, noise would move the map with each
-    calibration.
+    The other errors get their most probable values, given those that stay. If unobservable errors did not stay, noise would
+    move the map with each calibration.
     """
     stay = found.sigma > OBSERVABLE * found.prior
     if not stay.any():
@@ -51,9 +51,9 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 class Calibrator:
     """Decides after each keyframe whether a calibration begins or takes effect.
 
-    A calibration begins at fixed numbers of keyframes, and takes effect a fixed share of keyframes later, or as soon as the
-    worker is done. Each calibration that takes effect is recorded with the number of keyframes, so that a resumed session
-    does the same.
+    A calibration begins at fixed numbers of keyframes. It takes effect a fixed share of keyframes later. If the worker is
+    not done by then, a `patient` session waits for it. Any other session goes on until the worker is done. Each calibration
+    that takes effect is recorded with the number of keyframes, so that a resumed session does the same.
     """
 
     def __init__(
@@ -65,7 +65,10 @@ class Calibrator:
         name: str,
         patient: bool,
     ) -> None:
-        """Prepare for a session. record: writes to the journal. patient: whether the session may wait for the worker."""
+        """Prepare for a session. record: writes to the journal, and returns False if it refuses. name: of the log.
+
+        patient: whether the session may wait for the worker.
+        """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
         self._asked: tuple[int, Request] | None = None  # The number of keyframes, and the request for the worker.
@@ -74,7 +77,7 @@ class Calibrator:
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Apply these calibrations of a journal when they are due, and start no others until `begin`."""
+        """Apply these calibrations of a journal when they are due. Until `begin`, start no new ones."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:
@@ -103,7 +106,7 @@ class Calibrator:
             self._worker.close()
 
     def _ask(self, number: int) -> None:
-        """Begin a calibration of all keyframes. Nothing begins if no shared errors are estimated.
+        """Begin a calibration of all keyframes. Nothing begins if no shared errors are estimated or there are no objects.
 
         The noise is not estimated here. It stays as in the settings until the end of the session.
         """
@@ -119,7 +122,7 @@ class Calibrator:
             self._worker = Worker(request)
 
     def _finish(self, number: int) -> bool:
-        """Apply the worker's calibration if it is due and differs from the present one. Return whether it was applied."""
+        """Apply the worker's calibration if it is due and changes an error enough. Return whether it was applied."""
         worker, m = self._worker, self._mapper.state
         assert worker is not None
         assert self._asked is not None

@@ -21,8 +21,8 @@ class Collected:
     keyframes: in time order, as measured. rays: the rays of the keyframes, as measured. association: of these rays. ids:
     (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths
     and cameras. errors: the same keyframes and rays as a function of the shared errors, None if neither errors nor noise are
-    estimated. theta: (P,) the values by which the session corrects its measurements. If the session corrects an error but
-    does not estimate it, the keyframes, rays and log are corrected already.
+    estimated. theta: (P,) the present values of the shared errors, as `corrections` returns them, None without errors. If
+    the session corrects an error but does not estimate it, the keyframes, rays and log are corrected already.
     """
 
     keyframes: Keyframes
@@ -39,8 +39,8 @@ class Collected:
 def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
     """Collect the keyframes, the rays, the association and the estimate of a session. name: the name of the log.
 
-    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping, and counted if the
-    caller asks for it. Tracks with enough rays become objects too, but a solve may leave them unresolved.
+    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. count_dropped: whether
+    they are counted. Tracks with enough rays become objects too, but a solve may leave them unresolved.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
@@ -82,13 +82,13 @@ def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> S
         return None
     try:
         return shared_errors(log, keyframes, rays, m.given)
-    except ObjslamError as error:  # the file of the calibration has changed since the session began
+    except ObjslamError as error:  # The calibration file has changed since the session began.
         m.counters.ledger.warn(f"the shared errors are not estimated: {error}")
         return None
 
 
 def corrections(m: MapState, errors: SharedErrors) -> Floats:
-    """Return the values (P,) of the errors: the values that a session corrects, and the expected values of other errors."""
+    """Return the present values (P,) of the errors. An error that the session does not correct has its expected value."""
     return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
 
 
@@ -109,7 +109,7 @@ def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
 
 
 def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
-    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe there."""
+    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe."""
     names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
     columns = {name: getattr(m.rays, name)[rows] for name in names}
     _, bias = range_noise(columns["range"], m.camera_of_rays(rows), m.sent_cameras, m.given)
@@ -140,7 +140,10 @@ def _mount(keyframes: Keyframes, camera: int) -> Trajectory | None:
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """Return the object (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) of the objects."""
+    """Return the object id (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) by object id.
+
+    A landmark keeps its id. A track with enough rays gets an id above those of the landmarks.
+    """
     landmarks, rays = m.landmarks, m.rays
     owner = rays.owner.copy()
     first = int(landmarks.id.max(initial=-1)) + 1

@@ -24,9 +24,9 @@ _ITERATIONS = 8
 
 
 def recalibrate(m: MapState, calibration: Calibration) -> None:
-    """Correct the errors of a calibration in the map. They replace the errors that were corrected before.
+    """Correct the errors of a calibration in the map. They replace the values of the same errors before.
 
-    The map depends on its state and on the calibration only, so that a resumed session makes the same map.
+    The new map depends only on the old map and on the calibration, so that a resumed session makes the same map.
     """
     before = m.errors
     m.errors = before | dict(zip(calibration.names, calibration.values.tolist(), strict=True))
@@ -99,8 +99,8 @@ def _ratio(m: MapState, before: dict[str, float], name: str) -> float:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object stays with the keyframe whose drift it
-    had.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the first keyframe
+    whose old heading drift was at least that of the object.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])
@@ -109,7 +109,10 @@ def _carried(m: MapState, drifted: Floats) -> Floats:
 
 
 def _shift_times(m: MapState, times: Floats) -> None:
-    """Shift the stamps of landmarks and tracks like the stamps of keyframes. times: (K,) s, the old stamps of keyframes."""
+    """Shift the stamps of landmarks and tracks like the stamps of the keyframes that saw them.
+
+    times: (K,) s, the stamps of the keyframes before the correction.
+    """
     order = np.argsort(times, kind="stable")
     shift = (m.keyframes.stamp - times)[order]
 
@@ -122,7 +125,7 @@ def _shift_times(m: MapState, times: Floats) -> None:
 
 
 def _move_start(m: MapState, before: Floats) -> None:
-    """Move the whole map with the first keyframe. `before` is the pose (4, 4) at which this keyframe was fixed."""
+    """Move the whole map with the first keyframe, and fix it there. before: (4, 4) its camera pose before the correction."""
     now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
     m.graph.drop_absolute()
     m.move(now @ inverse(before))
@@ -148,7 +151,7 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 def _solve(m: MapState) -> None:
     """Move the estimate to the corrected measurements, at once or over the next keyframes.
 
-    The next full solve tests the rays again. Until then, the rays of one object may look like the rays of two.
+    The next full solve tests the rays again. Before that, they may still look like the rays of two objects.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

@@ -1,4 +1,4 @@
-"""Estimate shared errors in a separate process. While GTSAM solves, no other thread of its process runs."""
+"""Estimate shared errors in a separate process, because GTSAM stops all other threads of its process while it solves."""
 
 from __future__ import annotations
 
@@ -22,13 +22,16 @@ if TYPE_CHECKING:
 _PATIENT = 600.0
 """The longest time, s, that a calibration may take. A larger value waits longer for a process that hangs."""
 _NICE = 10
-"""The process has a priority that is lower than the session's by this. A larger number slows it down more."""
+"""How much nicer than the session the process is, as in `os.nice`. A larger number slows the process down more."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Request:
-    """The input of a calibration. theta: (P,) the errors now. map_T_camera: (K, 4, 4) poses of its keyframes."""
+    """The input of a calibration. errors: with the keyframes and rays. theta: (P,) the values at which the solve starts.
+
+    association: of the rays. map_T_camera: (K, 4, 4) poses of the keyframes at which the solve starts.
+    """
 
     errors: SharedErrors
     theta: Floats
@@ -37,7 +40,7 @@ class Request:
     settings: Settings
 
     def solve(self) -> Calibration | None:
-        """Return the shared errors that fit best, None if they cannot be estimated. SolveError without a solution."""
+        """Return the shared errors that fit best, None if they cannot be estimated. Raises SolveError if the solve fails."""
         from objslam.core.diagnostics import Ledger
         from objslam.graph.batch_solver import solve_joint
 
@@ -64,7 +67,7 @@ class Worker:
         self._process: subprocess.Popen[bytes] | None = None
         package = str(Path(__file__).parents[3])
         paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
-        with suppress(OSError):  # `result` then returns None
+        with suppress(OSError):  # Then `result` returns None.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", __name__],
                 stdin=subprocess.PIPE,

@@ -24,7 +24,7 @@ _MALFORMED = re.compile(r"malformed packet")
 class Network:
     """A DDS domain that this process has joined.
 
-    where: its network, in words. entities: DDS entities that must live as long as the participant. unread: the number of
+    where: the network, in words. entities: DDS entities that must live as long as the participant. unread: the number of
     payloads that the library rejected, by DDS topic. The topic "" counts packets that are not DDS.
     """
 
@@ -42,8 +42,9 @@ def open_network(domain: int | None = None, interface: str | None = None) -> Net
     """Join a DDS domain, or return the network of a domain that the process has already joined.
 
     domain: its number. None takes ROS_DOMAIN_ID, or 0 if that is unset. interface: the name or address of an interface, or
-    "auto" for any. None takes CYCLONEDDS_URI, or loopback if that is unset. ObjslamError when cyclonedds is not installed or
-    the domain cannot be joined. ConfigError when an argument is invalid, or the domain is already open on another interface.
+    "auto" for any. None takes CYCLONEDDS_URI, or loopback if that is unset. Raises ObjslamError if cyclonedds is not
+    installed or the domain cannot be joined, and ConfigError if an argument is invalid, or the domain is already open on
+    another interface.
     """
     try:
         import cyclonedds  # noqa: F401
@@ -98,7 +99,7 @@ def _settings(interface: str | None) -> tuple[str, str]:
     if interface is None and os.environ.get(_URI):
         return _URI, os.environ[_URI]
     if interface in (None, LOOPBACK):
-        # a loopback interface may lack multicast, so participants are found at the ports of their index
+        # A loopback interface may lack multicast. So participants look for each other at the ports of all indices.
         peers = '<Peers><Peer address="127.0.0.1"/></Peers>'
         index = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
         chosen = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces><AllowMulticast>false</AllowMulticast>'
@@ -124,7 +125,7 @@ def _sockets() -> set[int]:
         try:
             if str(entry.readlink()).startswith("socket:"):
                 found.add(int(entry.name))
-        except OSError:  # the descriptor that listed the folder is already closed
+        except OSError:  # The descriptor that listed the folder is already closed.
             continue
     return found
 
@@ -136,7 +137,7 @@ def _keep_inside(sockets: set[int]) -> None:
             if own.type == socket.SOCK_DGRAM:
                 try:
                     own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
-                except OSError as error:  # kernels before 5.7 need a privilege
+                except OSError as error:  # Kernels before 5.7 need a privilege.
                     raise ObjslamError(
                         f"the DDS sockets cannot be bound to the loopback interface ({error.strerror})",
                         hint=f"open them to the network with --interface {AUTO}",
@@ -154,7 +155,7 @@ def _listen(reading: int, unread: Counter[str]) -> None:
 
 
 def receive_buffer() -> int | None:
-    """Return the largest socket buffer that the system allows, bytes; None if unknown."""
+    """Return the largest socket buffer that the system allows, bytes, None if unknown."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):

@@ -16,7 +16,7 @@ TOPICS = {
     "path": "nav_msgs/msg/Path",
 }
 """The ROS types of the published messages, by their topic below the prefix."""
-_MAX_PATH = 500  # The most poses of a published path. It keeps a path of hours from delaying the mapping.
+_MAX_PATH = 500  # The most poses of a published path. With a larger number, long paths delay the mapping.
 
 
 class DdsPublisher:
@@ -47,7 +47,7 @@ class DdsPublisher:
 
 
 def messages_of(snapshot: Snapshot, maker: MapMessages) -> dict[str, Any]:
-    """Return the messages of a snapshot by the names in TOPICS. The path is thinned to _MAX_PATH poses."""
+    """Return the messages of a snapshot by the names in TOPICS. The path is thinned to at most _MAX_PATH poses."""
     stamp = snapshot.stamp if math.isfinite(snapshot.stamp) else 0.0
     stamps, poses = snapshot.path.stamps, snapshot.path.poses
     step = max(1, math.ceil(len(stamps) / _MAX_PATH))

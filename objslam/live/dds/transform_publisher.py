@@ -14,7 +14,7 @@ _TYPE = "tf2_msgs/msg/TFMessage"
 _QUEUE = 100  # The most transforms that wait for a slow subscriber, as in tf2. A larger number costs memory.
 _AHEAD = 0.2
 """How far a transform is dated ahead of the newest pose, s. Localisers do so, because tf2 does not extrapolate. The
-transforms are 0.1 s apart, so that 0.2 s bridge one that comes late. A larger value lets an old correction count longer."""
+transforms are 0.1 s apart, so 0.2 s bridge one late transform. With a larger value, an old correction is used for longer."""
 
 
 class TransformPublisher:
@@ -36,12 +36,12 @@ class TransformPublisher:
         self._writer: Any = DataWriter(network.participant, at, qos=qos)
 
     def update(self, snapshot: Snapshot) -> None:
-        """Take the correction of a snapshot. A snapshot without one leaves the last."""
+        """Take map_T_odom of a snapshot. If the snapshot has none, the last one stays."""
         if snapshot.map_T_odom is not None:
             self._newest, self._messages.frame = snapshot.map_T_odom, snapshot.map.frame
 
     def send(self, stamp: float) -> None:
-        """Publish the transform, dated just after the newest pose of the odometry, whose stamp, s, is given."""
+        """Publish the transform if it is known. stamp: of the newest pose, s. The transform is dated `_AHEAD` later."""
         child = self._odom_frame()
         if self._newest is None or child is None or not math.isfinite(stamp):
             return

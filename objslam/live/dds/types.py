@@ -21,7 +21,7 @@ def dds_topic(topic: str) -> str:
 
 
 def ros_topic(name: str) -> str | None:
-    """Return the ROS topic of a DDS topic's name; None for anything else, such as a service."""
+    """Return the ROS topic of a DDS topic's name, None for anything else, such as a service."""
     return "/" + name.removeprefix(_PREFIX) if name.startswith(_PREFIX) else None
 
 
@@ -32,7 +32,7 @@ def dds_type(type_: str) -> str:
 
 
 def ros_type(name: str) -> str | None:
-    """Return the ROS type of a DDS type's name; None for anything else."""
+    """Return the ROS type of a DDS type's name, None for anything else."""
     package, middle, rest = name.partition(_PARTS[0])
     return type_name(f"{package}/msg/{rest.removesuffix(_PARTS[1])}") if middle and rest.endswith(_PARTS[1]) else None
 
@@ -84,7 +84,7 @@ def _make_field(store: Typestore, description: Any, made: dict[str, type]) -> An
     from cyclonedds import idl
     from rosbags.interfaces import Nodetype
 
-    types: Any = idl.types  # untyped, because its generics are made at run time
+    types: Any = idl.types  # It is untyped, because its generics are made at run time.
     kind, detail = description
     if kind == Nodetype.NAME:
         return _make_struct(store, detail, made)

@@ -14,14 +14,14 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts kept per camera. More accept later frames of a camera on an arm, and cost memory.
+_MOUNTS = 4096  # How many mounts of a camera are kept. With more, its frames may arrive later. More cost memory.
 
 
 @dataclass(frozen=True)
 class FrameView:
-    """The bearings of the usable boxes of an image, with the number of its camera and base_T_camera (4, 4).
+    """The bearings of the usable boxes of an image. camera: the number of its camera.
 
-    mount: (4, 4) base_T_camera as received, with its shared errors.
+    mount: (4, 4) base_T_camera as received. base_T_camera: (4, 4) corrected for the shared errors.
     """
 
     camera: int
@@ -31,7 +31,7 @@ class FrameView:
 
 
 class BearingExtractor:
-    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings without their shared errors.
+    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings, corrected for the shared errors.
 
     The lists of cameras and labels are those of the map. New cameras and labels are appended to them.
     """
@@ -54,7 +54,7 @@ class BearingExtractor:
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:
-        """Return the bearings of a frame, with the mount of its camera at a corrected stamp, s. Count the dropped boxes."""
+        """Return the bearings of a frame. Count the dropped boxes. stamp: s, corrected for the camera's clock offset."""
         number, settings, errors = self._camera_number[frame.camera], self._settings, self._map.errors
         camera, held = self._map.sent_cameras[number], self._mounts.get(frame.camera)
         mount = camera.base_T_camera if held is None else held.at(stamp, camera)

@@ -1,6 +1,7 @@
 """The course of the robot: its path, joined from odometry and localisation, in the coordinate frame of the first pose.
 
-Localisation replaces missing odometry. It also relates the pieces of the course before and after a gap or change of source.
+Localisation replaces missing odometry. A gap, or a change between the two, begins a new piece of the course. Localisation
+also places a new piece relative to the pieces before.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # The time beyond live.max_late for which poses are kept, s, because frames wait in a queue. More costs memory.
+_KEPT = 3.0  # The time beyond live.max_late for which poses are kept, s, for frames that wait in a queue. More costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
@@ -27,7 +28,8 @@ class Placed:
     """The pose of the robot at the stamp of an image, from the odometry or from the localisation.
 
     piece: the number of the piece of the course. The path measures the motion between two images of one piece. map_T_base:
-    (4, 4) the pose on its own path. start_T_base, drift: the pose (4, 4) and its accumulated drift (6, 6) on the course.
+    (4, 4) the pose as its path gives it, in the frame odom or map. start_T_base, drift: the pose (4, 4) and its accumulated
+    drift (6, 6) on the course.
     """
 
     by_odometry: bool
@@ -39,7 +41,11 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """One stretch of a path, placed on the course. drift: (6, 6) the drift of the course in addition to the path's drift."""
+    """One stretch of a path, placed on the course.
+
+    stretch: the number of the stretch of the odometry, or _LOCALIZED. start_T_path: (4, 4) the first pose of the path on the
+    course. drift: (6, 6) what is added to the path's own drift, to get the drift on the course.
+    """
 
     stretch: int
     start_T_path: Floats
@@ -49,8 +55,8 @@ class _Piece:
 class Course:
     """The paths of odometry and localisation, and the course that they form.
 
-    driven, localized: the whole odometry and localisation, as received. odometry: the newest odometry, without its shared
-    errors.
+    driven, localized: the whole odometry and localisation, as received. odometry, localization: the poses of the last
+    seconds. The odometry in it is corrected for its shared errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:
@@ -67,23 +73,24 @@ class Course:
         self._newest = -np.inf
 
     def add_odometry(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) of the odometry."""
+        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others."""
         self.driven.append(stamp, pose)
         self.odometry.append(stamp, self._correction.correct(stamp, pose))
         self._localized_by_then = self.localization.newest
 
     def add_localization(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) of the localisation."""
+        """Append a pose (4, 4) of the localisation at a stamp, s, later than all others."""
         self.localized.append(stamp, pose)
         self.localization.append(stamp, pose)
 
     def recalibrate(
         self, errors: Mapping[str, float], corrected: Trajectory | None, settings: Settings, keyframes: KeyframeTable
     ) -> None:
-        """Correct other errors of the odometry, and move the pieces of the course and the keyframes on it accordingly.
+        """Correct the odometry by new values of its errors, and move the pieces of the course and the keyframes accordingly.
 
-        corrected: the odometry without its errors. keyframes: all keyframes, with their new stamps and their new map_T_base.
-        start_T_base and drift of the keyframes change. The first piece after a gap stays where its first keyframe is.
+        errors: by name. corrected: the whole odometry, corrected by these errors. keyframes: all keyframes, with their new
+        stamps and their new map_T_base. Their start_T_base and drift change here. A piece that does not continue the frame
+        of the piece before keeps the pose of its first keyframe.
         """
         said = self.driven.trajectory()
         self._correction = OdometryCorrection(errors, said, corrected)
@@ -135,7 +142,8 @@ class Course:
         """Return whether later messages cannot change the result of `place` for a frame with this stamp.
 
         When the localisation continues for poses.max_gap without odometry, the localisation gives the pose of the frame. A
-        frame on a new piece of the odometry waits until the localisation reaches the start of the piece.
+        frame on a new piece of the odometry waits until the localisation reaches the start of the piece, or is behind the
+        odometry by more than poses.max_gap.
         """
         odometry, localization = self.odometry, self.localization
         if odometry.newest < stamp:
@@ -175,7 +183,7 @@ class Course:
         return placed
 
     def _begin(self, stretch: int, path: PathBuffer, stamp: float, keyframes: KeyframeTable) -> _Piece:
-        """Make a new piece that starts at a stamp. If possible, the newest localisation until then positions it."""
+        """Make a new piece that starts at a stamp, s. If possible, the newest localisation up to the stamp places it."""
         last = self._last
         if last is None:
             return _Piece(stretch, np.eye(4), np.zeros((6, 6)))
@@ -188,7 +196,7 @@ class Course:
         if len(localized) and on is not None and there is not None and (path is self.localization or on.stretch == stretch):
             row = localized[keyframes.stamp[localized].argmax()]
             start_T_base = keyframes.start_T_base[row] @ inverse(keyframes.map_T_base[row]) @ there.pose
-            drift = 2 * last.drift - keyframes.drift[row]  # The new piece is independent of the drift since this keyframe.
+            drift = 2 * last.drift - keyframes.drift[row]  # Relative to `last`, its error is the drift since the keyframe.
             return self._lay(stretch, start_T_base, drift, path.from_start(on.pose), on.drift, self._noise)
         on = path.at(stamp)
         assert on is not None

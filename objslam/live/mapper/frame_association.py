@@ -17,9 +17,9 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, as a factor on the largest observed one. A larger factor costs time.
-_NEAR = 10.0  # The distance (m) up to which every landmark is a candidate. A larger distance costs time.
-_ROUGH = 3.0  # The least spread of a rough prediction, in units of a ray's noise. A larger value trusts more single boxes.
+_BEYOND = 1.5  # The largest distance to a candidate, as a multiple of the largest observed distance. More costs time.
+_NEAR = 10.0  # Up to this distance (m), a landmark is never too far to be a candidate. A larger distance costs time.
+_ROUGH = 3.0  # A prediction is rough if its image area is this many times that of a ray's noise. More removes fewer matches.
 _CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value trusts more single boxes.
 _BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
@@ -59,9 +59,10 @@ def match(
 ) -> Ints:
     """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for a ray without one.
 
-    Long unseen tracks are excluded, unless the camera pose in the map is certain. map_T_camera: (4, 4) predicted camera
-    pose, with its `uncertainty`. labels: number of labels. gate: share of the right matches that pass the gate.
-    landmark_of_track: id of the last landmark of each detector track. novelty: recent share of boxes without a landmark.
+    Long unseen tracks are excluded, unless the camera pose in the map is certain. Long unseen landmarks must be compatible
+    with each other (`jointly_compatible`). map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. labels:
+    number of labels. gate: share of the right matches that pass the gate. landmark_of_track: id of the last landmark of each
+    detector track. novelty: recent share of boxes without a landmark.
     """
     obs, origin, count = in_map(rays, map_T_camera), map_T_camera[:3, 3], len(rays.label)
     unseen = long_unseen(uncertainty.drift, predicted.drift)
@@ -88,7 +89,7 @@ def match(
         again = Landmarks(places[at], own[at], noises[at], accepts[at])
         unknown = unknown_density(some, rows[at], predicted, novelty)
         sure = back[jointly_compatible(some, again, uncertainty.against(to[at], then[at]), map_T_camera, unknown)]
-        if len(sure) < len(back):  # Assign again without the matches that failed. The others stay optimal.
+        if len(sure) < len(back):  # Assign again, to unseen landmarks only by the matches that passed.
             keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
             chosen = _best(_some(edges, keep), cost[keep], count, len(places), unmatched)
     return np.where(chosen >= 0, rows[chosen], -1)
@@ -124,7 +125,7 @@ def best_of_label(rays: FrameRays) -> Ints:
 
 
 def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(None)) -> Observations:
-    """Return rays as observations in map. which: the indices of these rays."""
+    """Return rays as observations in map. map_T_camera: (4, 4). which: the indices of the rays to return."""
     direction = rays.direction[which] @ map_T_camera[:3, :3].T
     origin = np.broadcast_to(map_T_camera[:3, 3], direction.shape)
     return Observations.of_lines(
@@ -135,7 +136,10 @@ def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(No
 def _possible(
     obs: Observations, origin: Floats, predicted: PredictedLandmarks, uncertainty: PoseUncertainty, unseen: Bools
 ) -> Ints:
-    """Return the indices in `predicted` of candidates for rays from one origin (3,). unseen: (n,) if long unseen."""
+    """Return the indices in `predicted` of the candidates for rays from one origin (3,), m.
+
+    unseen: whether each of the predicted landmarks and tracks is long unseen.
+    """
     wanted = np.flatnonzero(np.isin(predicted.label, obs.label))
     to = predicted.position[wanted] - origin
     distance = np.sqrt((to * to).sum(axis=1))
@@ -148,7 +152,8 @@ def _possible(
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
     """Return the candidate of each ray (n,), or -1, such that the total cost is least, as `best_assignment` for one frame.
 
-    cost: of each edge, which may be negative. unmatched: the cost of a ray without a candidate.
+    cost: (E,) of the edges, which may be negative. rays, places: the numbers of rays and of candidates. unmatched: the cost
+    of a ray without a candidate.
     """
     useful = np.flatnonzero(cost < unmatched)
     ray, place = pair_up(edges.ray[useful], edges.landmark[useful], unmatched - cost[useful], (rays, places))
@@ -162,7 +167,10 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 
 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
-    """Remove ambiguous or too uncertain matches of roughly predicted landmarks. `loop_closure` can find them later."""
+    """Remove ambiguous or too uncertain matches of roughly predicted landmarks. `loop_closure` can find them later.
+
+    sigma: (n,) rad, of the rays. to: (m, 3) m from the camera to each candidate. landmark: (m,) False for a track.
+    """
     rough = (edges.vague > 2 * np.log(_ROUGH)) & landmark[edges.landmark]
     if not rough.any():
         return edges

@@ -6,7 +6,7 @@ from objslam.core.arrays import Bools, Ints
 from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
-_NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. With more, more old ones are removed.
+_NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. A larger share removes more old ones.
 _OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They relate the map to the start.
 _SHARE = 0.25  # The share of live.max_keyframes that one culling removes. With more, culling is rarer and takes longer.
 _AGAIN = 0.1  # The new keyframes before the next culling, as a share of live.max_keyframes. With more, culling is rarer.
@@ -19,7 +19,7 @@ def cull_keyframes(m: MapState) -> None:
     """Remove old keyframes, if the map has more than live.max_keyframes, first where the keyframes are closest together.
 
     One call never removes two consecutive keyframes. The motions before and after a removed keyframe become one motion. The
-    next removal waits for some new keyframes.
+    next culling waits for some new keyframes (_AGAIN).
     """
     k, most = m.keyframes, m.settings.live.max_keyframes
     if len(k) <= most or m.next_id.keyframe < m.schedule.culled + _AGAIN * most:

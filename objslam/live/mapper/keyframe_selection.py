@@ -7,11 +7,15 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10  # The keyframes of a camera that stands still. More keyframes average the detector's noise, but cost time.
+_STANDING = 10  # The keyframes of all cameras while they stand still. More average the detector's noise, and cost time.
 
 
 class KeyframeSelector:
-    """Selects a keyframe when a camera has moved by a set distance or angle, and a few keyframes while it stands."""
+    """Selects a keyframe when a camera has moved by a set distance or angle, and a few keyframes while the cameras stand.
+
+    In the methods, camera is the number of the camera, start_T_camera (4, 4) its pose on the course, and shown the numbers
+    of the labels in the frame.
+    """
 
     def __init__(self, settings: Live) -> None:
         self._settings = settings
@@ -20,8 +24,7 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether the camera stands still, and the keyframes since it stopped are enough and show all labels
-        `shown`."""
+        """Return whether a frame adds nothing: its camera stands, and enough keyframes since the stop show its labels."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
@@ -33,12 +36,11 @@ class KeyframeSelector:
         self._standing += 1
 
     def place(self, camera: int, start_T_camera: Floats) -> None:
-        """Change the pose (4, 4) of a camera's last keyframe on the course, after the course has changed."""
+        """Change the pose of a camera's last keyframe, after the course has changed."""
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the count of keyframes
-        restarts."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the count restarts."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

@@ -14,7 +14,7 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # The information (m^-2) added to each landmark. Parallel rays give too little. More makes it too certain.
+_HELD = 1e-4  # The information (m^-2) added to each landmark. Parallel rays give none along them. More makes it too certain.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
 _FURTHER = 1.1  # A landmark is expected up to this factor times its largest observed distance. More counts more misses.
@@ -25,9 +25,9 @@ class LandmarkTable(GrowingTable):
     """The landmarks in the order of their ids.
 
     position: m, in map. information: m^-2, from the rays. drift: odometry drift at the last observation. first, last:
-    stamps, s, of the first and last observation. seen: number of frames that showed the landmark. expected: number of frames
-    that should have shown it. far: m, the largest observed distance. squared: sum of the squared deviations of its rays, in
-    variances. rejected: number of its rays outside the gate.
+    stamps, s, of the first and last observation. label: number. seen: number of frames that showed the landmark. expected:
+    number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared deviations
+    of its rays, in variances. rejected: number of its rays outside the gate.
     """
 
     id: Ints = column(np.int64)
@@ -60,8 +60,8 @@ def in_view(
 ) -> Bools:
     """Return which landmarks (N,) a camera should see, by their pixels and by the distances from which they were seen.
 
-    margin: the share of the image along its edge that is excluded. A negative margin extends the image. reach: m, the
-    distance up to which every landmark should be seen.
+    map_T_camera: (4, 4). margin: the share of the image along its edge that is excluded. A negative margin extends the
+    image. reach: m, the distance up to which every landmark should be seen.
     """
     local = (landmarks.position - map_T_camera[:3, 3]) @ map_T_camera[:3, :3]
     distance = np.sqrt(np.einsum("ni,ni->n", local, local))

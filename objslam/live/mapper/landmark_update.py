@@ -13,7 +13,7 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)  # The residual (rad) that shows that a loop closes. With a larger angle, the map settles later.
+_JUMP = np.radians(2.0)  # The residual (rad) above which the map relinearises soon. With a larger one, it settles later.
 _TRACKS = 4096  # The detector tracks whose landmark is stored. With more, a track id is recognised after a longer absence.
 
 
@@ -32,7 +32,7 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count the landmarks that the newest keyframe shows or should show, and add the information of its rays to them."""
+    """Count the landmarks that the newest keyframe shows or should show, and update those that it shows by its rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)
@@ -65,7 +65,7 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
 
 
 def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
-    """Move rays and counts from the landmark in row `drop` to that in row `keep`. The caller must then remove `drop`."""
+    """Move rays and counts from the landmark in row `drop` to the one in row `keep`. The caller must remove `drop` next."""
     landmarks, rays = m.landmarks, m.rays
     mine = np.flatnonzero(rays.owner == landmarks.id[drop])
     m.graph.drop_rays(rays.number[mine])

@@ -10,7 +10,7 @@ from objslam.live.mapper.state import MapState
 
 
 def localize(m: MapState) -> bool:
-    """Add absolute poses to the keyframes that the localisation covers only now, and return whether the map moved.
+    """Add absolute poses to the pending keyframes that the localisation covers by now. Return whether the map moved.
 
     The first absolute pose moves the whole map, because odometry alone gives the map relative to its own start.
     """
@@ -45,7 +45,11 @@ def localize(m: MapState) -> bool:
 
 
 def chain_keyframes(m: MapState) -> None:
-    """Connect consecutive keyframes by odometry, or without it by weak factors. The caller must rebuild the graph."""
+    """Connect consecutive keyframes by their motion. The caller must rebuild the graph.
+
+    If the odometry did not measure a motion, a weak factor takes its place. If the later keyframe and some
+    keyframe before it are localised, there is no factor, because absolute poses relate the two.
+    """
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)
     if every.odom_T_base is None:
@@ -65,7 +69,7 @@ def chain_keyframes(m: MapState) -> None:
 
 
 def _move_onto(m: MapState, row: int, map_T_base: Floats) -> None:
-    """Move the whole map such that the keyframe in a row gets the pose (4, 4)."""
+    """Move the whole map such that the robot has the pose map_T_base (4, 4) at the keyframe in a row."""
     m.graph.update()
     there = map_T_base @ m.keyframes.base_T_camera[row] @ inverse(m.graph.pose(int(m.keyframes.id[row])))
     m.graph.drop_absolute()

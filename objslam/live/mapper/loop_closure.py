@@ -18,10 +18,10 @@ from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
 _ANCHORS = 3  # The past keyframes that are tried as the start of the loop. More keyframes take longer.
-_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value relies on updates.
-_TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. A larger value relies on updates.
-_AROUND = 6.0  # The radius (m) around recognised landmarks in which others match again. It is about the view in a hall.
-_ERA = 15.0  # The most time (s) between the last observations of a recognised landmark and one _AROUND it. More adds misses.
+_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value leaves more to iSAM2.
+_TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. More leaves more to iSAM2.
+_AROUND = 6.0  # Other landmarks within this radius (m) of recognised ones match again. Cameras see about as far in a hall.
+_ERA = 15.0  # The most time (s) between the last sights of recognised landmarks and of those _AROUND. With more, more match.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
@@ -68,7 +68,10 @@ def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) 
 
 
 def _planar(m: MapState, before: int, now: int) -> Floats:
-    """Return a fast upper bound (3, 3) on the covariance of x, y, yaw between two keyframes, by odometry or the map."""
+    """Return a fast upper bound (3, 3) on the covariance of x, y (m) and yaw (rad) between keyframes in two rows.
+
+    It is the smaller of two bounds: by the drift between the two, and by the uncertainty of the newest pose in the map.
+    """
     k = m.keyframes
     turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
     to_camera = adjoint(k.camera_T_start[now])
@@ -79,7 +82,7 @@ def _planar(m: MapState, before: int, now: int) -> Floats:
 
 
 def _together(m: MapState) -> Bools:
-    """Return a mask (N, N) of the pairs of landmarks of one label that one frame showed."""
+    """Return a mask (N, N) of the pairs of landmarks of one label that some frame showed together."""
     result = np.zeros((len(m.landmarks), len(m.landmarks)), dtype=bool)
     if m.pairs.together:
         a, b = m.rows_of(np.array(list(m.pairs.together))).T
@@ -88,7 +91,7 @@ def _together(m: MapState) -> Bools:
 
 
 def _close(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Merge the landmarks in rows `now` (P,) into the landmarks in rows `old` (P,). First distribute a large correction."""
+    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). A large correction (4, 4) bends the path."""
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.landmarks.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
@@ -108,7 +111,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Give the landmarks around rows `old` (P,) the drift of the first row of `now` (P,), so that they match again."""
+    """Give landmarks around rows `old` (P,) the drift of the earliest one in rows `now` (P,), so that they match again."""
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
     since = gathered(drift, landmarks.drift)

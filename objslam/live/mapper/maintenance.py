@@ -21,13 +21,13 @@ from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
-_GROWING = 3  # The keyframe in each period that bounds growth. It differs from _CLOSING to spread the delay.
-_CLOSING = 6  # The keyframe in each period that merges and removes landmarks.
-_BREATH = 2  # The period of relinearisation after a loop closure, in keyframes. With a larger period, the map settles later.
+_GROWING = 3  # The keyframe of each period after which growth is bounded. It differs from _CLOSING to spread the delay.
+_CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed.
+_BREATH = 2  # The period of early relinearisations, in keyframes. With a larger period, the map settles later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
-_GROWTH = 1.5  # The growth factor of keyframes between full solves. A larger factor keeps errors of first estimates longer.
+_GROWTH = 1.5  # The growth of the number of keyframes between full solves. A larger factor keeps first errors for longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
-_LARGE = 400  # The keyframes above which relinearisation in slices replaces the full solve, because frames cannot wait.
+_LARGE = 400  # The number of keyframes above which a rebuild in slices replaces the full solve. More delay the next frame.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
@@ -35,7 +35,7 @@ _VISITS = 6
 of outliers. A larger number keeps one object for longer."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The border around the image, as a share of the image. A wider border prepares the graph for more landmarks.
-_USUAL = 0.75  # The quantile of the distances `far` up to which any landmark may be seen soon. More prepares more landmarks.
+_USUAL = 0.75  # The quantile of the landmarks' `far` up to which any of them may be seen soon. More prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:
@@ -60,7 +60,7 @@ def maintain(m: MapState) -> None:
 
 
 def _coming(m: MapState) -> Ints:
-    """Return the landmarks (n,) that the camera of the newest keyframe sees, or may see soon."""
+    """Return the ids (n,) of the landmarks that the camera of the newest keyframe sees, or may see soon."""
     landmarks, keyframes = m.landmarks, m.keyframes
     if not len(landmarks.id):
         return landmarks.id
@@ -87,7 +87,10 @@ def _polish_if_grown(m: MapState) -> None:
 
 
 def _reconsider(m: MapState) -> bool:
-    """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed."""
+    """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed.
+
+    If every label is one object, a landmark with few inliers is triangulated again. A label with two objects ends this mode.
+    """
     rays, landmarks = m.rays, m.landmarks
     m.graph.refresh()
     m.read_positions()
@@ -120,9 +123,10 @@ def _reconsider(m: MapState) -> bool:
 
 
 def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
-    """Return whether rays (R,) of one landmark alternate between inliers and outliers, which shows two objects.
+    """Return whether the rays (R,) of some landmark show two objects.
 
-    The rays are in time order. row: (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
+    They do if they alternate between inliers and outliers, and the outliers fit one point. The rays are in time order. row:
+    (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
     """
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))
@@ -172,7 +176,7 @@ def _merge_duplicates(m: MapState) -> None:
 def _one(way: Floats, spread: Floats, density: float) -> bool:
     """Return whether two landmarks are one object. way: (3,) m, from one to the other. spread: (3, 3) m^2, its covariance.
 
-    density: possible neighbours of the label per m^2.
+    density: landmarks of the label per m^2 of the map.
     """
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
@@ -191,7 +195,7 @@ def _drifted(m: MapState, rows: Ints) -> Floats:
 
 
 def _drop_ghosts(m: MapState) -> None:
-    """Remove the landmarks that are rarely seen in frames that should show them."""
+    """Remove the landmarks that were seen in too small a share of the frames that should show them (live.ghost_share)."""
     landmarks, live = m.landmarks, m.settings.live
     rarely_seen = landmarks.seen < live.ghost_share * landmarks.expected
     ghost = np.flatnonzero((landmarks.expected >= live.ghost_frames) & rarely_seen)

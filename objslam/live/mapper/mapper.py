@@ -49,7 +49,7 @@ class Mapper:
         self._predicted: PredictedLandmarks | None = None  # For the next frame. None after the map has changed.
 
     def feed(self, message: Message) -> None:
-        """Process a pose, a calibration or a mount."""
+        """Process a pose, a camera or a mount. Other messages change nothing."""
         m = self.state
         if isinstance(message, PoseMessage):
             if message.path == "odometry":
@@ -81,7 +81,7 @@ class Mapper:
             self._selector.place(number, m.keyframes.start_T_base[row] @ m.keyframes.base_T_camera[row])
 
     def take(self, frame: FrameMessage) -> LandmarkUpdate | None:
-        """Add a frame to the map, and return the argument for `look_after`. None if the frame does not become a keyframe."""
+        """Add a frame to the map. Return the argument for `look_after`, or None if the frame does not become a keyframe."""
         m, stamp = self.state, self.corrected_stamp(frame)
         before = m.newest_before(stamp)
         placed = m.course.place(stamp, m.keyframes, before)

@@ -15,7 +15,7 @@ _PLACED = 0.1  # The sigma (m) of the camera position below which old tracks mat
 
 @dataclass(frozen=True)
 class PoseUncertainty:
-    """The uncertainty of the camera pose of a frame.
+    """The uncertainty of the camera pose of a frame, in rad and m, rotation first.
 
     drift: (6, 6) covariance that the odometry has accumulated, on the course. camera_from_drift: (6, 6) adjoint from the
     course to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame. It is NaN if unknown.
@@ -50,7 +50,8 @@ class PoseUncertainty:
     def against(self, to: Floats, then: Floats) -> Floats:
         """Return the covariance (6, 6) of the camera pose relative to several landmarks together, in the camera frame.
 
-        It is the smaller of the drift since the longest unseen landmark and the covariance of the pose in the map.
+        It is the smaller of the drift since the longest unseen landmark and the covariance of the pose in the map. to, then:
+        as in `of_landmarks`.
         """
         oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
         since = self.camera_from_drift @ gathered(self.drift, oldest[None])[0] @ self.camera_from_drift.T

@@ -20,7 +20,7 @@ from objslam.live.mapper.landmark_table import LandmarkTable
 from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
 
-_RELINEARISATIONS = 3  # The relinearisations after a loop closure. More let the map settle further, and take time.
+_RELINEARISATIONS = 3  # The relinearisations after a large change. More let the map settle further, and take time.
 
 
 @dataclass
@@ -50,7 +50,7 @@ class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
     together: number of frames with both landmarks. apart: for a pair that was tested and not merged, the number of frames
-    with its less seen landmark, divided by 5.
+    with its less seen landmark at the test, divided by 5. When this has changed, the pair is tested again.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)
@@ -93,7 +93,7 @@ class MapState:
     the course. rng: seeded by the settings.
     given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
     the cameras as received, and without their errors. errors: by name, the errors that are corrected in all measurements.
-    calibration: the estimate of these errors.
+    calibration: the last estimate of these errors, None without one.
     """
 
     settings: Settings
@@ -122,7 +122,7 @@ class MapState:
     calibration: Calibration | None = None
 
     def newest_before(self, stamp: float) -> int | None:
-        """Return the row of the newest keyframe at or before a stamp, s; None if there is none."""
+        """Return the row of the newest keyframe at or before a stamp, s, None if there is none."""
         stamps = self.keyframes.stamp
         if len(stamps) and stamps[-1] <= stamp:
             return len(stamps) - 1
@@ -159,7 +159,11 @@ class MapState:
         return np.asarray(k.camera[np.searchsorted(k.id, self.rays.keyframe[at])])
 
     def bearings(self, at: Ints) -> Bearings:
-        """Return the rays in rows (n,) for the graph. Range noise includes a bias, which does not average out."""
+        """Return the rays in rows (n,) for the graph.
+
+        The range noise includes the bias that the ranges of a landmark share. It grows with their number, because a bias
+        does not average out.
+        """
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
@@ -186,7 +190,7 @@ class MapState:
         self.read_positions()
 
     def move(self, new_T_old: Floats) -> None:
-        """Move the whole map by a pose (4, 4). The caller must remove the absolute poses before."""
+        """Move the whole map by a pose (4, 4). Before, the caller must remove the factors of absolute poses."""
         self.graph.move(new_T_old)
         turn, landmarks = new_T_old[:3, :3], self.landmarks
         landmarks.position[:] = landmarks.position @ turn.T + new_T_old[:3, 3]

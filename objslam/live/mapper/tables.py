@@ -72,7 +72,8 @@ class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
     Above _MOST_POSES, some are dropped, evenly over time, so that a long session takes little memory. The time between the
-    poses that stay is always shorter than a gap. max_gap: s, the shortest gap.
+    poses that stay is always shorter than a gap. If this leaves too many poses, the limit doubles. max_gap: s, the shortest
+    gap.
     """
 
     stamp: Floats = column(np.float64)

@@ -16,7 +16,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
-SLACK = 0.02  # The error (m) between poses on one stretch. A larger error accepts rays that pass a point less closely.
+SLACK = 0.02  # The assumed error (m) between poses of one stretch. A larger one accepts rays that pass a point less closely.
 _AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
 _AGAIN = 1.2  # The growth factor of the rays or the spread after which a track is tried again. A smaller factor costs time.
 _EARLY = 0.4  # The share of joint.min_parallax_deg that suffices if the position is certain. More makes landmarks later.
@@ -62,7 +62,7 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:
-    """Return the position of a track's object if `fit_if_observable` finds one. A track is tried again only after growth."""
+    """Return the position of a track's object if `fit_if_observable` finds one. A failed track must grow first."""
     live, rays = settings.live, len(track.rays)
     unchanged = rays < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread
     if rays < live.min_rays or unchanged:
@@ -99,7 +99,8 @@ def fit_if_observable(
 def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
-    Labels with most tracks lose tracks first. Within a label, short tracks go first, then the longest unseen ones.
+    Labels with most tracks lose tracks first. Within a label, tracks with fewer than live.min_rays rays go first, and among
+    equals the longest unseen ones.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return

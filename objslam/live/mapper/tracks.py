@@ -16,7 +16,7 @@ _DEPTH_SIGMA = 2.0  # The standard deviation (m) of a track along its last ray. 
 _DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More makes it move less.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
 _RECENT = 30  # The newest rays that define a track's position. More rays average more noise over a longer drift.
-_LONGEST = 200  # The most rays of a track. Above it, every second old ray is dropped. More rays cost memory and time.
+_LONGEST = 200  # The most rays of a track. Above it, every second ray of the older half goes. More cost memory and time.
 
 TrackRay = tuple[int, int, Floats, float, float, float]
 """The number of a ray, its keyframe, its direction (3,) in the camera, sigma in rad, range in m and range_sigma in m."""
@@ -26,10 +26,11 @@ TrackRay = tuple[int, int, Floats, float, float, float]
 class Track:
     """The rays of one object that is not a landmark yet.
 
-    by_label: whether its rays were grouped by label alone. Such a track is never dropped. first, last: stamps, s, of its
-    first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)
-    m^2 in map, from the camera poses at the time of each ray. spread: rad, the widest angle between a ray and the first ray.
-    tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
+    label: its number. by_label: whether its rays were grouped by label alone. Such a track is not dropped when it is long
+    unseen. first, last: stamps, s, of its first and last observation. drift: (6, 6) odometry drift at the last observation.
+    position, covariance: (3,) m and (3, 3) m^2 in map, from the camera poses at the time of each ray. spread: rad, the
+    widest angle between a ray and the first ray. tried, tried_spread: the number of rays and the spread at the last attempt
+    to make a landmark.
     """
 
     id: int
@@ -84,12 +85,16 @@ class Track:
             )
         ]
         self.drift = drift
+        self.realign(graph)
+
+    def realign(self, graph: IncrementalGraph) -> None:
+        """Place its rays at the current camera poses of the graph, after these poses have moved."""
         obs = self.sight(graph)
-        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, ranges, range_sigmas])
+        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, obs.range, obs.range_sigma])
         self._lines = list(lines[-_RECENT:])
 
     def move(self, new_T_old: Floats) -> None:
-        """Move its position and lines by a pose (4, 4)."""
+        """Move its position, covariance and rays in map by a pose (4, 4)."""
         turn = new_T_old[:3, :3]
         self.position = turn @ self.position + new_T_old[:3, 3]
         self.covariance = turn @ self.covariance @ turn.T

@@ -40,7 +40,7 @@ class PathBuffer:
         self.stretch_begin = np.inf
 
     def append(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) that is newer than all others. The caller must not change its array."""
+        """Append a pose (4, 4) at a stamp, s, later than all others. The caller must not change its array."""
         if not self._stamps:
             self._from_start, drift, stretch = inverse(pose), np.zeros((6, 6)), 0
             self._last = self._from_start @ pose
@@ -60,7 +60,7 @@ class PathBuffer:
             del self._stamps[:half], self._path[:half]
 
     def replace(self, path: Trajectory, settings: Odometry) -> None:
-        """Replace the kept poses by poses of another path, which must include the first pose that was ever appended."""
+        """Replace the kept poses by poses of another path, which must begin at the first stamp that was ever appended."""
         if not self._stamps:
             return
         self._settings, self._from_start = settings, inverse(path.poses[0])

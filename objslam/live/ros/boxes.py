@@ -16,7 +16,7 @@ from objslam.ros.messages.decode import DecodeError
 from objslam.ros.messages.images import DEPTH_SCALE, depth_image
 
 _KEPT = 30  # The depth images kept per camera: 1 s at 30 Hz, the delay of a detector. A larger number costs memory.
-_MAX_FRAMES = 16  # The most coordinate frames with depth images. It bounds the memory.
+_MAX_FRAMES = 16  # The most coordinate frames with depth images. A larger number costs memory.
 Drop = Callable[[str, str], None]  # A function that counts a drop. Its arguments are the reason and the place.
 
 
@@ -24,9 +24,10 @@ Drop = Callable[[str, str], None]  # A function that counts a drop. Its argument
 class Boxes:
     """The boxes of one image.
 
-    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: the time of arrival, s, by any clock. points: centre and
-    corners (5, 3) of a tag, m, in the camera frame, by the index of the box that they replace. size: (width, height) of the
-    image, px, None if unknown. whole: as in `types.Detections`. image: (H, W, 3) uint8 BGR, None if not available.
+    stamp: s. frame: the camera's tf frame, "" if unknown. arrived: the time of arrival, s, by any clock. boxes: (B, 4), raw
+    px. points: centre and corners (5, 3) of a tag, m, in the camera frame, by the index of the box that is computed from
+    them. size: (width, height) of the image, px, None if unknown. whole: as in `types.Detections`. image: (H, W, 3) uint8
+    BGR, None if not available.
     """
 
     topic: str
@@ -64,12 +65,12 @@ class DepthImages:
         self._kept.setdefault(frame, deque(maxlen=_KEPT)).append((stamp, topic, message))
 
     def awaits(self, boxes: Boxes) -> bool:
-        """Return whether the depth image of the boxes may still arrive, because all present ones are older."""
+        """Return whether the depth image of the boxes may still arrive, because all depth images so far are older."""
         kept = self._kept.get(boxes.frame)
         return kept is not None and kept[-1][0] < boxes.stamp - MAX_IMAGE_LAG
 
     def at(self, boxes: Boxes, camera: Camera) -> Floats | None:
-        """Return the depths (B,) of boxes, m, NaN where unknown; None if their camera has no depth images."""
+        """Return the depths (B,) of boxes, m, NaN where unknown. None if their camera has no depth images."""
         kept = self._kept.get(boxes.frame)
         if not kept:
             return None

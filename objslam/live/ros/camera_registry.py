@@ -23,10 +23,10 @@ from objslam.ros.topics import closeness, is_named, is_rectified, mount_of
 
 PATIENCE = 1.0  # The time that boxes wait for their camera's calibration and transform, s. A larger value drops fewer boxes.
 _DEPTH_WAIT = 0.2  # The time that boxes wait for their depth image, s. A larger value uses depths of slower cameras.
-_MAX_WAITING = 200  # The most images whose boxes wait. It bounds the memory.
-_IMAGES = 4  # The number of images per camera that are kept for display. It bounds the memory.
+_MAX_WAITING = 200  # The most images whose boxes wait. A larger number costs memory.
+_IMAGES = 4  # The number of images per camera that are kept for display. A larger number costs memory.
 _SAME = 0.001  # The most that the stamps of an image and its boxes differ, s. It is far below the time between two images.
-_MAX_CAMERAS = 64  # The most cameras that are kept. It bounds the memory.
+_MAX_CAMERAS = 64  # The most cameras that are kept. A larger number costs memory.
 
 
 @dataclass
@@ -47,7 +47,11 @@ class _Known:
 
 
 class Cameras:
-    """Pushes each camera when its calibration and mount are known, then its boxes in order, and mounts that change."""
+    """Pushes each camera when its calibration and mount are known, then its boxes in order, and mounts that change.
+
+    base: returns the name of the base frame. calibrations: from a file, instead of CameraInfo. rectified: whether boxes are
+    in rectified images, None to tell it by the topic names. mounts: from a file, instead of tf.
+    """
 
     def __init__(
         self,
@@ -142,11 +146,11 @@ class Cameras:
         return ""
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return the image of a camera, by its name, at a stamp, s; None if it is not among the newest."""
+        """Return the image of a camera, by its name, at a stamp, s. None if it is not among the newest."""
         return next((image for at, image in self._images.get(camera, ()) if abs(at - stamp) <= _SAME), None)
 
     def _make(self, boxes: Boxes, waited: float) -> _Known | str:
-        """Make the camera of boxes that have none, or return the reason why it cannot be made. waited: s."""
+        """Make the camera of boxes whose camera is new, or return the reason why it cannot be made. waited: s."""
         frame = boxes.frame
         if frame not in self._frames:
             if len(self._frames) >= _MAX_CAMERAS:
@@ -181,8 +185,8 @@ class Cameras:
     def _source(self, boxes: Boxes, waited: float) -> str | None:
         """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
 
-        It is the frame of the boxes. After a while without a CameraInfo of this frame, the CameraInfo of the closest topic
-        is used.
+        It is the frame of the boxes. After half of `PATIENCE` without a CameraInfo of this frame, the CameraInfo of the
+        closest topic is used.
         """
         if boxes.frame in self._infos:
             return boxes.frame

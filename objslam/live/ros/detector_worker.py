@@ -17,7 +17,7 @@ from objslam.ros.messages.images import colour_image
 if TYPE_CHECKING:
     from objslam.detection import Detector
 
-_MAX_TOPICS = 64  # The most topics with a waiting image. It bounds the memory.
+_MAX_TOPICS = 64  # The most topics with a waiting image. A larger number costs memory.
 _IN_A_ROW = 5  # The number of consecutive failed images of a topic before a warning. A larger number warns later.
 _FAILED, _ENDED = "image that the detector failed on", "image that arrived after the detector had ended"
 
@@ -47,7 +47,9 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            late = self._waiting.pop(topic, None)
+            late = self._waiting.get(
+                topic
+            )  # The newer image keeps its place. At the end of the queue it might never be next.
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:
                 self._waiting[topic] = message, stamp

@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
 _GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value delays the start of a robot without one.
-_LONGEST = 160  # The most letters of the place of a drop in the ledger. It keeps lines readable.
-_MAX_TRACKS = 100_000  # The most track names that are kept. It bounds the memory.
+_LONGEST = 160  # The most letters of the place of a drop in the ledger. A larger number makes longer lines.
+_MAX_TRACKS = 100_000  # The track names above which all are forgotten. A larger number costs memory.
 
 
 class RosMessages:
     """Takes messages of ROS 1 or 2 by type, and pushes their content into a sink. Any thread may call it.
 
-    Odometry comes from one topic, or from tf if there is no topic. Localisation comes from poses in the frame map, or from
-    tf, where each new transform map -> odom is pushed with the next odometry.
-    ledger: the counts of unusable messages. chosen: the topics that the options name. sources: the topic in use, or "tf",
-    by role.
+    Odometry comes from one topic, or from tf if there is no topic. Localisation comes from an Odometry topic in the frame
+    map, from the topics of poses that the options name, or from tf. In tf, each new transform map -> odom is pushed with the
+    next odometry. Without odom in tf, the pose of base in map is pushed. ledger: the counts of unusable messages. chosen:
+    the topics that the options name. sources: the topic in use, or "tf", by role.
     """
 
     def __init__(
@@ -106,12 +106,12 @@ class RosMessages:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s; None if it is not among the detector's newest."""
+        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s. None if it is not among the detector's newest."""
         with self._lock:
             return self._cameras.image(camera, stamp)
 
     def odom_frame(self) -> str | None:
-        """Return the frame of the odometry. None while it is unknown, or if tf already gives it a place in a map."""
+        """Return the frame of the odometry. None while it is unknown, or if it already has a parent frame in tf."""
         with self._lock, suppress(UnknownTransform):
             odom = self._odom or find_odom(self._tf.above(self._base()))
             return odom if odom and len(self._tf.above(odom)) == 1 else None
@@ -122,7 +122,7 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used for a role. Only the chosen source is used, or else the first that arrived."""
+        """Return whether a source is used for a role: the one that the user chose, else the first to arrive."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:
@@ -155,7 +155,7 @@ class RosMessages:
             return
         if (frame, child) != (self._odom, self._child):
             self._odom, self._child = frame, child
-            with suppress(UnknownTransform):  # because tf may not give a localisation yet
+            with suppress(UnknownTransform):  # tf may not give a localisation yet.
                 self._correct(frame)
         self._push_odometry(stamp, pose, covariance)
 
@@ -166,7 +166,7 @@ class RosMessages:
             self._sink.push_localization(stamp, self._correction @ odom_T_base)
 
     def _take_pose(self, topic: str, message: Any, received: float) -> None:
-        if topic not in self.chosen.of("localization"):  # a goal is a pose too, so only chosen topics are used
+        if topic not in self.chosen.of("localization"):  # A goal is a pose too, so only chosen topics are used.
             return
         stamp, covariant = _stamp(message.header, received), hasattr(message.pose, "pose")
         place = message.pose.pose if covariant else message.pose
@@ -208,7 +208,7 @@ class RosMessages:
             self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
 
     def _news(self, top: str, base: str) -> float | None:
-        """Return the newest stamp, s, of the transform top_T_base; None if it is not new or all transforms are static."""
+        """Return the newest stamp, s, of the transform top_T_base. None if it is not new or all transforms are static."""
         before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
         return None if self._tf_stamp == before else self._tf_stamp
 
@@ -242,10 +242,10 @@ class RosMessages:
             self.refuse(f"message with more than {MAX_BOXES} detections", topic)
             return
         frame = message.header.frame_id
-        if not frame and found:  # some detectors fill in only the header of each box
+        if not frame and found:  # Some detectors fill in only the header of each box.
             frame = getattr(getattr(next(iter(getattr(message, "detections", ())), None), "header", None), "frame_id", "")
         labels = [f.label or self._options.label or "" for f in found]
-        if len(self._tracks) > _MAX_TRACKS:  # a tracker that never repeats a name gives no information
+        if len(self._tracks) > _MAX_TRACKS:  # A tracker that never repeats a name gives no information.
             self._tracks.clear()
         tracks = [track_number(f.track, self._tracks) for f in found]
         points = {i: f.points for i, f in enumerate(found) if f.points is not None}
@@ -259,6 +259,6 @@ def _stamp(header: Any, received: float) -> float:
 
 
 def _covariance(values: Any) -> Floats | None:
-    """Return a covariance (6, 6); None if the message does not fill it in."""
+    """Return a covariance (6, 6). None if the message does not fill it in."""
     matrix = np.array(values, dtype=np.float64)
     return matrix.reshape(6, 6) if matrix.size == 36 and np.isfinite(matrix).all() and matrix.any() else None

@@ -27,7 +27,7 @@ _EXACT = 2**53  # The bound below which a float represents every whole number ex
 
 
 def floats(values: object, *shape: int) -> Floats | None:
-    """Copy values into an array of a shape; None if that fails. An empty list fits every shape that has a 0 in it."""
+    """Copy values into an array of a shape, None if that fails. An empty list fits every shape that has a 0 in it."""
     found = _array(values, np.float64)
     if found is None or found.shape == shape:
         return found
@@ -35,7 +35,7 @@ def floats(values: object, *shape: int) -> Floats | None:
 
 
 def track_numbers(values: object, count: int) -> Ints | None:
-    """Copy the ids of `Sink.push_detections` into an array (count,), with -1 for unknown ids; None if an id is invalid."""
+    """Copy the ids of `Sink.push_detections` into an array (count,), with -1 for unknown ids. None if they are invalid."""
     if values is None:
         return np.full(count, -1, dtype=np.int64)
     found = _array(values)
@@ -50,13 +50,13 @@ def track_numbers(values: object, count: int) -> Ints | None:
 
 
 def stamp_of(value: object) -> float | None:
-    """Return a stamp, s; None if the value is no number, not finite or out of range."""
+    """Return a stamp, s. None if the value is no number, not finite or out of range."""
     found = floats(value)
     return float(found) if found is not None and valid_stamps(found, MAX_LIVE_STAMP) else None
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
-    """Return labels as a tuple; None for a text, an unordered collection or more than MAX_BOXES labels."""
+    """Return labels as a tuple. None for a text, an unordered collection or more than MAX_BOXES labels."""
     if isinstance(labels, str | bytes | Mapping | Set) or not _is_short(labels):
         return None
     try:
@@ -78,7 +78,7 @@ def told(value: object) -> str:
 
 
 def rigid(pose: object) -> Floats | None:
-    """Copy a rigid pose into an array (4, 4) with an exact rotation; None if `validity.rigid_poses` refuses it."""
+    """Copy a rigid pose into an array (4, 4) with an exact rotation. None if `validity.rigid_pose` refuses it."""
     matrix = floats(pose, 4, 4)
     return None if matrix is None else rigid_pose(matrix)
 
@@ -107,7 +107,7 @@ def sound_camera(camera: object) -> Camera | str:
         return "whose sees_size is neither true nor false"
     noise: object = camera.depth_noise
     if noise is not None and not isinstance(noise, RangeNoise):
-        return "whose depth noise is none"
+        return "whose depth_noise is not a RangeNoise"
     lens = matrix, camera.distortion_model, distortion
     copied = Camera(camera.name, width, height, *lens, base_T_camera, float(scale), bool(sees_size), noise)
     return camera_fault(copied) or copied
@@ -118,8 +118,9 @@ def sound_frame(
 ) -> tuple[FrameMessage | None, str, str, dict[str, int]]:
     """Check the arguments of `Sink.push_detections`, which may be of any type.
 
-    Return the frame without its invalid boxes, or None if the whole frame is malformed; the reason to drop the whole frame,
-    or ""; the frame's name in reports; and the number of invalid boxes by reason.
+    Return four values. The first is the frame without its invalid boxes, or None if the whole frame is malformed. The second
+    is the reason to drop the whole frame, or "". The third is the frame's name in reports. The last is the number of invalid
+    boxes by reason.
     """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:
@@ -149,7 +150,7 @@ def sound_frame(
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array; None if they form no array, or hold something else than numbers, such as truth values."""
+    """Copy values into an array. None if they form no array of numbers. Truth values are not numbers here."""
     if not _is_short(values, scalar=True):
         return None
     try:

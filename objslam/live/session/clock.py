@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The consecutive older poses that show that the clock was set back. A larger number is surer, but slower.
-_BACK = 0.5  # The least step back that counts as a clock set back, s. With a smaller step, a pose counts as late.
-_LEAP = 60.0  # The least step ahead that a second pose must confirm, s. A smaller step lets a wrong stamp cost less.
+_SURE = 5  # The number of older poses in a row that shows that the clock was set back. A larger one is surer, but slower.
+_BACK = 0.5  # The least step back of a clock that is set back, s. A pose that is back by less counts as late.
+_LEAP = 60.0  # The least step ahead that a second pose must confirm, s. With a larger one, a wrong stamp does more harm.
 _KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
 
@@ -16,7 +16,7 @@ _MISSED = 0.005  # The assumed time between the poses around a change of the clo
 class Clock:
     """Converts stamps to session time, in which the stamps of the path increase.
 
-    shift: the time, s, that is added to a stamp now. newest: the newest stamp of the path, in session time, s. It is -inf
+    shift: the time, s, that is now added to each stamp. newest: the newest stamp of the path, in session time, s. It is -inf
     before the first pose.
     """
 
@@ -30,7 +30,7 @@ class Clock:
         """Return a new pose's stamp in session time, or None, and whether the clock was set back.
 
         The stamp is None for a pose that is late or repeated. It is also None for a pose that leaps ahead, unless the
-        previous pose leapt as well.
+        previous pose leapt to about the same time.
         """
         time = stamp + self.shift
         if self.newest + _LEAP < time and math.isfinite(self.newest):
@@ -56,7 +56,10 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return any other stamp in session time. The newest shift that puts it between `oldest` and `latest` is used."""
+        """Return a stamp that does not set the clock, in session time. oldest, latest: session time, s.
+
+        The newest shift that puts the stamp between the two is used. If no shift does, the newest is used.
+        """
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:
                 return stamp + shift
@@ -66,7 +69,8 @@ class Clock:
 class Lead:
     """Chooses the path whose stamps set the clock. path: this leading path, None before the first pose.
 
-    The odometry leads. The localisation takes over when it continues for max_gap, s, without odometry.
+    The odometry leads. The localisation leads before the first odometry, and when it continues for max_gap, s, without
+    odometry.
     """
 
     def __init__(self, clock: Clock, max_gap: float) -> None:

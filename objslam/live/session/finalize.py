@@ -12,6 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
+from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Association, Log, Trajectory
@@ -23,11 +24,14 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
 from objslam.mapping.solution import Solution, without_errors
 
 
-def finish(m: MapState, name: str, path: Path | None) -> RunResult:
+def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
+
+    known: a prior map. If the whole drive is found in it, the result is in its frame, as in an offline run.
 
     The session's association is kept if every label is one object, or if there are more rays than live.reassociate.
     SolveError when no box could be mapped.
@@ -60,7 +64,15 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     ids = _kept_ids(found.association, found.ids, solution.association)
-    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
+    objects = _with_ids(objects, ids)
+    where = None
+    if known is not None:
+        where = localize(solution, objects, known, errors, settings, ledger)
+        if where.solution is not None and where.map_T_drive is not None:
+            solution, log = where.solution, moved_log(log, where.map_T_drive)
+            keyframes, estimate = solution.keyframes, solution.estimate
+            described, residual = describe(solution, cameras, settings)
+            objects = with_map(_with_ids(described, ids), where, known)
     accepted = m.counters.accepted()
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
@@ -71,12 +83,21 @@ def finish(m: MapState, name: str, path: Path | None) -> RunResult:
         solution,
         objects,
         residual,
-        summary={**summary, "live": {**accepted, "rebuilds": m.graph.rebuilds}},
+        summary={
+            **summary,
+            "live": {**accepted, "rebuilds": m.graph.rebuilds},
+            **({} if where is None else {"localisation": where.told}),
+            **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
+        },
         settings=settings,
         cameras=cameras,
         path=Trajectory(stamps, keyframes.map_T_base[first]),
         path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
+
+
+def _with_ids(objects: ObjectMap, ids: list[int]) -> ObjectMap:
+    return replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:

@@ -9,6 +9,7 @@ from objslam.config import Settings
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
+from objslam.live.session.map_locator import MapLocator
 from objslam.sources.journal.records import FrameMessage, Message
 
 TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason to drop a frame for which the session had no time.
@@ -24,10 +25,17 @@ class FrameQueue:
     """
 
     def __init__(
-        self, settings: Settings, counters: Counters, mapper: Mapper, calibrator: Calibrator, patient: bool
+        self,
+        settings: Settings,
+        counters: Counters,
+        mapper: Mapper,
+        calibrator: Calibrator,
+        locator: MapLocator,
+        patient: bool,
     ) -> None:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
-        self._counters, self._mapper, self._calibrator, self._patient = counters, mapper, calibrator, patient
+        self._counters, self._mapper, self._patient = counters, mapper, patient
+        self._calibrator, self._locator = calibrator, locator
         # corrected stamp, order of arrival, frame, time of arrival
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
@@ -60,6 +68,7 @@ class FrameQueue:
                 if measured:
                     self._counters.updated(self.lag)
                 self._mapper.look_after(update)
+                self._locator.after_keyframe()
                 if self._calibrator.after_keyframe():
                     corrected = self._mapper.corrected_stamp
                     self._waiting = sorted((corrected(f), number, f, arrived) for _, number, f, arrived in self._waiting)

@@ -30,8 +30,8 @@ from objslam.sources.journal.records import (
 _JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # After a gap, a pose smaller than this, m and rad, means a restart. A larger value detects more restarts.
-_FAR = 0.1  # The least size of the pose before such a gap, m and rad. A larger value takes more restarts for motion.
+_ZERO = 0.05  # A pose smaller than this, m and rad, after a gap means a restart. A larger value detects more restarts.
+_FAR = 0.1  # The least size of the pose before the gap, m or rad, for _ZERO. A larger value takes more restarts for motion.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
@@ -46,7 +46,8 @@ class Intake:
 
     It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
     odometry, it converts the new poses, so that they continue the old path. The thread that pushes calls deliver(message,
-    arrival), for one message at a time. `deliver` returns whether it accepts the message, and counts what it refuses.
+    arrival), for one message at a time. arrival: s, by `time.perf_counter`. `deliver` returns whether it accepts the
+    message, and counts what it refuses.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
@@ -55,7 +56,7 @@ class Intake:
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
-        self._stamps: dict[str, dict[float, None]] = {}  # by camera, in the order of arrival
+        self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
         self._start_T_odom = np.eye(4)
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
@@ -81,7 +82,7 @@ class Intake:
         return self._push_pose("odometry", stamp, odom_T_base)
 
     def push_localization(self, stamp: float, map_T_base: Floats, covariance: Floats | None = None) -> bool:
-        """Push a localisation, as `Sink.push_localization`. Its covariance is ignored: the noise comes from the settings."""
+        """Push a localisation, as `Sink.push_localization`. The covariance is ignored. The noise is in the settings."""
         return self._push_pose("localization", stamp, map_T_base)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:

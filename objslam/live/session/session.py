@@ -21,7 +21,9 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import TOO_SLOW, FrameQueue
 from objslam.live.session.intake import Intake
+from objslam.live.session.map_locator import MapLocator
 from objslam.live.session.snapshots import Describer, take_snapshot
+from objslam.mapping.localization import PriorMap
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.reader import calibrations, messages
 from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Message, NoteMessage
@@ -41,7 +43,8 @@ class Session(Intake):
 
     journal: the file that receives every accepted message before it is processed. Only one session may write the file.
     resume: whether to continue an existing journal. Then `start` processes its messages. patient: whether frames of any age
-    are accepted, because the source waits for the session.
+    are accepted, because the source waits for the session. known: a prior map. Once the session is found in it, snapshots
+    and the result are in the frame of that map. A resumed session needs the same map again.
     """
 
     def __init__(
@@ -51,11 +54,13 @@ class Session(Intake):
         resume: bool = False,
         name: str = "live",
         patient: bool = False,
+        known: PriorMap | None = None,
     ) -> None:
         super().__init__(settings, Counters(), self._enqueue)
         self._mapper = Mapper(settings, self.counters)
         self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
-        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, patient)
+        self._known, self._locator = known, MapLocator(known, self._mapper, self.counters)
+        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, self._locator, patient)
         self._name, self._journal_file, self._resume = name, journal, resume
         live = settings.live
         self._journal = None
@@ -121,7 +126,7 @@ class Session(Intake):
             reason = one_line(self.failure)
             self.counters.ledger.warn(f"the session ended early, the map covers the messages until then: {reason}")
         try:
-            return finish(self._mapper.state, self._name, self._journal_file)
+            return finish(self._mapper.state, self._name, self._journal_file, self._known)
         except Exception as error:
             if self.failure is None:
                 raise
@@ -248,7 +253,10 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now. Right after a quick frame, the most time is left until the next frame."""
+        """Return whether to make a snapshot now: no frame came for a while, the last one was quick, or the wait is long.
+
+        worked: whether a frame was just processed. begin: when this began, s (`time.perf_counter`).
+        """
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
@@ -257,6 +265,7 @@ class Session(Intake):
         if wanted == self._given and not self._stopping:
             return
         snapshot = take_snapshot(self._mapper.state, self._describer, self._frames_waiting.lag, whole=self._stopping)
+        snapshot = self._locator.in_map(snapshot)
         with self._changed:
             self._snapshot, self._given = snapshot, wanted
             self._changed.notify_all()

@@ -42,7 +42,7 @@ _MOVED_BY_ODOMETRY = 0.1
 _MOVED_SIGMAS = 6.0
 """The least size of this rotation in standard deviations. A larger number warns less often."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
-"""The other clock offsets (s) from which the search for small errors starts. More offsets take longer."""
+"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the best one. More take longer."""
 _GAIN_MOVED = 0.03
 """The least growth of the score if each half has its own camera rotation. A larger value reports fewer moved cameras."""
 _GAIN = 0.02

@@ -27,7 +27,8 @@ _TEXT_SIZE = 0.15  # The text of a label has this height, m.
 
 
 class MapMessages:
-    """A maker of messages in one coordinate frame. ROS 2 Humble and later know their types, and `store` serialises them."""
+    """A maker of messages in the coordinate frame `frame`. ROS 2 Humble and later know the types of the messages. `store`
+    serialises them."""
 
     def __init__(self, frame: str) -> None:
         self.frame, self.store = frame, typestore()
@@ -56,21 +57,22 @@ class MapMessages:
         return self.make("geometry_msgs/PoseStamped", self.header(stamp), self.pose(pose))
 
     def transform(self, stamp: float, child: str, pose: Floats) -> Any:
-        """Make a tf2_msgs/TFMessage with the pose (4, 4) of the frame `child`, from a stamp, s."""
+        """Make a tf2_msgs/TFMessage with the pose (4, 4) of the frame `child` in the maker's frame, at a stamp, s."""
         turn = self._vector("Quaternion", quaternion(pose[None])[0])
         transform = self.make("geometry_msgs/Transform", self._vector("Vector3", pose[:3, 3]), turn)
         stamped = self.make("geometry_msgs/TransformStamped", self.header(stamp), child, transform)
         return self.make("tf2_msgs/TFMessage", [stamped])
 
     def path(self, stamp: float, stamps: Floats, poses: Floats) -> Any:
-        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s."""
+        """Make a nav_msgs/Path from poses (N, 4, 4) at stamps (N,), s. `stamp`, s, is that of the whole message."""
         stamped = [self.stamped(t, pose) for t, pose in zip(stamps.tolist(), poses, strict=True)]
         return self.make("nav_msgs/Path", self.header(stamp), stamped)
 
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
         """Make a vision_msgs/Detection3DArray with the labels, positions and covariances of objects.
 
-        The score of a label is its share. The depth of a box equals its width. A box of unknown size has size 0.
+        The score of a label is its share of the object's boxes. The depth of a 3D box equals its width. A 3D box of unknown
+        size has size 0.
         """
         return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 

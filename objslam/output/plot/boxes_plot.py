@@ -1,4 +1,4 @@
-"""Draw the boxes of a detector on a photo, with their labels on plates that do not cover each other."""
+"""Draw the boxes of a detector on a photo, with their labels on plates that avoid each other."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,10 @@ Plate = tuple[int, int, int, int]
 
 
 def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Floats) -> bytes:
-    """Return a PNG of an image (H, W, 3), BGR, with boxes (N, 4) x1, y1, x2, y2, px, in the colours of their labels."""
+    """Return a PNG of an image (H, W, 3), BGR, with boxes (N, 4) x1, y1, x2, y2, px, in the colours of their labels.
+
+    labels, scores: (N,) the text beside each box.
+    """
     import cv2
 
     drawn, line = np.ascontiguousarray(image).copy(), max(1, max(image.shape[:2]) // _LINE)

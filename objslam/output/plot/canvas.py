@@ -14,9 +14,10 @@ from objslam.output.plot.figure import Colour
 
 _SHIFT = 4  # OpenCV takes coordinates as integers, here in 1 / 2^4 of a px. A larger number is finer, and overflows earlier.
 _FAR = 1e6
-"""The distance, px, to which farther points are moved, because OpenCV's integers have 32 bits. A larger one overflows."""
-_NEAR = 3.0  # The least way, px, between two drawn points of a line. A larger one cuts its curves.
-_BATCH = 4_000_000  # The pixels of segments that are drawn at once. A larger number takes more memory.
+"""The largest coordinate, px, of a drawn point. Points beyond it are moved to it, because OpenCV's integers have 32 bits.
+They overflow at 1e8 px."""
+_NEAR = 3.0  # The least distance, px, between two drawn points of a line. A larger one cuts off the corners of curves.
+_BATCH = 4_000_000  # About this many steps along segments are drawn at once. A larger number takes more memory.
 _HALO = 0.85  # The opacity of the white around a text, in [0, 1].
 _HALO_WIDTH = 5  # The width, px, of the brush that widens a text to its halo.
 _ROOM = 8  # The room, px, around a text for its halo and for letters that reach out of its box.
@@ -45,7 +46,8 @@ def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) ->
 
 
 def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Floats]]:
-    """Yield x, y and the cover, in [0, 1], of the pixels of segments (n, 2, 2), in portions. Each step covers two pixels."""
+    """Yield x, y and the cover, in [0, 1], of the pixels of segments (n, 2, 2), px, in portions. Each step of 1 px along a
+    segment covers two pixels beside each other."""
     along = ends[:, 1] - ends[:, 0]
     steep = np.abs(along[:, 1]) > np.abs(along[:, 0])
     ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # the first coordinate grows faster
@@ -78,7 +80,8 @@ def draw_line(image: Image, points: Floats, colour: Colour, width: float, dash: 
 
 
 def _apart(points: Floats) -> Floats:
-    """Leave out points (n, 2), px, of a line near the one before. The smooth ends of short pieces would thicken it."""
+    """Return the points (n, 2), px, of a line without those near the point before. The smooth ends of short pieces would
+    thicken the line."""
     if len(points) < 3:
         return points
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
@@ -88,8 +91,8 @@ def _apart(points: Floats) -> Floats:
 
 
 def _dashes(points: Floats, dash: float, gap: float, size: tuple[int, int]) -> list[Floats]:
-    """Return the dashes of a line through points (n, 2), px, that an image of this size shows, each as the ends of its
-    pieces."""
+    """Return the dashes of a line through points (n, 2), px, that an image of this size (width, height), px, shows. A dash
+    is a line through points (k, 2)."""
     begin, way = points[:-1], np.diff(points, axis=0)
     piece = np.linalg.norm(way, axis=1)
     length = np.append(0.0, np.cumsum(piece))
@@ -113,7 +116,7 @@ def _dashes(points: Floats, dash: float, gap: float, size: tuple[int, int]) -> l
 
 
 def draw_dot(image: Image, centre: Floats, size: float, colour: Colour, rim: Colour, rim_width: float) -> None:
-    """Draw a filled circle with a rim at (2,), px. size: the diameter, px."""
+    """Draw a filled circle with a rim around the centre (2,), px. size: the diameter, px. rim_width: px."""
     if np.isfinite(centre).all():
         at, one = _fixed(centre[None])[0, 0].tolist(), 1 << _SHIFT
         cv2.circle(image, at, round(one * (size + rim_width) / 2), _bgr(rim).tolist(), -1, cv2.LINE_AA, _SHIFT)
@@ -121,7 +124,7 @@ def draw_dot(image: Image, centre: Floats, size: float, colour: Colour, rim: Col
 
 
 def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float, width: float) -> None:
-    """Draw a polygon (n, 2), px, filled with a share of its colour, with a rim of this width, px."""
+    """Draw a polygon (n, 2), px, filled with a colour of this opacity, in [0, 1], and with a rim of this width, px."""
     if not np.isfinite(rim).all():
         return
     size = np.array(image.shape[1::-1])
@@ -142,7 +145,8 @@ def text_width(text: str, size: float) -> int:
 def draw_text(
     image: Image, text: str, corner: tuple[float, float], size: float, colour: Colour, *, halo: bool = False
 ) -> None:
-    """Draw a text with the upper left corner of its box at x, y, px. halo: whether it has white around it."""
+    """Draw a text with the upper left corner of its box at x, y, px. size: of the font, px. halo: whether the text has white
+    around it."""
     x, y = round(corner[0]), round(corner[1])
     wide, high = text_width(text, size), round(1.25 * size)
     mask = np.zeros((high + 2 * _ROOM, wide + 2 * _ROOM, 3), dtype=np.uint8)
@@ -164,14 +168,14 @@ def draw_text(
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the content of a PNG file of 256 colours. It looks the same, and is a fifth of the size of all
-    colours."""
+    """Return an image as the content of a PNG file of 256 colours. The file looks the same as one with all colours, and is a
+    fifth of its size."""
     from PIL import Image as Picture
 
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(
         256, method=Picture.Quantize.FASTOCTREE, dither=Picture.Dither.NONE
     )
-    # The method makes white a shade darker. The paper, as in the first pixel, stays white.
+    # The method makes white a shade darker. The first pixel is paper, so its colour becomes white again.
     palette, paper = few.getpalette() or [], int(np.asarray(few)[0, 0])
     palette[3 * paper : 3 * paper + 3] = [255, 255, 255]
     few.putpalette(palette)

@@ -20,7 +20,8 @@ _COLOURS = {"confirmed": "#4b5563", "unseen": "#767676", "new": "#1a7f37", "move
 _MARKERS = {"confirmed": "o", "unseen": "o", "new": "P", "moved": "D", "gone": "X"}
 """The marker of each outcome, so that the picture is readable without colours."""
 _LONG_SIDE, _SHORT_SIDE = 8.0, 4.0
-"""The longer side of the map and the least other side, inches. Larger values make a larger picture."""
+"""The length of the map's longer side, and the least length of the other side, inches. Larger values make a larger
+picture."""
 _FONT = 8.0
 """The font size of labels and legend, points. A larger size has room for fewer labels."""
 _LETTERS = 24

@@ -15,7 +15,8 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Segments:
-    """Thin segments (n, 2, 2), m. The more of them overlap, the darker they are. opacity: of one segment, in [0, 1]."""
+    """Thin segments (n, 2, 2), m. The more of them overlap, the darker they are. opacity: of one segment, in [0, 1]. name:
+    as in `Line`."""
 
     ends: Floats
     colour: Colour
@@ -36,7 +37,8 @@ class Line:
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one size (px) at points (n, 2), m. A dot has a rim of another colour. turn: rad, where a triangle points."""
+    """Marks of one size (px) at points (n, 2), m. rim: the colour of the rim of a dot. name: as in `Line`. turn: rad, the
+    direction in which a triangle points, counterclockwise from the right."""
 
     points: Floats
     kind: Literal["dot", "cross", "triangle"]
@@ -74,8 +76,8 @@ class Figure:
     """A picture of a map from above.
 
     axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m.
-    shapes: what is drawn, the lowest first. legend: entries for shapes that are not in the picture as they are. note: a
-    remark at the upper right.
+    shapes: what is drawn, the lowest first. legend: more entries, besides those of the shapes with a name. note: a remark at
+    the upper right.
     """
 
     title: str

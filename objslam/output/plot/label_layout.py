@@ -12,7 +12,7 @@ _PAD = 2.0  # Labels keep this distance, px, from each other.
 _CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
 _FAR = 14.0  # A label gets a leader line if it is farther than this, px, from its dot.
 _AMBIGUOUS = 2.0  # A label is ambiguous if another dot is nearer than its own dot, or at most this distance, px, farther.
-_AMBIGUOUS_COST = 60.0  # This is the cost, px, of an ambiguous label. A larger cost moves it farther out.
+_AMBIGUOUS_COST = 60.0  # This is the cost, px, of an ambiguous label. With a larger cost, fewer labels are ambiguous.
 _COVER_COST = 1.5  # This is the cost, px, of each point in `avoid` that a label covers.
 _MOST_COVERED = 20  # At most this many covered points add to the cost.
 _CROSSING_COST = 60.0  # This is the cost, px, of each line, label or dot that a leader line crosses.
@@ -88,7 +88,7 @@ def _counts(points: Floats, frame: Floats) -> Floats:
 def _covered(boxes: Floats, counts: Floats, origin: Floats) -> Floats:
     """Return how many points (A,) lie in the pixels that each box (A, 4) touches.
 
-    counts: the table of `_counts`. origin: (2,) the lower left corner of its area.
+    counts: the table of `_counts`. origin: (2,) the lower left corner of the area of the table.
     """
     pixels = np.floor(boxes).astype(np.int64) - np.tile(np.floor(origin).astype(np.int64), 2) + [0, 0, 1, 1]
     x1, y1, x2, y2 = np.clip(pixels, 0, np.tile(np.array(counts.shape) - 1, 2)).T

@@ -25,19 +25,20 @@ _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
 _WEIGHT = 5  # A label avoids each point of a cross or of an ellipse as much as this many points of the path.
 _CROSS = 17.0  # The cross of a true object has this width and height, px.
 _DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start of the path, have these diameters, px.
-_ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, a corner fits between two.
-_LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map and its smallest width, px.
+_ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
+_LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
 _EDGE = 0.985  # The triangle of a far object is this share of the way from the centre of the picture to its edge.
 _TRIANGLE = 18.0  # The triangle of a far object has this length, px.
 _PATH = 2.0  # The width, px, of a path.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
-_BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # Colours of the path before, and of the path after.
+_BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of the path before and after the estimation.
 _NEUTRAL = (0.333, 0.333, 0.333)  # The legend shows objects in this colour, because each label has its own colour.
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
 def draw_map(result: RunResult, file: Path, truth: Truth | None = None) -> None:
-    """Draw the paths, rays, objects and ground truth from above as a PNG. OSError if the file cannot be written."""
+    """Draw the paths, rays, objects and ground truth from above as a PNG. truth: in the map's frame. OSError if the file
+    cannot be written."""
     file.write_bytes(render(map_figure(result, truth)))
 
 
@@ -107,7 +108,8 @@ def _rays(result: RunResult, plane: list[int]) -> list[Shape]:
     for mask, colour, most, name in ((used, _USED, _MAX_RAYS, "rays"), (out, _REJECTED, _MAX_REJECTED, many)):
         index = sample(mask, most)
         if len(index):
-            opacity = float(np.clip(125 / len(index), 0.2, 0.75))  # Many lines are fainter, so that objects stay visible.
+            # The more lines there are, the fainter they are, so that objects stay visible.
+            opacity = float(np.clip(125 / len(index), 0.2, 0.75))
             shapes.append(
                 Segments(np.stack([result.origins[index][:, plane], ends[index][:, plane]], axis=1), colour, opacity, name)
             )
@@ -125,7 +127,7 @@ def _paths(result: RunResult, plane: list[int]) -> list[Shape]:
 
 
 def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[Shape], list[Shape]]:
-    """The ellipses and the dashed rays of the objects, and their dots."""
+    """Return the ellipses and the dashed rays of the objects, and then the dots. points: (N, 2) m, in the plane."""
     colours = label_colours(result.map)
     below: list[Shape] = []
     dots: list[Shape] = []
@@ -144,7 +146,7 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
 
 
 def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
-    """The entries for objects."""
+    """Return the entries of the legend for objects."""
     nowhere, resolved = np.zeros((0, 2)), len(result.map.resolved())
     entries: list[Line | Marks] = []
     if resolved:
@@ -165,14 +167,16 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return the points (F, 2) at the edge of the picture towards far points (F, 2), and the ways (F,) between them, m."""
+    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge towards it, and the distance (F,) between
+    both, all in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)
 
 
 def _far(objects: list[MapObject], result: RunResult, at: Floats, centre: Floats) -> list[Shape]:
-    """Return a triangle at the edge, at (F, 2), for each object that is far outside. It points to the object."""
+    """Return a triangle for each object that is far outside. It points to the object. at: (F, 2) m, at the picture's edge.
+    centre: (2,) m, of the picture."""
     colours = label_colours(result.map)
     return [
         Marks(place[None], "triangle", colours[o.label], _WHITE, _TRIANGLE, "", float(np.arctan2(*(place - centre)[::-1])))
@@ -199,7 +203,8 @@ def _labels(
 ) -> tuple[Label, ...]:
     """Place at most `_MAX_LABELS` labels. An object whose label has no room has none.
 
-    names: (N,) the texts. avoid: points (P, 2), m, of the path, of the crosses, and of the ellipses.
+    points: (N, 2) m. shown: (N,) which objects may have a label. names: (N,) the texts. avoid: points (P, 2), m, of the
+    path, of the crosses, and of the ellipses.
     """
     path, crosses, outlines = (figure.pixels(part) for part in avoid)
     colours = label_colours(result.map)

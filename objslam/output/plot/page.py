@@ -24,7 +24,7 @@ _TITLE = 21.0  # The title has this font size, px.
 _NOTE = 15.0  # The remark has this font size, px.
 _MARGIN = 16  # The white, px, around the picture and between its parts.
 _MOST_TICKS = 8  # At most this many steps of the grid fit the longer side of the map.
-_COLUMNS = 4  # The legend has this many columns.
+_COLUMNS = 4  # The legend has at most this many columns.
 _HANDLE = 34  # The width, px, of an entry's sample in the legend.
 _DASH, _GAP = 8.0, 4.0  # The lengths, px, of a dash and of the gap behind it.
 _TICK = 6  # The length, px, of a tick.
@@ -67,7 +67,7 @@ def render(figure: Figure) -> bytes:
 
 
 def _area(figure: Figure) -> Image:
-    """The shown area of the map, with everything that is clipped at its edges."""
+    """Return the picture of the shown area of the map. What reaches beyond its edges is cut off."""
     width, height = figure.size
     area = blank(width, height)
     ticks = _ticks(figure)
@@ -141,7 +141,7 @@ def _draw_ticks(page: Image, ticks: Ticks, left: int, top: int, bottom: int) -> 
 
 
 def _legend(figure: Figure) -> Image:
-    """The samples and the names of all shapes that have one."""
+    """Return the picture of the legend: a sample and the name of each shape that has a name."""
     entries = [*(one for one in figure.shapes if not isinstance(one, Area) and one.name), *figure.legend]
     rows = -(-len(entries) // _COLUMNS)
     columns = [entries[i : i + rows] for i in range(0, len(entries), rows)] if rows else []

@@ -46,7 +46,7 @@ def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
 def ray_ends(result: RunResult) -> Floats:
     """Return the point (R, 3), m in map, at which the drawing of each ray ends.
 
-    A ray is as long as the distance to its object. A ray without an object gets the median length of the other rays.
+    A ray is as long as the distance to its object. A ray without an object gets the median length of the rays with one.
     """
     index = result.association.object
     reach = np.full(len(index), np.nan)

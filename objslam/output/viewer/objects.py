@@ -30,8 +30,8 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
     Args:
         path: (K, 3) points, m in map, that labels should not cover.
-        static: whether the objects are static. If not, they are logged at the current time of the recording, and an empty
-            entity is logged too, because it clears the earlier objects.
+        static: whether the objects are static. If not, they are logged at the current time of the recording. An entity
+            without objects is then logged too, because it clears the earlier objects.
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 

@@ -8,7 +8,7 @@ import rerun as rr
 from objslam.core.result import RunResult
 from objslam.core.types import Surface
 
-_MAX_VERTICES = 100_000  # A recording has at most this many vertices, 5 MB. reconstruction.ply has the whole surface.
+_MAX_VERTICES = 100_000  # A recorded surface has at most this many vertices, 5 MB. reconstruction.ply has all.
 _CELL = 0.02  # The grid cells have this edge length, m, before they first grow.
 _GROWTH = 1.25  # The cells grow by this factor until at most `_MAX_VERTICES` vertices remain.
 

@@ -11,7 +11,7 @@ STAMP, ITERATION = "stamp", "iteration"  # These are the timelines of the drive 
 
 
 def stamp_column(stamps: Floats) -> Any:
-    """Make a column of the timeline `stamp` from stamps (N,), s. It has dates if they are Unix time, else durations."""
+    """Make a column of the timeline `stamp` from stamps (N,), s. Unix times become dates, and other stamps durations."""
     import rerun as rr
 
     if len(stamps) and is_date(float(stamps[0])):

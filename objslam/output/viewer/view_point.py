@@ -75,7 +75,7 @@ def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoin
 
 
 def look_at(target: Floats, back: Floats, distance: float, up: Up = "z") -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,) points from the target to it.
+    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,): from there to the view point.
 
     up: the axis of the map that points up.
     """

@@ -1,6 +1,7 @@
 """Read ROS 1 bags (format 2.0) record by record from the front, so that damage affects only the records that it hits.
 
-The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes are used only to detect missing messages.
+The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes give only the connections, and how many
+messages the bag should have.
 """
 
 import io
@@ -18,7 +19,7 @@ MAGIC = b"#ROSBAG V2.0\n"
 _OPS = _MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = b"\x02", b"\x03", b"\x04", b"\x05", b"\x06", b"\x07"
 _OP_FIELD = re.compile(rb"\x04\x00\x00\x00op=[\x02\x04\x05\x06\x07]")
 _MAX_HEADER = 1 << 16  # The length limit of a record header, bytes. A longer header counts as damage.
-_MAX_SEARCHED_HEADER = 512  # The longest header that the search after damage finds, bytes. A larger value slows it.
+_MAX_SEARCHED_HEADER = 512  # The longest header that the search after damage finds, bytes. A larger value slows the search.
 _BLOCK = 1 << 20  # The number of bytes read at once, a compromise between few reads and little memory.
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
@@ -27,7 +28,7 @@ _Fields = dict[bytes, bytes]
 
 @dataclass
 class _Reading(Reading):
-    chunk_at: int = 0  # The byte where the current chunk starts.
+    chunk_at: int = 0  # The byte where the data of the current chunk start.
 
     def next_chunk(self, at: int) -> None:
         """Report the damage of the current chunk, and start the next chunk at byte `at`."""
@@ -49,7 +50,7 @@ def read_bag1(path: Path, report: FileReport, wanted: Wanted) -> Messages:
 
 
 def _walk(stream: BinaryIO, at: int, end: int, reading: _Reading, chunks: bool = True) -> Messages:
-    """Yield the messages from byte `at` to byte `end` of a file, or of an unpacked chunk.
+    """Yield the wanted messages from byte `at` to byte `end` of a file, or of an unpacked chunk.
     chunks: whether the records may include chunks. An unpacked chunk never contains chunks."""
     report = reading.report
     while at < end:
@@ -70,7 +71,7 @@ def _walk(stream: BinaryIO, at: int, end: int, reading: _Reading, chunks: bool =
             connection = reading.connections.get(_number(fields, b"conn"))
             reading.chunk_read += 1
             if connection is None or size > MAX_RECORD:
-                why = "an undescribed connection" if connection is None else f"more than {MAX_RECORD >> 20} MiB"
+                why = "a connection without a description" if connection is None else f"more than {MAX_RECORD >> 20} MiB"
                 report.damage(f"messages of {why}", 1)
                 continue
             report.messages += 1
@@ -95,7 +96,7 @@ def _unpack_chunk(
 ) -> tuple[bytes, int]:
     """Return the readable records of a compressed chunk and the byte where the next record starts."""
     method = fields.get(b"compression", b"").decode("ascii", "replace")
-    unfinished = size == 0 or start + size > end  # The recorder writes the size when it closes the chunk.
+    unfinished = size == 0 or start + size > end  # The recorder writes the size only when it closes the chunk.
     after = end if unfinished else start + size
     try:
         if not unfinished and size > MAX_RECORD:
@@ -171,7 +172,7 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
         return
     name, definition = (details.get(key, b"").decode("utf-8", "replace") for key in (b"type", b"message_definition"))
     connection, key = make_connection(topic, name, "ros1", definition, "msg"), _number(fields, b"conn")
-    if reading.connections.get(key) != connection:  # Readers use id() of a connection as a key, so an equal one stays.
+    if reading.connections.get(key) != connection:  # Callers use id() of a connection as a key, so an equal one stays.
         reading.connections[key] = connection
 
 

@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 from objslam.ros.bag.records import MAX_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # The first bytes of zstd data.
-_PIECE = 1 << 22  # The size limit of one unpacked piece, bytes. With a larger value, data over the limit use more memory.
+_PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. With a larger one, data over the limit take more.
 
 
 class CorruptDataError(ValueError):
@@ -42,7 +42,10 @@ def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
 
 
 def unpack_file(source: Path, target: Path, limit: int) -> str | None:
-    """Unpack a zstd file to `target`. Return the reason for an early stop, None if the whole file is unpacked."""
+    """Unpack a zstd file to `target`. Return the reason for an early stop, None if the whole file is unpacked.
+
+    limit: the largest unpacked size, bytes. What was unpacked before the stop stays in `target`.
+    """
     size = 0
     with source.open("rb") as packed, target.open("wb") as out:
         try:

@@ -35,9 +35,10 @@ class _Reading(Reading):
 
 
 def read_mcap(path: Path, report: FileReport, wanted: Wanted) -> Messages:
-    """Yield the wanted messages of an MCAP file in file order. It may be damaged or unclosed. `report` lists missing parts.
+    """Yield the wanted messages of an MCAP file in file order. `report` lists missing parts.
 
-    A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC is skipped.
+    The file may be damaged or unclosed. A cut-off last chunk is read as far as it can be unpacked. A chunk with a wrong CRC
+    is skipped.
     """
     with path.open("rb", buffering=_BLOCK) as file:
         end = os.fstat(file.fileno()).st_size
@@ -95,7 +96,7 @@ def _walk(file: BinaryIO, at: int, end: int, reading: _Reading) -> Messages:
 
 
 def _records(data: bytes, reading: _Reading) -> Messages:
-    """Yield the messages of an unpacked chunk, up to the last whole record."""
+    """Yield the wanted messages of an unpacked chunk, up to the last whole record."""
     at, end = 0, len(data)
     while at + _RECORD.size <= end:
         op, size = _RECORD.unpack_from(data, at)
@@ -108,7 +109,7 @@ def _records(data: bytes, reading: _Reading) -> Messages:
             channel, _, stamp, _ = _MESSAGE_HEAD.unpack_from(data, start)
             connection = reading.connections.get(channel)
             if connection is None:
-                reading.report.damage("messages of an undescribed channel", 1)
+                reading.report.damage("messages of a channel without a description", 1)
                 continue
             reading.report.messages += 1
             if reading.wanted(connection):
@@ -118,7 +119,7 @@ def _records(data: bytes, reading: _Reading) -> Messages:
 
 
 def _record(op: int, data: bytes, reading: _Reading) -> Messages:
-    """Store a schema or channel, or yield a message that is outside of all chunks."""
+    """Store a schema or channel, or yield a wanted message that is outside of all chunks."""
     try:
         if op == _SCHEMA:
             (key,) = _U16.unpack_from(data)
@@ -150,7 +151,7 @@ def _strings(data: bytes, at: int, count: int) -> Iterator[str]:
 
 
 def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
-    """Return the records of a chunk, or with `cut` the readable part of the records."""
+    """Return the unpacked records of a chunk. With `cut`, return the part of them that can be unpacked."""
     try:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)

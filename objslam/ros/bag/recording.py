@@ -26,7 +26,7 @@ _FORMATS = {
 _METADATA = "metadata.yaml"
 _MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
 _MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
-_MAX_RATIO = 1000  # The limit of the unpacked size of a file divided by its packed size. No recording compresses further.
+_MAX_RATIO = 1000  # How many times larger an unpacked file may be. 1 GiB is always allowed. No recording compresses further.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 
@@ -61,9 +61,10 @@ def is_bag(path: Path) -> bool:
 def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
     """Find the recording in one or several files, or in one folder.
 
-    The metadata.yaml of a folder lists its files. Listed files that are missing or outside the folder are counted as drops.
-    A killed recorder writes no metadata.yaml. Without it, file names may differ only in the number before the suffix.
-    Raises LogError if there is no recording or more than one.
+    Several files are read in the given order. The metadata.yaml of a folder lists its files. Listed files that are missing
+    or outside the folder are counted as drops. Files that it does not list are left out with a warning. A killed recorder
+    writes no metadata.yaml. Without it, the file names may differ only in the number before the suffix. Raises LogError if
+    there is no recording, or if a folder has more than one.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -86,7 +87,8 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
 def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport]) -> Messages:
     """Yield the messages of the wanted topics, file by file, and append a report on each file to `reports`.
 
-    An unreadable file is reported and skipped. Raises LogError if no file can be read.
+    An unreadable file is reported and skipped. If metadata.yaml counts more messages than the files have, a last report
+    counts the missing ones. Raises LogError if no file can be read.
     """
     refused: list[LogError] = []
     for file in recording.files:
@@ -116,7 +118,7 @@ def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport
 
 
 def _bag_file(path: Path) -> BagFile | None:
-    """Return the bag file at a path, None for another file. The suffix decides, or the first bytes if it is unknown."""
+    """Return the bag file at a path, None for another file. If the suffix is unknown, the first bytes decide."""
     suffixes = [suffix for suffix in path.suffixes if suffix != ".active"]
     packed = bool(suffixes) and suffixes[-1] == ".zstd"
     suffix = suffixes[-2 if packed else -1] if len(suffixes) > packed else ""

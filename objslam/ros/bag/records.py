@@ -37,7 +37,7 @@ class FileReport:
     problems: list[str] = field(default_factory=list)  # One text per kind of damage.
 
     def damage(self, problem: str, lost: int | None = None) -> None:
-        """Add damage of the kind `problem`. `lost` is the number of messages lost by it, None if unknown."""
+        """Add damage of the kind `problem`. lost: the number of messages that this damage lost, None if unknown."""
         if problem not in self.problems:
             self.problems.append(problem)
         if lost is None:
@@ -46,8 +46,10 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """If the file states its message count, increase `lost` to at least the stated count minus the messages read, and
-        set `complete`."""
+        """Use the message count that the file states, if any.
+
+        Then `lost` is at least the stated count minus the messages read, and `complete` is True.
+        """
         if self.expected is not None:
             self.lost = max(self.lost, self.expected - self.messages)
             self.complete = True
@@ -63,7 +65,11 @@ class FileReport:
 
 @dataclass
 class Reading:
-    """The state while a file of chunks is read. The index of a chunk follows the chunk."""
+    """The state while a file of chunks is read. The index of a chunk follows the chunk.
+
+    connections: by their number in the file. chunk_read, chunk_indexed: how many messages of the current chunk were read,
+    and how many its index lists. chunk_problem: why the chunk cannot be read, "" if it can.
+    """
 
     report: FileReport
     wanted: Wanted

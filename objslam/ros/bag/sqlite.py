@@ -85,11 +85,14 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
 def _rows(
     database: sqlite3.Connection, file: Path, topics: frozenset[int], report: FileReport
 ) -> Iterator[tuple[int, int, Any, Any]]:
-    """Yield the rows of the topics in rowid order. After a failure of the database, the rest is read page by page."""
+    """Yield the rows of the topics in rowid order: rowid, topic id, time of recording (ns) and message.
+
+    A cut-off file is read page by page. So is the rest of a file after a failure of the database.
+    """
     marks = ", ".join("?" * len(topics))
     last = -1
     pages, missing = missing_pages(file)
-    if missing:  # SQLite would fill the cut page with zeros.
+    if missing:  # SQLite would fill the page that is cut off with zeros.
         report.damage(f"cut off at byte {file.stat().st_size}, {missing} of {pages + missing} pages are missing")
     else:
         try:

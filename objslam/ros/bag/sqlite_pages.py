@@ -24,7 +24,7 @@ class _CellError(ValueError):
 
 
 def missing_pages(path: Path) -> tuple[int, int]:
-    """Return how many whole pages a file has and how many are missing. No page is missing if the header is not reliable."""
+    """Return how many whole pages a file has and how many are missing, 0 if its header is not reliable."""
     with path.open("rb") as file:
         header = file.read(100)
     if len(header) < 100:
@@ -85,7 +85,10 @@ def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
 def _read_row(
     data: mmap.mmap, at: int, page: int, columns: tuple[int, int, int], topics: frozenset[int], whole: bool
 ) -> tuple[int, int, bytes]:
-    """Return topic id, time and message of the cell at byte `at` of the file. The message is empty unless `whole` is set."""
+    """Return topic id, time (ns) and message of the cell at byte `at` of the file. The message is empty without `whole`.
+
+    page: the page size, bytes. Raises _CellError if the cell is incomplete or is not a row of messages.
+    """
     size, at = _varint(data, at)
     _, at = _varint(data, at)  # The rowid.
     usable = page - data[20]

@@ -83,7 +83,10 @@ def make_decoder(connection: Connection) -> Callable[[bytes], Any]:
 
 @lru_cache(maxsize=256)
 def typestores(name: str, encoding: str, definition: str, language: str) -> tuple[Typestore, ...]:
-    """Return a cached type store for each possible definition of a type. Raises DecodeError if one cannot be used."""
+    """Return a cached type store for each possible definition of a type. language: "msg" or "idl".
+
+    Raises DecodeError if there is no definition, or if one cannot be used.
+    """
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 

@@ -43,7 +43,7 @@ def track_number(name: str, tracks: dict[str, int]) -> int:
 
 def boxes_of_points(camera: Camera, points: Floats) -> Floats:
     """Return the boxes (M, 4) of tags, px of the raw image, from centre and corners (M, 5, 3), m, in the camera frame.
-    The tag centre is the centre of the box. A box with a point outside of the lens field is NaN."""
+    The tag centre is the centre of the box. If a point is outside the field of the lens, the box is NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = project(camera, points.reshape(-1, 3)).reshape(-1, 5, 2)
     reach = np.abs(pixels[:, 1:] - pixels[:, :1]).max(axis=1)
@@ -79,7 +79,8 @@ def tag_boxes(message: Any) -> Iterator[Found]:
     """Yield the tags of an AprilTag array message with label tag_<id> and score 1.
 
     The box centre is the intersection of the tag diagonals. The box is symmetric about this centre and contains all corners.
-    Tag bundles (apriltag_ros) are skipped, because a bundle is not a single object.
+    A message of apriltag_ros has poses instead of corners, so its tags get `points` instead of a box. Its tag bundles are
+    skipped, because a bundle is not a single object.
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):

@@ -52,7 +52,8 @@ def depth_image(message: Any) -> NDArray[Any]:
 def image_file(message: Any, depth: bool) -> tuple[bytes, str]:
     """Return the content and the suffix of a file for an image message. Raises DecodeError if the message is malformed.
 
-    JPEG and PNG data are not changed. Other images become PNG. A depth image becomes a PNG of the result of `depth_image`.
+    depth: whether it is a depth image, which becomes a PNG of the result of `depth_image`. Colour images in JPEG or PNG are
+    not changed. Other colour images become PNG.
     """
     packing = _packing(message)
     if depth or "compresseddepth" in (packing or ""):
@@ -111,7 +112,10 @@ def _convert(image: NDArray[Any], conversion: str) -> NDArray[Any]:
 
 
 def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
-    """Decode data of compressed_depth_image_transport, a header and a PNG. For float images, the PNG has a / depth + b."""
+    """Decode data of compressed_depth_image_transport: a header and a PNG.
+
+    For float images, the PNG has a / depth + b, with depth in m. The numbers a and b are in the header.
+    """
     if b"\x89PNG" != data[_DEPTH_HEADER : _DEPTH_HEADER + 4]:
         raise DecodeError("its compressed depth is not PNG")
     image = decode_depth(data[_DEPTH_HEADER:])
@@ -125,7 +129,7 @@ def _compressed_depth(data: bytes, packing: str) -> NDArray[Any]:
 
 
 def _depth_units(image: NDArray[Any]) -> NDArray[Any]:
-    """Return depth in 1 / `DEPTH_SCALE` m. Input with 16 bits is in mm and input of floats is in m (REP 118)."""
+    """Return depth (H, W), uint16, in 1 / `DEPTH_SCALE` m, 0 if unknown. REP 118: uint16 is in mm, float in m."""
     if image.dtype == np.uint16 and image.ndim == 2:
         return image
     if image.dtype != np.float32 or image.ndim != 2:

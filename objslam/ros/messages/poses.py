@@ -23,7 +23,7 @@ class PoseRows:
     values: array[float] = field(default_factory=lambda: array("d"))
 
     def add(self, stamp: int, logged: int, place: Any, turn: Any) -> None:
-        """Add a pose from its position (or translation) and orientation messages."""
+        """Add a pose from its position (or translation) and orientation messages. stamp, logged: ns."""
         self.stamps.append(stamp)
         self.logged.append(logged)
         self.values.extend((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
@@ -51,6 +51,6 @@ def one_pose(place: Any, turn: Any) -> Floats | None:
 
 
 def choose_times(stamps: array[int], logged: array[int]) -> Ints:
-    """Return the header timestamps (N,), ns. If all are zero, they are unset, and the recording times are returned."""
+    """Return the header timestamps (N,), ns. If there are none, or all are zero and so unset, return the recording times."""
     times = np.frombuffer(stamps, dtype=np.int64)
     return times if times.any() else np.frombuffer(logged, dtype=np.int64)

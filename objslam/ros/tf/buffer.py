@@ -1,4 +1,4 @@
-"""A buffer of the transforms on /tf and /tf_static of a live robot. It keeps them as long as tf2 does by default (10 s)."""
+"""A buffer of the transforms on /tf and /tf_static of a live robot. It keeps at least the last 10 s, as tf2 does."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.ros.messages.poses import one_pose
 from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
 
-_MAX_KEPT = 10_000  # The limit of buffered transforms per pair of frames, enough for 10 s at 1 kHz.
+_MAX_KEPT = 10_000  # The limit of buffered transforms per child frame, enough for 10 s at 1 kHz. A larger one costs memory.
 
 
 class UnknownTransform(LookupError):
@@ -25,7 +25,10 @@ class UnknownTransform(LookupError):
 
 @dataclass
 class _Edge:
-    """The poses parent_T_child of a child frame at increasing timestamps, s. `still`: whether the pose has never changed."""
+    """The poses parent_T_child of a child frame at increasing timestamps, s.
+
+    static: whether they come from /tf_static. still: whether the pose has never changed.
+    """
 
     parent: str
     static: bool
@@ -34,8 +37,11 @@ class _Edge:
     still: bool = True
 
     def add(self, stamp: float, pose: Floats) -> bool:
-        """Add a pose, or return False if it is older than the newest pose.
-        If it is older by more than `MAX_GAP` s, the clock was set back. Then the buffer is cleared and the pose is added."""
+        """Add a pose at a timestamp, s. Return False, and do not add it, if it is older than the newest pose.
+
+        If it is older by more than `MAX_GAP` s, the clock was set back. Then the buffer is cleared and the pose is added. A
+        pose with the newest timestamp replaces the newest pose.
+        """
         if self.stamps and stamp < self.stamps[-1] - MAX_GAP:
             self.stamps.clear()
             self.poses.clear()
@@ -52,7 +58,10 @@ class _Edge:
         return True
 
     def at(self, stamp: float) -> Floats:
-        """Return the interpolated pose at a timestamp, s. Raises UnknownTransform outside of the buffer or in a long gap."""
+        """Return the interpolated pose at a timestamp, s. A pose that has never changed is known at all times.
+
+        Raises UnknownTransform outside of the buffer, or in a gap longer than `MAX_GAP`.
+        """
         if self.still:
             return self.poses[-1]
         after = bisect_left(self.stamps, stamp)
@@ -80,13 +89,16 @@ class TfBuffer:
         self._edges: dict[str, _Edge] = {}
 
     def add(self, transform: Any, received: float, static: bool) -> str:
-        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is refused."""
+        """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is refused.
+
+        received: the arrival time, s. static: whether it came on /tf_static.
+        """
         parent, child = link(transform)
         pose = one_pose(transform.transform.translation, transform.transform.rotation)
         if pose is None:
             raise ValueError("transform whose pose is invalid (not finite, too far away, or a zero quaternion)")
         time = transform.header.stamp
-        stamp = time.sec + time.nanosec * 1e-9 or received  # The arrival time (s) replaces an unset timestamp.
+        stamp = time.sec + time.nanosec * 1e-9 or received  # The arrival time replaces an unset timestamp.
         edge = self._edges.get(child)
         if edge is None and len(self._edges) >= MAX_TRANSFORMS:
             raise ValueError(f"transform beyond the first {MAX_TRANSFORMS} frames")

@@ -11,7 +11,7 @@ from objslam.ros.bag.records import frame_name
 
 MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. The limit bounds memory.
 MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. tf2 has the same default buffer length.
-_STILL = 1e-9  # A pose is static if no element changes by more. No sensor resolves such a small change.
+_STILL = 1e-9  # A pose is static if no element of its matrix changes by more. A larger value takes slow motion for rest.
 BASES = ("base_footprint", "base_link")  # The base frames of a robot (REP 105) without namespaces, by priority.
 _WORLDS = {"map", "world"}
 
@@ -36,7 +36,11 @@ def find_world(frames: Iterable[str]) -> str:
 
 
 def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
-    """Return the base frame: `given`, else `moved` (the child frame of the odometry), else base_footprint or base_link."""
+    """Return the base frame: `given`, or if `given` is None, the first that fits.
+
+    `moved`, the child frame of the odometry, fits if it is in `frames`. Next come base_footprint and base_link in `frames`,
+    with any namespace. If nothing fits, the result is `moved`, or base_link if `moved` is empty.
+    """
     if given is not None:
         return given.lstrip("/")
     known = set(frames)

@@ -20,14 +20,17 @@ _NAMED = 6  # The limit of frames listed in a message. The limit keeps the messa
 
 @dataclass
 class TfRows:
-    """Transforms by (parent, child). `moving` has all transforms in the order of arrival, `static` only the last."""
+    """Transforms by (parent, child). moving: all in the order of arrival. static: only the last.
+
+    refused: the number of refused transforms by reason.
+    """
 
     moving: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
     static: dict[tuple[str, str], PoseRows] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
     def add(self, transform: Any, logged: int, static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped. Invalid transforms are counted in `refused`."""
+        """Add a geometry_msgs/TransformStamped. Invalid ones are counted in `refused`. logged: the time of recording, ns."""
         try:
             parent, child = link(transform)
         except ValueError as error:

@@ -15,8 +15,8 @@ from objslam.sources.journal.segments import holds_messages
 def set_aside(file: Path) -> Path | None:
     """Rename the journal `file` so that a new one can be written, and return its new path.
 
-    The new name is journal.1.objslam, or has the next free number. If there is no journal, or one without messages, nothing
-    is renamed and None is returned.
+    The new name has the first free number: journal.1.objslam. If there is no journal, or one without messages, nothing is
+    renamed and None is returned.
     Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be renamed.
     """
     with refusals("set the journal aside", file):
@@ -52,11 +52,12 @@ def put_back(aside: Path, file: Path) -> bool:
 
 
 def restore_after_kill(file: Path) -> Path | None:
-    """Put the newest journal that was set aside back, if `file` is the empty journal of a session that was killed.
+    """Put back the newest journal that was set aside, if `file` is the empty journal of a session that was killed.
 
-    A session sets the earlier journal aside before its own first message. Killed in between, it leaves an empty journal, and
-    a resumed session would start from nothing. Returns the path from which the journal came, None if there was nothing to
-    do. A session that is alive keeps its empty journal. Raises OutputError if the journal cannot be renamed.
+    A session sets the earlier journal aside before its own first message. If it is killed between the two, it leaves an
+    empty journal, and a resumed session would start from nothing. Returns the path from which the journal came, None if
+    nothing was renamed. If another session has the empty journal open, nothing is renamed. Raises OutputError if the journal
+    cannot be renamed.
     """
     numbered = re.compile(rf"{re.escape(file.stem)}\.[0-9]+{re.escape(file.suffix)}")
     with refusals("put an earlier journal back", file):
@@ -80,7 +81,7 @@ def restore_after_kill(file: Path) -> Path | None:
 
 @contextmanager
 def refusals(action: str, file: Path) -> Iterator[None]:
-    """Convert OSError to OutputError, "cannot ACTION: REASON", at `file`."""
+    """Turn an OSError in the block into the OutputError "cannot ACTION: REASON" at `file`."""
     try:
         yield
     except OSError as error:

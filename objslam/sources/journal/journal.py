@@ -1,8 +1,8 @@
-"""Write the journal, the files of all messages that a live session accepted.
+"""Write the journal: the files with all messages that a live session accepted.
 
 A message is accepted only when its record is in the kernel's cache, so a killed process loses no accepted message. The
-record is on the disk at most `_SYNC_EVERY` later, so a power failure loses at most the messages of that time. Where the disk
-is nearly full, fails, or loses the file, the journal says so and stops; the session goes on without it.
+record is on the disk about `_SYNC_EVERY` later, so a power failure loses about the messages of that time. If the disk is
+nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without it.
 """
 
 import fcntl
@@ -30,16 +30,16 @@ from objslam.sources.journal.records import Message, encode, encode_stop
 from objslam.sources.journal.segments import compress, identity_of, new_file, seal, uncompressed_segments
 
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
-_EARLY = 2.0  # The free space at which the end of the journal is announced, over that at which it stops.
-_SMALL = 0.02  # The share of a small disk that stays free. A larger share ends the journal earlier.
+_EARLY = 2.0  # A warning comes at this many times the free space at which the journal stops. A larger value warns earlier.
+_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share ends it earlier on a small disk.
 _MB = 1_000_000
 
 
 class Journal:
     """A journal open for writing. Only one process may write it.
 
-    torn: how many bytes of an incomplete record were removed from the end of a resumed journal, else 0.
-    stopped: why nothing is written any more; None while all is well.
+    torn: how many bytes behind the last undamaged record were removed from a resumed journal. 0 for a new journal.
+    stopped: why nothing is written any more, None as long as messages are written.
     """
 
     def __init__(
@@ -53,10 +53,11 @@ class Journal:
     ) -> None:
         """Open a new journal. With `resume`, open an existing journal to append to it.
 
-        Without `resume`, an existing journal with messages is renamed first (`set_aside`). With `resume`, an incomplete
-        record at the end is removed. segment: the size at which a segment is sealed and compressed, bytes. min_free: the
-        free space at which the journal stops, bytes; on a small disk less. warn: takes each warning, from any thread.
-        Raises OutputError if another session writes the journal or it cannot be opened.
+        Without `resume`, an existing journal with messages is renamed first (`set_aside`). With `resume`, the bytes behind
+        the last undamaged record are removed. segment: the size at which a segment is sealed and compressed, bytes.
+        min_free: the free space at which the journal stops, bytes. On a small disk it is less (`_SMALL`). warn: the function
+        that is called with each warning, from any thread.
+        Raises OutputError if another session writes the journal, the file is not a journal, or it cannot be opened.
         """
         self.file, self._segment, self._warn = file, segment, warn
         self._min_free = min_free
@@ -133,7 +134,7 @@ class Journal:
                 synced = 0
 
     def _watch(self) -> None:
-        """Stop the journal if the disk is nearly full or the file was deleted. Announce it before, if the disk fills."""
+        """Stop the journal if the disk is nearly full or the file was deleted. Warn once when the disk begins to fill."""
         if os.fstat(self._stream).st_nlink == 0:
             with self._lock:
                 self._stop("the file was deleted")
@@ -149,7 +150,7 @@ class Journal:
             self._warn(f"{self.file}: {left:.1f} MB of the disk are free, the journal stops at {limit:.1f} MB")
 
     def _seal(self) -> bool:
-        """Begin a new segment, and compress the full one. Return whether that was possible."""
+        """Begin a new segment, and compress the full one. Return False if the disk refuses the new segment or the sync."""
         try:
             identity, number = identity_of(self.file, self._header), self._header.number
             fresh, stream = new_file(self.file, identity, number + 1)
@@ -174,7 +175,7 @@ class Journal:
         return True
 
     def _compress(self) -> None:
-        """Compress the earlier segments that are not. One that cannot be compressed stays as it is, and can be read."""
+        """Compress the earlier segments that are uncompressed. One that cannot be compressed can still be read."""
         try:
             for full in uncompressed_segments(self.file, identity_of(self.file, self._header), self._header.number):
                 compress(full)
@@ -192,11 +193,11 @@ class Journal:
         self._end += len(data)
 
     def _stop(self, reason: str) -> None:
-        """Write no more. Remove an incomplete record, and say in the journal, if that is possible, and in a warning why."""
+        """Stop writing, and warn why. If possible, remove an incomplete record, and write the reason into the journal."""
         if self.stopped is not None:
             return
         self.stopped = reason
-        with suppress(OSError):  # A reader then finds at most an incomplete record at the end, and drops it.
+        with suppress(OSError):  # If this fails, a reader drops the incomplete record.
             os.ftruncate(self._stream, self._end)
             os.lseek(self._stream, 0, os.SEEK_END)
             os.write(self._stream, pack_record(self._header.version, encode_stop(reason)))
@@ -205,12 +206,15 @@ class Journal:
 
 
 def _locked(file: Path) -> int:
-    """Open and lock a journal, which is made if there is none. OutputError if another session writes it."""
+    """Open and lock a journal, and return its descriptor. Without a journal, an empty file is made.
+
+    Raises OutputError if another session writes the journal.
+    """
     while True:
         stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(stream), os.stat(file)):  # noqa: PTH116 - of the path and of what is open
+            if os.path.samestat(os.fstat(stream), os.stat(file)):  # noqa: PTH116 - the path against the open file
                 return stream
         except BlockingIOError as error:
             os.close(stream)
@@ -218,11 +222,14 @@ def _locked(file: Path) -> int:
         except OSError:
             os.close(stream)
             raise
-        os.close(stream)  # It was replaced by its next segment in between.
+        os.close(stream)  # The next segment replaced the file before it was locked.
 
 
 def _existing(file: Path) -> tuple[Header | None, int, int]:
-    """Return the header of a journal, the end of its last undamaged record, and its size. None, 0 for one without header."""
+    """Return the header of a journal, the end of its last undamaged record, and its size, both in bytes.
+
+    If the file is cut off in its header, the header is None and the end is 0. Raises OutputError if it is not a journal.
+    """
     size = file.stat().st_size
     with file.open("rb") as stream:
         header = read_header(stream)

@@ -14,7 +14,7 @@ from objslam.sources.journal.segments import journal_file
 
 
 def read_journal(path: Path, ledger: Ledger) -> Log:
-    """Read a journal as a log, with the stamps that the session gave the messages. Raises LogError if it holds no frames."""
+    """Read a journal as a log, with the stamps that the session gave the messages. Raises LogError if it has no frames."""
     poses: dict[str, list[PoseMessage]] = {"odometry": [], "localization": []}
     cameras: dict[str, Camera] = {}
     frames: dict[str, list[FrameMessage]] = {}

@@ -25,9 +25,10 @@ from objslam.sources.journal.segments import Segment, compress, identity_of, jou
 
 @dataclass(frozen=True)
 class Check:
-    """What a segment holds. format: 0 if it has no readable header. damaged: bytes that belong to no undamaged record.
+    """What is in a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
 
-    unknown: records that this version of objslam cannot read. start, end: the least and the greatest stamp, s, if any.
+    records: the number of undamaged records. unknown: how many of them this version of objslam cannot read. damaged: the
+    bytes that belong to no undamaged record. start, end: the least and the greatest stamp, s, None without stamps.
     """
 
     path: Path
@@ -45,16 +46,16 @@ class Check:
 
 
 def verify(path: Path) -> list[Check]:
-    """Check each segment of a journal, the missing ones too. Raises LogError if the path is not a journal."""
+    """Check each segment of a journal, also a missing one. Raises LogError if the path is not a journal."""
     return [_check(segment) for segment in segments(path)]
 
 
 def repair(path: Path) -> list[Path]:
-    """Write each damaged segment anew without its damage, and compress the segments that are not. Return the new files.
+    """Rewrite each damaged segment without its damage, and compress the earlier segments that are uncompressed.
 
-    What a segment was is kept beside it under its name with ".damaged". Records of other versions stay. A missing segment,
-    or one without a header, cannot be repaired. Raises LogError if the path is not a journal, and OutputError if a session
-    writes it or a file cannot be written.
+    Return the files that were written. The damaged file is kept beside the new one, with ".damaged" after its name. Records
+    that this version of objslam cannot read stay. A missing segment, or one without a header, cannot be repaired. Raises
+    LogError if the path is not a journal, and OutputError if a session writes it or a file cannot be written.
     """
     file = journal_file(path)
     found = segments(path)
@@ -64,13 +65,13 @@ def repair(path: Path) -> list[Path]:
         last = found[-1].header
         assert last is not None
         made += [compress(full) for full in uncompressed_segments(file, identity_of(file, last), last.number)]
-    return made
+    return [one for one in made if one.exists()]  # A segment that was rewritten and then compressed has another name.
 
 
 def json_lines(path: Path, ledger: Ledger, left_out: Counter[str]) -> Iterator[str]:
     """Yield the messages of a journal as lines for `objslam live stdin`, with the stamps of the session.
 
-    left_out: counts the messages that only mean something in a journal: offsets of the clock, and calibrations.
+    left_out: counts the other messages, which only a journal has. Its keys are "note" (an offset) and "calibration".
     Raises LogError if the path is not a journal.
     """
     for message in messages(path, ledger):
@@ -105,7 +106,7 @@ def _check(segment: Segment) -> Check:
 
 
 def _without_damage(segment: Segment) -> Path:
-    """Write the undamaged records of a segment anew, uncompressed, in place of the segment. Return the new file."""
+    """Replace a segment by an uncompressed file with its undamaged records, and return this file."""
     header = segment.header
     assert header is not None
     old, new = segment.path, segment.path.with_name(segment.path.name.removesuffix(".zst"))

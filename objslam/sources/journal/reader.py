@@ -13,8 +13,8 @@ from objslam.sources.journal.segments import contents
 def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
     """Read the messages of a journal in order. Raises LogError if it is not a journal.
 
-    Damaged records and segments, and records of other versions of objslam, are dropped and counted. Where a session stopped
-    to write the journal, the ledger gets a warning.
+    Damaged records and segments, and records of other versions of objslam, are dropped and counted. If a session had to stop
+    the journal before its own end, the ledger gets a warning.
     """
     for place, content in contents(path, ledger):
         try:
@@ -31,7 +31,7 @@ def calibrations(file: Path) -> Iterator[CalibrationMessage]:
     it takes effect."""
     for _, content in contents(file, Ledger()):
         if content.startswith(CALIBRATION_KIND):
-            with suppress(LogError):  # `messages` drops and counts it too
+            with suppress(LogError):  # `messages` counts it.
                 message = decode(content)
                 assert isinstance(message, CalibrationMessage)
                 yield message

@@ -1,10 +1,10 @@
 """The bytes of a journal file: a header, then records, each with a checksum of its own.
 
-Format 2, which is written: the header is `OBJSLAM2`, 8 bytes that identify the journal, the number of this segment from 1
-on, and a CRC-32 of all that. A record is a mark, the length of its content, a CRC-32 of length and content, and the
-content. The mark lets a reader find the next record behind a damaged one. Format 1, which is only read and continued, has
-the header `OBJSLAM1`; its records have no mark, and the CRC-32 is that of the content. All numbers are little endian and of
-4 bytes.
+New journals have format 2. Its header is `OBJSLAM2`, 8 bytes that identify the journal, the number of this segment from 1
+on, and a CRC-32 of the bytes before it. A record is a mark, the length of its content, a CRC-32 of length and content, and
+the content. The mark lets a reader find the next record behind a damaged one. Format 1 is only read, and appended to. Its
+header is `OBJSLAM1`. Its records have no mark, and their CRC-32 is that of the content alone. All numbers are little endian
+and have 4 bytes.
 """
 
 import struct
@@ -21,12 +21,15 @@ _HEADER = struct.Struct("<8s8sII")
 _MARK = b"\xf5REC"
 _HEADS = {1: struct.Struct("<II"), 2: struct.Struct("<4sII")}
 _CHUNK = 1 << 18  # The bytes of one read. A larger number makes fewer reads.
-_MOST_WASTED = 1 << 30  # The most bytes of damaged records that are checked, so that no file takes hours to read.
+_MOST_WASTED = 1 << 30  # The most bytes of damaged records that are checked. A larger number takes longer on a damaged file.
 
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a journal file. size: its bytes. identity: 8 bytes, the same in all segments. number: from 1 on."""
+    """The header of a journal file. version: the format, 1 or 2. size: of the header, bytes.
+
+    identity: 8 bytes, the same in all segments of a journal. number: the number of the segment, from 1 on.
+    """
 
     version: int
     size: int
@@ -36,7 +39,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Record:
-    """A record. start, end: its place in the file, bytes."""
+    """A record. start, end: its first byte in the uncompressed file, and the byte behind it."""
 
     start: int
     end: int
@@ -44,13 +47,13 @@ class Record:
 
 
 def pack_header(identity: bytes, number: int) -> bytes:
-    """Return the header of a file of format 2."""
+    """Return the header of the segment `number` of a journal in format 2. identity: 8 bytes."""
     first = _HEADER.pack(MAGICS[2], identity, number, 0)[:-4]
     return first + zlib.crc32(first).to_bytes(4, "little")
 
 
 def pack_record(version: int, content: bytes) -> bytes:
-    """Return a record with its content in a format."""
+    """Return the bytes of a record with this content, in the format `version`."""
     if version == 1:
         return _HEADS[1].pack(len(content), zlib.crc32(content)) + content
     return _HEADS[2].pack(_MARK, len(content), _checksum(content)) + content
@@ -69,15 +72,15 @@ def read_header(stream: BinaryIO) -> Header | None:
 
 
 def is_cut_header(data: bytes) -> bool:
-    """Return whether a file that holds no more than `data` is a journal that was cut in its header, or is empty."""
+    """Return whether `data`, the whole content of a file, is the beginning of a header, or is empty."""
     return len(data) < _HEADER.size and any((data + magic[len(data) :]).startswith(magic) for magic in MAGICS.values())
 
 
 def records(stream: BinaryIO, header: Header) -> Iterator[Record]:
-    """Yield the undamaged records that follow the header. The stream stands behind the header, and need not be seekable.
+    """Yield the undamaged records that follow the header. The stream is at the byte behind the header.
 
-    Where `start` is not the `end` of the record before, the bytes between are damaged. In format 1, what follows a damaged
-    record cannot be found.
+    If the `start` of a record is not the `end` of the record before, the bytes between are damaged. In format 1, no record
+    behind a damaged one can be found. The stream need not be seekable.
     """
     head, buffer, base, at, wasted = _HEADS[header.version], bytearray(), header.size, 0, 0
 

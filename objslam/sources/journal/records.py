@@ -103,9 +103,9 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """A record of offsets, which apply to all later messages of a session.
+    """The offsets that a session adds to the stamps and the odometry of all later messages.
 
-    clock: s, added to stamps. odometry: start_T_odom (4, 4).
+    clock: s, added to stamps. odometry: start_T_odom (4, 4), the present odom frame in the first odom frame of the session.
     """
 
     clock: float
@@ -127,17 +127,17 @@ Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessag
 
 
 def encode_stop(reason: str) -> bytes:
-    """Encode that a session stopped to write the journal, and why."""
+    """Encode the record that a session had to stop the journal, with the reason."""
     return _STOP_KIND + json.dumps([reason]).encode()
 
 
 def is_stop(data: bytes) -> bool:
-    """Return whether a record says that a session stopped to write the journal."""
+    """Return whether a record says that a session had to stop the journal."""
     return data.startswith(_STOP_KIND)
 
 
 def read_stop(data: bytes) -> str:
-    """Return why a session stopped to write the journal. Raises LogError if the bytes do not say it."""
+    """Return why a session had to stop the journal. Raises LogError if the bytes give no reason."""
     try:
         (reason,) = json.loads(data[1:])
     except (ValueError, TypeError, RecursionError) as error:
@@ -171,7 +171,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Decode a message. Raises LogError if the bytes are no message, or hold a value that no session accepts."""
+    """Decode a message. Raises LogError if the bytes are no message, or contain a value that no session accepts."""
     try:
         reader = _READERS.get(data[:1])
         if reader is None:

@@ -1,7 +1,7 @@
 """The segments of a journal. A long journal is cut into files, and all but the last are compressed with zstd.
 
-The last segment has the name of the journal. The others stand beside it as journal-IDENTITY.NUMBER.objslam.zst, where the
-identity is in the header of the last. So a journal that is renamed keeps its segments, and they stay where they are.
+The last segment has the name of the journal. The earlier ones are beside it as journal-IDENTITY.NUMBER.objslam.zst, where
+IDENTITY is in the header of the last one. So a renamed journal keeps its earlier segments, which keep their names.
 """
 
 import fcntl
@@ -27,7 +27,7 @@ NAME = "journal.objslam"
 """The usual name of a journal."""
 _PACKED = ".zst"
 _LEVEL = 3  # The zstd level. A larger level makes smaller files and takes more time.
-_WINDOW = 1 << 27  # The most memory, bytes, that a compressed segment may ask for. What needs more was not written here.
+_WINDOW = 1 << 27  # The most memory, bytes, to unpack a segment. A larger value lets a damaged file take more memory.
 _CHUNK = 1 << 20  # The bytes of one read. A larger number makes fewer reads.
 
 
@@ -41,7 +41,7 @@ class Segment:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """Open the file for `records`: uncompressed, behind the header."""
+        """Open the file, uncompressed, at the byte behind its header, as `records` needs it."""
         with _uncompressed(self.path) as stream:
             read_header(stream)
             yield stream
@@ -62,12 +62,12 @@ def is_journal(path: Path) -> bool:
 
 
 def holds_messages(file: Path, header: Header | None) -> bool:
-    """Return whether a journal with this header holds more than the header, in this segment or in earlier ones."""
+    """Return whether a journal has messages. header: of its last segment, which is `file`, None if it is damaged."""
     return header is not None and (header.number > 1 or file.stat().st_size > header.size)
 
 
 def segments(path: Path) -> list[Segment]:
-    """Return the segments of a journal in order, missing ones too. Raises LogError if the path is not a journal."""
+    """Return the segments of a journal in order, also missing ones. Raises LogError if the path is not a journal."""
     file = journal_file(path)
     last = _header(file) if file.is_file() else None
     if last is None:
@@ -78,9 +78,9 @@ def segments(path: Path) -> list[Segment]:
 
 
 def contents(path: Path, ledger: Ledger) -> Iterator[tuple[str, bytes]]:
-    """Yield the place and the content of each undamaged record of a journal. Damaged and missing parts are counted.
+    """Yield the place (FILE:BYTE) and the content of each undamaged record of a journal.
 
-    Raises LogError if the path is not a journal.
+    The ledger counts damaged and missing parts. Raises LogError if the path is not a journal.
     """
     found = segments(path)
     for segment in found:
@@ -108,7 +108,7 @@ def sealed(file: Path, identity: bytes, number: int) -> Path:
 
 
 def identity_of(file: Path, header: Header) -> bytes:
-    """Return the identity of a journal. A journal of format 1 gets one that always follows from its first bytes."""
+    """Return the identity of a journal, 8 bytes. In format 1, it is a hash of the first 4096 bytes of the file."""
     if header.version > 1:
         return header.identity
     with file.open("rb") as stream:
@@ -116,10 +116,10 @@ def identity_of(file: Path, header: Header) -> bytes:
 
 
 def seal(file: Path, identity: bytes, number: int, fresh: Path) -> Path:
-    """Give the file of a full segment its own name, put the new file `fresh` in its place, and return that name.
+    """Rename the full segment `file` as an earlier segment, put the new file `fresh` in its place, and return the new name.
 
-    A process killed in between leaves the full segment under both names; nothing is lost, and the next call goes on from
-    there. Raises OSError.
+    A process that is killed between the two steps leaves the full segment under both names. Nothing is lost then, and the
+    next call does both steps. Raises OSError.
     """
     full = sealed(file, identity, number)
     full.unlink(missing_ok=True)  # A killed process may have left it. All of it is in `file`.
@@ -147,7 +147,10 @@ def new_file(file: Path, identity: bytes, number: int) -> tuple[Path, int]:
 
 
 def compress(full: Path) -> Path:
-    """Compress the file of a segment, read it back, and delete the uncompressed file. Return the path. Raises OSError."""
+    """Compress the file of a segment, read it back, and delete the uncompressed file. Return the compressed one.
+
+    Raises OSError, also if the compressed file does not read back as it was.
+    """
     packed = full.with_name(full.name + _PACKED)
     temporary = packed.with_name(temporary_name(packed))
     remove_leftovers(packed)
@@ -167,7 +170,7 @@ def compress(full: Path) -> Path:
 
 
 def uncompressed_segments(file: Path, identity: bytes, number: int) -> list[Path]:
-    """Return the earlier segments of a journal that a killed session left uncompressed."""
+    """Return the segments before `number` that are not compressed, because they are new or a session was killed."""
     return [full for n in range(1, number) if (full := sealed(file, identity, n)).exists()]
 
 

@@ -28,7 +28,7 @@ _WIDTH, _HEIGHT = 640, 480
 _MATRIX = np.array([[_FOCAL, 0, _WIDTH / 2], [0, _FOCAL, _HEIGHT / 2], [0, 0, 1.0]])
 _FORWARD = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 """base_T_camera of the virtual camera. The camera is in the origin of base and looks along base x."""
-_FASTEST = 1000.0  # The bound of speeds, m/s and rad/s. A larger bound lets damaged numbers in.
+_FASTEST = 1000.0  # The speed, m/s and rad/s, from which an odometry line is dropped. A larger value lets damaged lines in.
 _HALF_BOX = 4.0  # Half the side of a box, px. The dataset has bearings but no boxes, so a small box is made.
 _MARGIN = 6.0  # The least distance of a box centre from the image's edge, px. Boxes nearer to it would count as cut off.
 
@@ -47,12 +47,12 @@ def robots(folder: Path) -> tuple[int, ...]:
 def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
     """Read one robot of an MRCLAM folder (files .dat or .dat.gz).
 
-    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes an image, even if
-    all its measurements are dropped. Depths are range * cos(bearing). Labels are landmark_<subject>, or all "landmark" with
-    `options.anonymous`.
-    The ground truth holds the landmark positions (z = 0) and the robot's path.
-    Measurements of other robots and of unknown barcodes are dropped and counted.
-    Raises LogError if a file is unusable or the folder lacks the robot.
+    Odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes a frame, even if all
+    its measurements are dropped. Depths are range * cos(bearing), or NaN without `options.with_range`. Labels are
+    landmark_<subject>, or all "landmark" with `options.anonymous`.
+    The ground truth has the landmark positions (z = 0) and the robot's path.
+    Measurements of other robots, of unknown barcodes, and outside the virtual camera's view are dropped and counted.
+    Raises LogError if a file is unusable, no robot is chosen, or the folder lacks the robot.
     """
     robot = options.robot
     with reading(folder):

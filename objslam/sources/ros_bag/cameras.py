@@ -19,9 +19,10 @@ from objslam.sources.ros_bag.trajectories import tf_path
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of one camera. frame: the name of its optical coordinate frame.
+    """The topics of one camera, each None if there is none. frame: the name of its optical coordinate frame.
 
-    calibration: the calibration from a file, if any. rectified: whether boxes and images are rectified.
+    info: the topic of its CameraInfo. calibration: the calibration from a file, None without a file. rectified: whether
+    boxes and images are rectified.
     """
 
     name: str
@@ -40,10 +41,11 @@ def find_cameras(
     """Find the cameras of a recording and their topics.
 
     With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the camera's
-    name as a part. A single calibration without such topics takes all topics. Without calibrations, each frame_id of
-    detections is a camera. Without detections too, each frame_id of both colour images and a CameraInfo is a camera, and so
-    is a single topic of colour images. The other topics of a camera have the same frame_id. If several topics fit a role,
-    the one with the most similar name is taken with a warning.
+    name as a part. A single calibration without such topics takes all topics. One of several calibrations without such
+    topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. Without detections too,
+    each frame_id of both colour images and a CameraInfo is a camera, and so is a single topic of colour images. The other
+    topics of a camera have the same frame_id. If several topics fit a role, the one with the most similar name is taken with
+    a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images
@@ -77,10 +79,10 @@ def find_cameras(
 def build_camera(
     topics: CameraTopics, tree: TfTree, base: str, ledger: Ledger, mounts: Sequence[Mount] = ()
 ) -> tuple[Camera, Trajectory | None]:
-    """Build a camera from its topics. Returns it with base_T_camera over time, which is None if the camera does not move on
-    base.
+    """Build a camera from its topics. Returns the camera, and base_T_camera over time, which is None if it never changes.
 
-    mounts: base_T_camera of cameras with a CameraInfo, from a file. They replace the poses from tf.
+    base: the name of the base frame. mounts: base_T_camera of cameras with a CameraInfo, from a file. They replace the poses
+    from tf.
     Raises LogError if the calibration is missing or tf does not connect base with the camera.
     """
     given = topics.calibration
@@ -119,10 +121,11 @@ def _gather(
     rectified: bool | None,
     alone: bool,
 ) -> CameraTopics:
-    """Find all topics of a camera, which are the topics with the frame_id `frame` of the camera.
+    """Find all topics of a camera. seeds: the topics of detections or images that define the camera.
 
-    If this is the only camera (`alone`), topics with another frame_id belong to it as well, if the user chose them. If the
-    camera has no frame_id, all topics of its roles belong to it.
+    Its other images are those with the frame_id `frame`. If this is the only camera (`alone`), images with another frame_id
+    belong to it too, if the user chose them or the camera has no frame_id. Its CameraInfo has the same frame_id. Without
+    such a CameraInfo, one with a similar name is taken, or any if no name is similar.
     """
 
     def mine(role: str) -> list[Topic]:

@@ -42,9 +42,9 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 class Assembly:
     """A recording after each topic got its role, for example the odometry or the images of a camera.
 
-    cast: the topics of every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is
-    base_T_camera over time, None if the camera does not move. problems: the errors that make a run impossible. left_out: the
-    errors of the unusable cameras, if others are usable.
+    tree: the tree of tf. paths: the robot's paths, None without any. cast: the topics of every camera. cameras: the topics,
+    the camera and its mount for each usable camera. The mount is base_T_camera over time, None if the camera does not move.
+    problems: the errors that make a run impossible. left_out: the errors of the unusable cameras, if others are usable.
     """
 
     survey: Survey
@@ -59,10 +59,11 @@ class Assembly:
 def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions | None = None) -> Log:
     """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
 
-    The first pass reads everything except the images. The second pass reads the images. Stamps are those of the headers.
-    Damaged files are read as far as possible and never changed. The ledger counts the lost messages.
-    Raises LogError if the robot's path or every camera is missing (NoCamera if it is only the cameras), and ConfigError for
-    options that do not fit the bag.
+    The first pass reads everything except the images. The second pass reads the images, unless `options.with_images` is
+    False. Stamps are those of the headers, or the times of recording if the headers have none. Damaged files are read as far
+    as possible and never changed. The ledger counts the lost messages.
+    Raises LogError if the robot's path or every camera is missing, and ConfigError for options that do not fit the bag. The
+    LogError is a NoCamera if the bag has a path, but neither images nor detections.
     """
     options = options or BagOptions()
     assembly = assemble(paths, ledger, options)
@@ -89,7 +90,10 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
 
 
 def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) -> Assembly:
-    """Read a recording without its images, and give topics their roles. Raises LogError if no file can be read."""
+    """Read a recording without its images, and give topics their roles.
+
+    Raises LogError if no file can be read, and ConfigError for options that do not fit the recording.
+    """
     calibrations = () if options.camera_info is None else read_calibrations(options.camera_info, ledger)
     mounts = () if options.camera_info is None else read_mounts(options.camera_info)
     choices = parse_topics(options.topics)

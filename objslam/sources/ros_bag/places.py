@@ -9,7 +9,7 @@ from objslam.ros.tf.tree import TfTree
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """An optical frame in tf. chain: the frames from base to it. base_T_frame: (4, 4), None if it moves on the robot."""
+    """An optical frame in tf. chain: the frames from base to this frame. base_T_frame: (4, 4), None if it changes."""
 
     frame: str
     chain: tuple[str, ...]
@@ -17,7 +17,7 @@ class CameraPlace:
 
 
 def camera_places(tree: TfTree, base: str) -> tuple[CameraPlace, ...]:
-    """Return the optical frames that tf connects to base."""
+    """Return the frames that tf connects to base and whose names end in "optical" or "optical_frame", sorted by name."""
     places = []
     for frame in sorted(frame for frame in tree.frames if frame.endswith(("optical_frame", "optical"))):
         try:

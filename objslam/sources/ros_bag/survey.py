@@ -24,7 +24,7 @@ from objslam.ros.messages.poses import PoseRows, choose_times
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSES, TRANSFORMS, is_boxes
 from objslam.ros.tf.tree import TfRows
 
-_MAX_TOPICS = 10_000  # The largest number of topics. The value is chosen to limit the memory.
+_MAX_TOPICS = 10_000  # The most topics that are read. Messages of other topics count as lost. A larger number costs memory.
 _Decoder = Callable[[bytes], Any]
 _Handler = Callable[[bytes, int], None]
 
@@ -33,10 +33,11 @@ _Handler = Callable[[bytes, int], None]
 class Topic:
     """The content of a topic.
 
-    logged: the times of recording, ns. stamps: the header stamps, ns, if objslam uses messages of this type. frames: how
-    many messages have each frame_id. refused: the count of unusable messages by reason. poses: the poses by (frame, child
-    frame). tracks: the track id of each track whose name is no number. points: the points of each tag without a box, by the
-    index of its place in `boxes`. infos: up to two distinct CameraInfo messages. image: the first image, decoded.
+    logged: the times of recording, ns. stamps: the header stamps, ns, if objslam uses messages of this type (not for tf).
+    frames: how many messages have each frame_id. refused: the count of unusable messages by reason. poses: the poses by
+    (frame, child frame). tracks: the track id of each track whose name is no number. points: centre and corners (5, 3), m,
+    of each tag without a box, by the index of the tag in `boxes`. infos: up to two distinct CameraInfo messages, by their
+    bytes without the stamp. image: the first image, decoded.
     """
 
     connection: Connection
@@ -73,7 +74,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Survey:
-    """The topics of a recording by name, its transforms, and a report of the damage in each file."""
+    """The topics of a recording by name, the transforms of its tf topics, and a report on each file."""
 
     recording: Recording
     topics: dict[str, Topic]

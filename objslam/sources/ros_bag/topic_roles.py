@@ -40,9 +40,9 @@ class TopicPool:
         return [topic for topic in candidates(self.survey, role) if not names or topic.name in names]
 
     def choose(self, role: str, fitting: Sequence[Topic], camera: str = "") -> Topic | None:
-        """Return the topic that the user chose for a role of a camera. Without a choice, return the first fitting topic.
+        """Return the topic that the user chose for a role of a camera. Without a choice, return the first of `fitting`.
 
-        Warns if several topics fit. Returns None if no topic fits, or if the user chose `none` or `tf`.
+        Warns if there is no choice and several topics fit. Returns None if no topic fits, or the user chose `none` or `tf`.
         """
         names = self.choices.names.get((camera, role))
         if names:

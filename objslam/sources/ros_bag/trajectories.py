@@ -17,12 +17,12 @@ from objslam.sources.ros_bag.survey import Survey, Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _NOT_THE_ROBOT = ("goal", "target", "initial", "setpoint", "waypoint", "truth", "mocap", "vrpn", "vicon")
-"""A topic of poses with one of these words in its name does not hold the robot's own estimate of its pose."""
+"""A topic of poses with one of these words in its name is not the robot's own estimate of its pose."""
 
 
 @dataclass(frozen=True)
 class Paths:
-    """The odometry odom_T_base and the localisation map_T_base. base: the name of the base frame.
+    """The robot's paths. base: the name of the base frame. odometry: odom_T_base. localization: map_T_base.
 
     odometry_from, localization_from: the topic or transform that gives the path, as text for the user, "" without the path.
     roles: the role of each topic that is used, by the topic's name.
@@ -51,9 +51,10 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     """Read the odometry and the localisation of the robot's base.
 
     The odometry comes from a nav_msgs/Odometry topic. Without such a topic, it is tf from odom to base. The localisation is
-    tf from map to odom, composed with the odometry at the odometry's stamps. Without this tf, it comes from a topic of poses
-    in map. If map never moves against odom, the odometry is converted to map and there is no localisation.
-    Raises LogError if both are missing, or if tf does not connect a necessary frame.
+    tf from map to odom, composed with the odometry at the odometry's stamps. If the odometry's frame is not in tf, the
+    localisation is tf from map to base. Without map in tf, it comes from a topic of poses in map. If map never moves against
+    odom, the odometry is converted to map and there is no localisation. The user may choose other topics, or tf.
+    Raises LogError if both are missing, if a topic has no usable pose, or if tf does not connect a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]
@@ -84,7 +85,10 @@ def _main_pair(topic: Topic) -> tuple[str, str]:
 
 
 def _from_topic(topic: Topic, what: str, ledger: Ledger) -> _Odometry:
-    """Read the poses of a topic. A message that names other coordinate frames than most messages is dropped and counted."""
+    """Read the poses of a topic. Messages that name other coordinate frames than most messages are dropped and counted.
+
+    what: the name of a message in the reasons. Raises LogError if no pose is usable.
+    """
     pair = _main_pair(topic)
     for other, rows in topic.poses.items():
         if other != pair:
@@ -130,7 +134,7 @@ def tf_path(tree: TfTree, frame: str, child: str) -> tuple[Floats, Floats]:
 
 
 def _localized(pool: TopicPool, tree: TfTree, odometry: _Odometry | None, base: str) -> Paths:
-    """Return the odometry with the localisation, which is the one that the user chose or else the first one found."""
+    """Return the odometry and the localisation. Without a choice of the user, tf is tried before the topics of poses."""
     chosen = pool.choices.of("localization")
     path, source = (None, "") if odometry is None else (Trajectory(odometry.stamps, odometry.poses), odometry.source)
     if chosen in ([], [TF]):

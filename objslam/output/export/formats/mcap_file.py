@@ -14,7 +14,7 @@ from objslam.output.export.export_format import ExportFormat
 if TYPE_CHECKING:
     from objslam.output.export.content import Content
 
-_POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose. No other topic has a message per stamp.
+_POSE_TOPIC = "/objslam/pose"  # This topic has the robot's pose at each stamp. Every other topic has one message, latched.
 _LATCHED = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  liveliness_lease_duration:\n"

@@ -1,0 +1,84 @@
+"""The inner solve of a calibration: poses and landmarks at given shared errors."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import exp_se3
+from objslam.graph.assembly import Measurements
+from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem
+from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.outlier_rejection import supported
+from objslam.graph.variables import make_values, read_poses, with_points
+
+_INNER = 3
+"""The most steps of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
+_TOLERANCE = 1e-4
+"""An inner solve ends if the next step would decrease the cost by less than this share. A larger share ends it sooner."""
+
+
+@dataclass(frozen=True)
+class InnerSolve(Linearised):
+    """A graph for given parameters, with its variables near their optimum."""
+
+    @property
+    def cost(self) -> float:
+        """The cost at the optimum, as the next step of an inner solve predicts it."""
+        return self.rows.cost - self.decrease
+
+    @cached_property
+    def step(self) -> Floats:
+        """(D,) the next step of an inner solve, by Gauss-Newton."""
+        return -self.normal.solve(self.rows.jacobian.T @ self.rows.residual)
+
+    @property
+    def decrease(self) -> float:
+        """The decrease of the cost by this step, in the linear system."""
+        return float(-(self.rows.jacobian.T @ self.rows.residual) @ self.step / 2)
+
+    def ordered(self) -> Self:
+        """Return the state with the order of elimination, which all later states share."""
+        return replace(self, order=self.normal.order)
+
+    def moved(self, change: Floats) -> Self:
+        """Return the state after a change (D,) of its variables."""
+        landmarks = self.landmarks
+        positions = self.positions.copy()
+        positions[landmarks] += change[: 3 * len(landmarks)].reshape(-1, 3)
+        return replace(
+            self,
+            map_T_camera=self.map_T_camera @ exp_se3(change[3 * len(landmarks) :].reshape(-1, 6)),
+            positions=positions,
+        )
+
+    def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
+        """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
+        return replace(self.moved(system.sensitivity @ step + system.newton), measured=measured)
+
+    def solved(self) -> Self:
+        """Return the state after an inner solve. One more step would hardly change it."""
+        state = self
+        for _ in range(_INNER):
+            if state.decrease <= _TOLERANCE * state.rows.cost:
+                return state
+            after = state.moved(state.step)
+            if not after.rows.cost <= state.rows.cost:
+                return self._damped()
+            state = after
+        return state
+
+    def _damped(self) -> Self:
+        """Return the state after iterations of Levenberg-Marquardt. Steps of Gauss-Newton do not lower the cost."""
+        landmarks = self.landmarks
+        graph = build_graph(self.measured.factors(self.association.object, self.which, landmarks, self.positions))
+        values = make_values(self.map_T_camera, self.positions, landmarks)
+        found = levenberg_marquardt(graph, values, _INNER, _TOLERANCE).values
+        return replace(self, map_T_camera=read_poses(found), positions=with_points(self.positions, landmarks, found))
+
+    def settled(self) -> Self:
+        """Return the state with the rays that now agree with their objects."""
+        used = supported(self.measured.rays, self.association, self.map_T_camera, self.positions, self.used)
+        return self if np.array_equal(used, self.used) else replace(self, used=used)

@@ -1,0 +1,228 @@
+"""The graph of a joint solve as arrays: its whitened residuals and its sparse Jacobian, without an object for each factor.
+
+A calibration solves the same graph for many values of the shared errors. To make a GTSAM graph takes longer than to solve
+it, so these solves have arrays instead. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy import sparse
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import adjoint, inverse, log_se3
+from objslam.core.rotation import skew
+from objslam.core.statistics import CAUCHY_K, HUBER_K
+from objslam.core.types import Association, Rays
+from objslam.graph.assembly import Measurements
+from objslam.graph.factors.bearing import EQ1_SIGMA, ray_jacobians, ray_residuals, residual_axes
+from objslam.graph.factors.localization import localization_covariance
+from objslam.graph.factors.priors import ANCHOR
+
+
+@dataclass(frozen=True)
+class JointRows:
+    """A graph at some values: M rows in the order of `Measurements.factors`. The robust weights are in the rows.
+
+    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. residual: (M,) whitened.
+    cost: half the sum of the squared residuals, with the robust losses.
+    """
+
+    jacobian: sparse.csr_matrix
+    residual: Floats
+    cost: float
+
+
+@dataclass(frozen=True)
+class JointGraph:
+    """The measurements of a joint solve with Huber's loss.
+
+    rays: the n rays in the graph. landmark: (n,) the row of each ray's landmark in `weak`. weak: (m, 3) m, the means of the
+    landmarks' weak priors.
+    """
+
+    measured: Measurements
+    rays: Rays
+    landmark: Ints
+    weak: Floats
+
+    @classmethod
+    def of(cls, measured: Measurements, association: Association, used: Bools, positions: Floats) -> Self:
+        """Make the graph of the rays `used` (R,). Landmarks without a position (N, 3) are not in it."""
+        which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
+        landmark = np.searchsorted(landmarks, association.object[which])
+        return cls(measured, measured.rays.take(which), landmark, positions[landmarks])
+
+    @cached_property
+    def ranged(self) -> Ints:
+        """(q,) the rays with a range."""
+        return np.flatnonzero(np.isfinite(self.rays.range))
+
+    @cached_property
+    def steps(self) -> Ints:
+        """(s,) the motions that the odometry measured. Motion i is from pose i to pose i + 1."""
+        if self.measured.motion is None:
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(self.measured.keyframes.measured)
+
+    @property
+    def first_range(self) -> int:
+        """The first row of the ranges."""
+        return 2 * len(self.rays)
+
+    @property
+    def first_motion(self) -> int:
+        """The first row of the motions."""
+        return self.first_range + len(self.ranged) + self.weak.size
+
+    @cached_property
+    def motion_roots(self) -> Floats:
+        """(s, 6, 6) upper triangular matrices that whiten the motions."""
+        return whitening(self.measured.odometry()[1][self.steps]) if len(self.steps) else np.zeros((0, 6, 6))
+
+    @cached_property
+    def _absolute_roots(self) -> Floats:
+        """(a, 6, 6) matrices that whiten the absolute poses: all poses with a localisation, else the anchor."""
+        keyframes = self.measured.keyframes
+        if not keyframes.localized_every:
+            return np.eye(6)[None] / ANCHOR
+        return whitening(localization_covariance(keyframes, self.measured.settings))
+
+    @property
+    def _metric(self) -> bool:
+        """Whether the residuals of rays are distances (m, Eq. 1), not angles."""
+        return self.measured.settings.joint.factor != "bearing"
+
+    @cached_property
+    def blocks(self) -> Ints:
+        """(D,) the variable of each column: first the landmarks, then the poses."""
+        m, poses = len(self.weak), len(self.measured.keyframes)
+        return np.concatenate([np.repeat(np.arange(m), 3), np.repeat(m + np.arange(poses), 6)])
+
+    @cached_property
+    def _pattern(self) -> tuple[Ints, Ints]:
+        """The columns of all entries of the Jacobian, row by row, and the first entry of each row."""
+        first_pose = self.weak.size
+        on_landmark = 3 * self.landmark[:, None] + np.arange(3)
+        seen = np.hstack([on_landmark, first_pose + 6 * self.rays.keyframe[:, None] + np.arange(6)])
+        moved = first_pose + 6 * self.steps[:, None] + np.arange(12)
+        absolute = first_pose + 6 * np.arange(len(self._absolute_roots))[:, None] + np.arange(6)
+        parts = (
+            np.repeat(seen, 2, axis=0),
+            seen[self.ranged],
+            np.arange(first_pose)[:, None],
+            np.repeat(moved, 6, axis=0),
+            np.repeat(absolute, 6, axis=0),
+        )
+        lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+        columns = np.concatenate([part.ravel() for part in parts])
+        return columns.astype(np.int32), np.append(0, np.cumsum(lengths)).astype(np.int32)
+
+    def seen(self, map_T_camera: Floats, landmarks: Floats) -> Floats:
+        """Return the landmark of each ray (n, 3), m, in the frame of its pose."""
+        poses = map_T_camera[self.rays.keyframe]
+        return np.asarray(np.einsum("nji,nj->ni", poses[:, :3, :3], landmarks[self.landmark] - poses[:, :3, 3]))
+
+    def bearing_axes(self, to_landmark: Floats) -> Floats:
+        """Return the axes (n, 3, 2) of the residuals of rays with landmarks at `to_landmark` (n, 3) from their origins."""
+        return residual_axes(self.rays.direction, to_landmark, self.rays.offset, self._metric)
+
+    def bearing_residuals(self, directions: Floats, to_landmark: Floats, axes: Floats) -> Floats:
+        """Return the residuals (n, 2), rad or m, of rays with directions (n, 3)."""
+        return ray_residuals(directions, to_landmark, axes, self._metric)
+
+    def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
+        """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of Huber's loss, and their costs (n,)."""
+        sigma = np.full(len(self.rays), EQ1_SIGMA) if self._metric else self.rays.sigma
+        weight, cost = _huber(np.linalg.norm(residuals, axis=1) / sigma)
+        return (weight / sigma)[:, None], cost
+
+    def range_roots(self, distances: Floats) -> tuple[Floats, Floats]:
+        """Return the factors (q,) that whiten distances (q,), m, with the weights of Cauchy's loss, and their costs (q,)."""
+        sigma = self.rays.range_sigma[self.ranged]
+        square = ((distances - self.rays.range[self.ranged]) / sigma / CAUCHY_K) ** 2
+        return 1 / sigma / np.sqrt(1 + square), CAUCHY_K**2 / 2 * np.log1p(square)
+
+    def absolute_roots(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the residuals (a, 6) of absolute poses, the matrices (a, 6, 6) that whiten them, and their costs (a,).
+
+        The anchor has no loss. The others have Huber's, whose weights are in the matrices.
+        """
+        keyframes, roots = self.measured.keyframes, self._absolute_roots
+        off = log_se3(inverse(keyframes.map_T_camera[: len(roots)]) @ map_T_camera[: len(roots)])
+        size = np.linalg.norm((roots @ off[..., None])[..., 0], axis=1)
+        if not keyframes.localized_every:
+            return off, roots, size**2 / 2
+        weight, cost = _huber(size)
+        return off, roots * weight[:, None, None], cost
+
+    def rows(self, map_T_camera: Floats, landmarks: Floats) -> JointRows:
+        """Return the rows at poses (P, 4, 4) and positions (m, 3), m."""
+        rays, ranged = self.rays, self.ranged
+        seen = self.seen(map_T_camera, landmarks)
+        to_landmark = from_origins(rays, seen)
+        axes = self.bearing_axes(to_landmark)
+        off = self.bearing_residuals(rays.direction, to_landmark, axes)
+        roots, ray_cost = self.bearing_roots(off)
+        by_seen = roots[:, :, None] * ray_jacobians(rays.direction, to_landmark, axes, rays.offset, self._metric)
+        distance = np.linalg.norm(to_landmark[ranged], axis=1)
+        range_root, range_cost = self.range_roots(distance)
+        by_distance = (range_root / np.maximum(distance, 1e-12))[:, None] * to_landmark[ranged]
+        by_seen = np.concatenate([by_seen.reshape(-1, 3), by_distance])
+        ray = np.concatenate([np.repeat(np.arange(len(rays)), 2), ranged])
+        on_landmark = (map_T_camera[rays.keyframe, :3, :3][ray] @ by_seen[..., None])[..., 0]
+        seen_rows = np.hstack([on_landmark, np.cross(by_seen, seen[ray]), -by_seen])
+        way, move_rows = self._motion_rows(map_T_camera)
+        apart, absolute_roots, absolute_cost = self.absolute_roots(map_T_camera)
+        held = (absolute_roots @ apart[..., None]).ravel()
+        weak = (landmarks - self.weak).ravel() / self.measured.settings.joint.prior_sigma
+        by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
+        by_absolute = (absolute_roots @ _by_end(apart)).ravel()
+        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute])
+        columns, first = self._pattern
+        jacobian = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=(len(first) - 1, len(self.blocks)))
+        jacobian.eliminate_zeros()  # On a plane, half of the entries are zero.
+        past = range_root * (distance - rays.range[ranged])
+        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held])
+        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + (weak @ weak + way @ way) / 2
+        return JointRows(jacobian, residual, float(cost))
+
+    def _motion_rows(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
+        """Return the residuals (6 s,) of the motions, and their derivatives (s, 6, 12) by the poses before and after."""
+        if not len(self.steps):
+            return np.zeros(0), np.zeros((0, 6, 12))
+        moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[self.steps]
+        off = log_se3(inverse(self.measured.odometry()[0][self.steps]) @ moved)
+        after = self.motion_roots @ _by_end(off)
+        before = -after @ adjoint(inverse(moved))
+        return (self.motion_roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2)
+
+
+def from_origins(rays: Rays, seen: Floats) -> Floats:
+    """Return positions (n, 3), m, relative to the points where their rays begin."""
+    return seen if rays.offset is None else seen - rays.offset
+
+
+def whitening(covariance: Floats) -> Floats:
+    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does."""
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+
+
+def _huber(size: Floats) -> tuple[Floats, Floats]:
+    """Return the roots (n,) of Huber's weights of whitened norms (n,), and the costs (n,)."""
+    weight = np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(size, 1e-12)))
+    return weight, np.where(size <= HUBER_K, size**2 / 2, HUBER_K * (size - HUBER_K / 2))
+
+
+def _by_end(twist: Floats) -> Floats:
+    """Return the derivatives (n, 6, 6) of log(X exp(d)) by d at 0, for the twists (n, 6) log(X).
+
+    This is the inverse of the right Jacobian of SE(3) up to the square of the twist (Barfoot, State Estimation for Robotics,
+    eq. 8.102). The error is the twist's fourth power divided by 720.
+    """
+    small = np.zeros((len(twist), 6, 6))
+    small[:, :3, :3] = small[:, 3:, 3:] = skew(twist[:, :3])
+    small[:, 3:, :3] = skew(twist[:, 3:])
+    return np.asarray(np.eye(6) + small / 2 + small @ small / 12)
