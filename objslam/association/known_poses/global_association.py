@@ -1,6 +1,7 @@
 """Global association at known poses: assign rays to an unknown number of objects.
 
-A search finds points where rays of one label meet, and the best points become landmarks. Then landmarks are merged, fused
+A search finds points where rays of one label meet, and the best points become landmarks. A second search finds points with
+few rays, whose odds against chance decide. Then landmarks are merged, fused
 across labels or dropped, if this explains the boxes and the misses at a lower cost.
 """
 
@@ -33,7 +34,7 @@ _SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames
 _FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
-_SPARSE_SAMPLE = 1024
+_SPARSE_SAMPLE = 512  # The most rays of one label in a search for objects with few rays. A larger one costs time squared.
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
@@ -216,7 +217,7 @@ def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
 
 
 def _plausible(task: _Task, state: State) -> Bools:
-    """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
+    """Return which landmarks (N,) have two rays or a range, and are not so far away that only parallel rays meet there."""
     near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
     ranged = np.bincount(state.owner, np.isfinite(state.obs.range[state.assigned]), state.count) > 0
     return np.asarray(((state.ray_count > 1) | ranged) & near)
