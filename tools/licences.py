@@ -4,8 +4,8 @@
     python tools/licences.py --sbom sbom.json # also a CycloneDX 1.5 file
 
 All data come from the metadata of the installed packages, and nothing is downloaded. The packages are the dependencies of
-objslam and of its extras open3d, torch and dds in pyproject.toml, and all packages that these need. Run the tool in the
-environment that tools/setup.sh made. If the metadata name no licence, the page says so.
+objslam and of its extras open3d, torch, dds and fleet in pyproject.toml, and all packages that these need. Run the tool in
+an environment with all of them, as `tools/setup.sh dev` makes it. If the metadata name no licence, the page says so.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def requirements(project: Path) -> list[str]:
     """What pyproject.toml requires to run: its dependencies, and those of the extras that a user may add."""
     data = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     extras = data["optional-dependencies"]
-    return [*data["dependencies"], *extras["open3d"], *extras["torch"], *extras["dds"]]
+    return [*data["dependencies"], *extras["open3d"], *extras["torch"], *extras["dds"], *extras["fleet"]]
 
 
 def packages(required: Iterable[str]) -> list[Package]:

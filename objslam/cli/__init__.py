@@ -14,6 +14,7 @@ from objslam.cli.detect import detect
 from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
 from objslam.cli.export import export
+from objslam.cli.fleet import fleet
 from objslam.cli.info import info
 from objslam.cli.journal import journal_app
 from objslam.cli.live_command.command import live
@@ -38,6 +39,7 @@ app.command(name="report")(report_result)
 app.command(name="register")(register_results)
 app.command(name="merge")(merge_results)
 app.command(name="diff")(diff_results)
+app.command()(fleet)
 app.command()(view)
 app.command()(demo)
 app.command()(convert)

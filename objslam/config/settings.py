@@ -14,6 +14,7 @@ from objslam.config.checks import Checks
 from objslam.config.detector import Detector
 from objslam.config.noise import Noise
 from objslam.config.section import Section
+from objslam.config.tags import Tags
 from objslam.config.yaml_text import MAX_YAML, parse_yaml
 from objslam.errors import ConfigError
 
@@ -31,6 +32,7 @@ class Settings(Section):
     poses: mapping.Poses = mapping.Poses()
     rays: mapping.RayNoise = mapping.RayNoise()
     depth: mapping.Depth = mapping.Depth()
+    tags: Tags = Tags()
     odometry: mapping.Odometry = mapping.Odometry()
     planar: mapping.Planar = mapping.Planar()
     localization: mapping.Localization = mapping.Localization()

@@ -174,6 +174,9 @@ class CalibratedMeasurements(Protocol):
         """The parameters that scale the measured lengths, if every kind of length has one and no absolute pose is measured.
         The log cannot determine a factor that all these lengths share. The set is empty in all other cases."""
 
+    def take(self, keyframes: Keyframes, rays: Rays) -> Self:
+        """Return the same errors for other keyframes and rays of the log."""
+
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
 

@@ -1,10 +1,12 @@
 """The result type of every solver."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import Calibration
 from objslam.core.noise import NoiseFactors
+from objslam.core.object_map import TagPose
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class Estimate:
     noise: the estimated noise, None if none was estimated.
     box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
     None if boxes have no size.
+    tags: the rotation and the size of each fiducial that has them, by the index of its object.
     """
 
     map_T_base: Floats
@@ -35,3 +38,4 @@ class Estimate:
     calibration: Calibration | None = None
     noise: NoiseFactors | None = None
     box_offset: float | None = None
+    tags: Mapping[int, TagPose] = field(default_factory=dict)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -65,6 +66,49 @@ class Life:
 
 
 @dataclass(frozen=True)
+class TagPose:
+    """The rotation and the size of one fiducial. Its position is that of its object.
+
+    xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
+    covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
+    from the settings. other_xyzw: (4,) the second rotation that a flat square leaves open, None if the views rule it out.
+    other_probability: of this second rotation, 0 without one.
+    """
+
+    xyzw: Floats
+    covariance: Floats
+    size: float
+    size_sigma: float
+    other_xyzw: Floats | None = None
+    other_probability: float = 0.0
+
+    @property
+    def rotation(self) -> Floats:
+        """(3, 3) map_R_tag."""
+        return rotation_from_quaternion(self.xyzw[None])[0]
+
+    @property
+    def other(self) -> Floats | None:
+        """(3, 3) the second rotation, None without one."""
+        return None if self.other_xyzw is None else rotation_from_quaternion(self.other_xyzw[None])[0]
+
+    @property
+    def sigma_deg(self) -> float:
+        """The standard deviation of the rotation about its least certain axis, degrees."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
+
+    def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
+        """Return the fiducial in a frame in which its map has a rotation (3, 3), whose yaw has a sigma, rad."""
+        up = (rotation @ self.rotation)[2]
+        return replace(
+            self,
+            xyzw=_quaternion(rotation @ self.rotation),
+            covariance=self.covariance + yaw_sigma**2 * np.outer(up, up),
+            other_xyzw=None if self.other is None else _quaternion(rotation @ self.other),
+        )
+
+
+@dataclass(frozen=True)
 class MapObject:
     """One object of the map, with the fields of objects.json.
 
@@ -74,7 +118,7 @@ class MapObject:
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
-    in the map of a single run.
+    in the map of a single run. tag: the rotation and size of a fiducial, None for another object.
     """
 
     id: int
@@ -94,6 +138,7 @@ class MapObject:
     existence: float | None = None
     seen_from: SeenFrom | None = None
     life: Life | None = None
+    tag: TagPose | None = None
 
     @property
     def sigma(self) -> float | None:
@@ -222,6 +267,10 @@ class ObjectMap:
         objects, positions = self._placed(label)
         distance = np.linalg.norm(positions[:, : len(at)] - at, axis=1)
         return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
+
+
+def _quaternion(rotation: Floats) -> Floats:
+    return quaternion_from_rotation(rotation[None])[0]
 
 
 def _point(values: ArrayLike) -> Floats:

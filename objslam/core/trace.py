@@ -61,9 +61,14 @@ class Round:
 
 @dataclass
 class Trace:
-    """A collector of the rounds of an estimation. base_T_camera: (K, 4, 4) the camera on the robot at each keyframe."""
+    """A collector of the rounds of an estimation.
+
+    base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: how many positions of an iteration are objects.
+    The positions behind them, such as further corners of fiducials, are left out. None means all.
+    """
 
     base_T_camera: Floats
+    count: int | None = None
     rounds: list[Round] = field(default_factory=list)
     _iterations: list[Iteration] = field(default_factory=list)
 
@@ -72,12 +77,12 @@ class Trace:
     ) -> None:
         """Add one step of a solver, with the camera poses (k, 4, 4) of the first k keyframes and object positions (N, 3)."""
         path = (map_T_camera @ inverse(self.base_T_camera[: len(map_T_camera)]))[:, :3, 3]
-        step = Iteration(stage, cost, path.astype(np.float32), positions.astype(np.float32), parameters)
+        step = Iteration(stage, cost, path.astype(np.float32), positions[: self.count].astype(np.float32), parameters)
         self._iterations.append(step)
 
     def aside(self) -> Trace:
         """Return an empty trace for an attempt that may be discarded."""
-        return Trace(self.base_T_camera)
+        return Trace(self.base_T_camera, self.count)
 
     def take(self, attempt: Trace) -> None:
         """Add the iterations of a successful attempt."""

@@ -58,7 +58,8 @@ class Detections:
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
     the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge.
     Then box centres are valid up to the edge. This holds for fiducials, because a detector needs all their corners.
-    ValueError if a shape, an index or the order is wrong.
+    corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if
+    no box has corners. ValueError if a shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -70,12 +71,14 @@ class Detections:
     track_ids: Ints
     label_names: tuple[str, ...]
     whole: bool = False
+    corners: Floats | None = None
 
     def __post_init__(self) -> None:
         m = len(self.frame)
         _need(self.boxes.shape == (m, 4), "boxes must be (M, 4)")
         for name in _BOX_COLUMNS:
             _need(getattr(self, name).shape == (m,), f"{name} must be (M,) like the boxes")
+        _need(self.corners is None or self.corners.shape == (m, 4, 2), "corners must be (M, 4, 2) like the boxes")
         _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
         _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
@@ -93,7 +96,7 @@ class Detections:
     def take(self, boxes: Bools | Ints) -> Self:
         """Select boxes by a mask or increasing indices. All frames stay."""
         values: dict[str, Any] = {name: getattr(self, name)[boxes] for name in ("boxes", *_BOX_COLUMNS)}
-        return replace(self, **values)
+        return replace(self, **values, corners=None if self.corners is None else self.corners[boxes])
 
 
 @dataclass(frozen=True)
@@ -222,7 +225,8 @@ class Rays:
     ray, NaN if unknown. range_sigma: (R,) m, the standard deviation of the range. range_bias: (R,) m, the standard deviation
     of the error that all ranges of an object share. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px.
     track_id: (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the
-    origin.
+    origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
+    object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes.
     """
 
     keyframe: Ints
@@ -237,6 +241,8 @@ class Rays:
     track_id: Ints
     label_names: tuple[str, ...]
     offset: Floats | None = None
+    corners: Floats | None = None
+    corner_sigma: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.keyframe)

@@ -163,6 +163,16 @@ def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools,
     )
 
 
+def valid_corners(corners: Floats) -> Bools:
+    """Return which corners (M, 4, 2), px, are finite, not too large, and those of a convex quadrilateral in its order."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        known = np.asarray((np.abs(corners) < MAX_PIXEL).all(axis=(1, 2)))
+        ahead = np.roll(corners, -1, axis=1) - corners
+        after = np.roll(ahead, -1, axis=1)
+        turn = ahead[..., 0] * after[..., 1] - ahead[..., 1] * after[..., 0]
+        return known & np.asarray((turn > 0).all(axis=1) | (turn < 0).all(axis=1))
+
+
 def valid_depths(depths: Floats) -> Bools:
     """Return which depths (...), m, are above zero and below `MAX_POSITION`."""
     return np.asarray((depths > 0) & (depths < MAX_POSITION))

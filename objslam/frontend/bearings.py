@@ -7,7 +7,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
-from objslam.core.types import Keyframes, Log, Rays, label_table
+from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
 """The reason to drop a box that ends at the image's edge, because its centre is then wrong."""
@@ -41,8 +41,13 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         boxes, directions, angle_sigma = boxes.take(few), directions[few], angle_sigma[few]
         names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         of_rays = (keyframe_of_frame[boxes.frame], directions, angle_sigma)
-        columns.append((*of_rays, boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids))
-    keyframe, direction, sigma, depth, label, score, box, track_id = (np.concatenate(c) for c in zip(*columns, strict=True))
+        corners, corner_sigma = _corner_rays(boxes, camera, settings, ledger)
+        measures = boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids
+        columns.append((*of_rays, *measures, corners, corner_sigma))
+    keyframe, direction, sigma, depth, label, score, box, track_id, corners, corner_sigma = (
+        np.concatenate(c) for c in zip(*columns, strict=True)
+    )
+    seen = np.isfinite(corner_sigma).any()
     order = np.argsort(keyframe, kind="stable")
     if not settings.depth.use:
         depth = np.full(len(depth), np.nan)
@@ -62,6 +67,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         box=box[order],
         track_id=track_id[order],
         label_names=label_names,
+        corners=corners[order] if seen else None,
+        corner_sigma=corner_sigma[order] if seen else None,
     )
 
 
@@ -81,6 +88,26 @@ def box_rays(
         ledger.drop("boxes where the lens model has no inverse", int((~valid).sum()), _where(camera, stamps, bad))
         kept, boxes, directions = kept[valid], boxes[valid], directions[valid]
     return kept, directions, _angle_sigma(camera, directions, boxes, settings)
+
+
+def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> tuple[Floats, Floats]:
+    """Return unit directions (M, 4, 3) to the corners of fiducials in the camera frame, and their sigma (M,), rad.
+
+    Both are NaN for a box without corners, and for a fiducial with a corner where the lens model has no inverse.
+    """
+    directions, sigma = np.full((len(boxes), 4, 3), np.nan), np.full(len(boxes), np.nan)
+    if boxes.corners is None or not settings.tags.use:
+        return directions, sigma
+    known = np.flatnonzero(np.isfinite(boxes.corners[:, 0, 0]))
+    found, valid = undistort(camera, boxes.corners[known].reshape(-1, 2))
+    whole = valid.reshape(-1, 4).all(axis=1)
+    lost = "corners of fiducials where the lens model has no inverse (their centres are used)"
+    ledger.drop(lost, int((~whole).sum()), spoken_name(camera.name))
+    directions[known[whole]] = found.reshape(-1, 4, 3)[whole]
+    middle = directions[known[whole]].mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    sigma[known[whole]] = _radians(camera, middle, np.full(len(middle), settings.tags.corner_sigma))
+    return directions, sigma
 
 
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
@@ -136,6 +163,11 @@ def _angle_sigma(camera: Camera, directions: Floats, boxes: Floats, settings: Se
     """Return the standard deviations (n,), rad, of rays in unit directions (n, 3) through the centres of boxes (n, 4)."""
     size = np.maximum(boxes[:, 2:] - boxes[:, :2], 0.0)
     pixels = np.hypot(settings.rays.pixel_sigma, settings.rays.box_sigma * np.sqrt(size[:, 0] * size[:, 1]))
+    return _radians(camera, directions, pixels)
+
+
+def _radians(camera: Camera, directions: Floats, pixels: Floats) -> Floats:
+    """Return the angles (n,), rad, of distances (n,) px in the image, at unit directions (n, 3)."""
     # For each radian of ray angle, a pinhole image moves by f / cos(a)^2 along the radius and by f / cos(a) across it. Here
     # a is the angle off the axis. The geometric mean gives one sigma for the ray. A fisheye image moves by f everywhere.
     if camera.fisheye:

@@ -1,13 +1,14 @@
 """Choose the factors of a log's measurements. The initialisations, outlier rejection and the final solve use them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import gtsam
 import numpy as np
 
 from objslam.config import Loss, Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Rays
 from objslam.graph.factors.bearing import point_to_line_fixed
@@ -18,6 +19,10 @@ from objslam.graph.factors.priors import anchor, landmark_priors
 from objslam.graph.factors.range import along_ray
 from objslam.graph.factors.rays import ray_factors
 from objslam.graph.multiframes import Multiframes
+from objslam.graph.optimizers import build_graph
+from objslam.graph.tags.corner_rays import TagCorners
+from objslam.graph.tags.squares import add_squares
+from objslam.graph.variables import make_values
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class Measurements:
 
     images: the keyframes before they were joined. keyframes: (P,) the first keyframe of each multiframe. The graph has the
     poses of these. rays: in the frames of these keyframes. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions
-    by odometry, None without odometry.
+    by odometry, None without odometry. tags: the fiducials whose corners are landmarks, None if there are none.
     """
 
     multiframes: Multiframes
@@ -36,18 +41,48 @@ class Measurements:
     settings: Settings
     motion: Floats | None
     covariance: Floats | None
+    tags: TagCorners | None = None
 
     @classmethod
-    def of(cls, images: Keyframes, rays: Rays, settings: Settings, multiframes: Multiframes | None = None) -> Self:
+    def of(
+        cls,
+        images: Keyframes,
+        rays: Rays,
+        settings: Settings,
+        multiframes: Multiframes | None = None,
+        tags: TagCorners | None = None,
+    ) -> Self:
         """Collect the measurements of keyframes and rays. Without multiframes, each keyframe has its own pose."""
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
-        moved = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
-        return cls(joined, images, keyframes, rays, settings, *moved)
+        motion, covariance = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
+        return cls(joined, images, keyframes, rays, settings, motion, covariance, tags)
 
     def map_T_base(self, map_T_camera: Floats) -> Floats:
         """Return the base poses (K, 4, 4) at all images, from the poses (P, 4, 4) of the graph."""
         return self.multiframes.map_T_base(self.images, map_T_camera)
+
+    @cached_property
+    def seen_twice(self) -> Bools:
+        """(P-1,) whether both poses of a motion see the same fiducial, so that its corners measure the motion too."""
+        if self.tags is None:
+            return np.zeros(max(len(self.keyframes) - 1, 0), dtype=bool)
+        return self.tags.measured_motions(self.rays, len(self.keyframes))
+
+    def whole(
+        self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Return the graph of the whole log, and its values. The ties of fiducials are its last factors.
+
+        owner: (R,) the landmark of each ray. used: (R,) the rays in the graph. map_T_camera: (P, 4, 4). positions: (N, 3) m,
+        NaN for a landmark that is not in the graph.
+        """
+        landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
+        factors = self.factors(owner, np.flatnonzero(used), landmarks, positions, loss)
+        values = make_values(map_T_camera, positions, landmarks)
+        if self.tags is not None:
+            factors += add_squares(self.tags, landmarks, positions, values, self.settings.joint.prior_sigma)
+        return build_graph(factors), values
 
     def odometry(self) -> tuple[Floats, Floats]:
         """Return the motions (P-1, 4, 4) and their covariances (P-1, 6, 6). ValueError without odometry."""
@@ -81,7 +116,8 @@ class Measurements:
         made += landmark_priors(landmarks, positions, settings)
         if self.motion is not None and self.covariance is not None:
             steps = slice(max(begin - 1, 0), end - 1)
-            made += betweens(self.motion[steps], self.covariance[steps], steps.start, keyframes.measured[steps])
+            robust = None if self.tags is None else self.seen_twice[steps]
+            made += betweens(self.motion[steps], self.covariance[steps], steps.start, keyframes.measured[steps], robust)
         if keyframes.localized_every:
             on_plane = is_planar(keyframes.map_T_base)
             made += localizations(keyframes.take(np.arange(begin, end)), settings, begin, on_plane)

@@ -23,6 +23,9 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
+from objslam.graph.tags.corner_rays import TagCorners
+from objslam.graph.tags.estimate import with_objects
+from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
@@ -85,6 +88,7 @@ def solve_fixed(
         cost_before=optimum.cost_before,
         cost_after=optimum.cost_after,
         iterations=optimum.iterations,
+        tags=tags_at_poses(keyframes, rays, association, settings),
     )
 
 
@@ -111,12 +115,19 @@ def solve_joint(
     start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors.
     These are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance of objects.
     hold: whether the shared errors and the noise are kept fixed.
+    The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
+    tags = TagCorners.of(rays, association, settings)
+    if trace is not None:
+        trace.count = association.count
+    if tags is not None:
+        errors = None if errors is None else errors.take(errors.keyframes, tags.rays(errors.rays))
+        rays, association = tags.rays(rays), tags.association
 
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes)
+        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes, tags)
 
     if errors is None:
         measured = measure(keyframes, rays, settings)
@@ -171,22 +182,23 @@ def solve_joint(
     weight = np.zeros(len(rays))
     weight[used] = _weights(settings.joint.loss, residual, optimum)
     covariance = np.full((association.count, 3, 3), np.nan)
-    inliers = np.flatnonzero(used & (weight > 0))
-    gaussian = build_graph(measured.factors(association.object, inliers, landmarks, positions, "gnc"))
+    inliers = used & (weight > 0)
+    gaussian, _ = measured.whole(association.object, inliers, map_T_camera, positions, "gnc")
     covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
     seen_sigma = largest_sigma(covariance)
     witness = _witnesses(rays, association, used & (weight > 0))
     reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
     far = np.flatnonzero(seen_sigma > settings.triangulation.max_rel_sigma * reach)
     seen_sigma[far] = largest_sigma(seen_covariances(gaussian, optimum.values, far, witness[far], ledger))
-    wider = widening(residual, association.object[used], association.count)
+    body = np.arange(association.count) if tags is None else tags.object_of_landmark()
+    wider = widening(residual, body[association.object[used]], association.count)[body]
     covariance *= wider[:, None, None]
     seen_sigma *= np.sqrt(wider)
     if calibrated is not None:
         by_error = calibrated.sensitivity
         covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
         covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
-    return Estimate(
+    estimate = Estimate(
         map_T_base=measured.map_T_base(map_T_camera),
         positions=positions,
         covariance=covariance,
@@ -199,6 +211,10 @@ def solve_joint(
         calibration=calibration if calibration is not None and calibration.names else None,
         noise=None if errors is None else errors.noise,
     )
+    if tags is None:
+        return estimate
+    told = None if calibrated is None else calibrated.sensitivity
+    return with_objects(estimate, tags, rays, map_T_camera, (gaussian, optimum.values), wider, told, ledger)
 
 
 def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:

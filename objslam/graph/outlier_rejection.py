@@ -11,9 +11,9 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_at
-from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
+from objslam.graph.optimizers import Optimum, optimize, trace_solve
 from objslam.graph.robust_cost import truncated_cost
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
 """A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is also
@@ -62,6 +62,8 @@ def reject_outliers(
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
+    if measured.tags is not None:
+        positions = measured.tags.placed(measured.rays, map_T_camera, positions)
     for _ in range(rounds):
         moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
@@ -69,9 +71,8 @@ def reject_outliers(
         elif (agreeing == used).all():
             break  # The positions stay as in the last solve.
         positions, used = moved, agreeing
-        which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
-        graph = build_graph(measured.factors(association.object, which, landmarks, positions, loss))
-        values, others = make_values(map_T_camera, positions, landmarks), range(len(which), graph.size())
+        graph, values = measured.whole(association.object, used, map_T_camera, positions, loss)
+        landmarks, others = np.flatnonzero(np.isfinite(positions[:, 0])), range(int(used.sum()), graph.size())
         traced = trace_solve(trace, positions, landmarks)
         optimum = optimize(graph, values, loss, measured.settings, others, max(tolerance, _COARSE), traced)
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
@@ -115,6 +116,8 @@ def second_opinion(
 ) -> tuple[Floats, Bools]:
     """Triangulate undetermined objects and objects with outliers again. Move an object if more of its rays agree then.
 
+    The corners of fiducials stay: rays to four separate points say less than those to a square.
+
     Return the positions (N, 3), and which rays (R,) agree with them.
     """
     keyframes, rays = measured.keyframes, measured.rays
@@ -122,6 +125,8 @@ def second_opinion(
     agreeing = supported(rays, association, map_T_camera, positions, used)
     support = np.bincount(association.object[agreeing], minlength=association.count)
     doubtful = support < _SURE * number
+    if measured.tags is not None:
+        doubtful &= ~measured.tags.is_corner()
     which = np.isin(association.object, np.flatnonzero(doubtful))
     if not which.any():
         return positions, agreeing

@@ -1,6 +1,7 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
-X(k) belongs to the camera of keyframe k. If images share a pose, it belongs to the first camera of multiframe k.
+X(k) belongs to the camera of keyframe k. If images share a pose, it belongs to the first camera of multiframe k. Y(t) is the
+pose of fiducial t, and Z(t) what half its diagonal lacks to its first value, if its size is not known.
 
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """
@@ -18,6 +19,11 @@ X0 = gtsam.symbol("x", 0)
 """The key of X(0). The key of X(k) is X0 + k."""
 L0 = gtsam.symbol("l", 0)
 """The key of L(0). The key of L(j) is L0 + j."""
+TAG0 = gtsam.symbol("y", 0)
+"""The key of Y(0). The key of Y(t) is TAG0 + t. Keys of fiducials are above those of keyframes and landmarks, so that the
+columns of a linear system begin with landmarks and poses."""
+TAG_SIZE0 = gtsam.symbol("z", 0)
+"""The key of Z(0). The key of Z(t) is TAG_SIZE0 + t."""
 LETTER = 56
 """The number of bits of a key that hold the number of the symbol. The letter is in the bits above."""
 

@@ -4,15 +4,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from objslam.core.arrays import Bools, Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, label_table
-from objslam.core.validity import box_rules, is_name, valid_depths
+from objslam.core.validity import box_rules, is_name, valid_corners, valid_depths
 from objslam.io.text import drop_rows, in_order
 
 
 @dataclass
 class BoxCollector:
-    """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1.
+    """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1. The corners of
+    fiducials are known by the index of their box.
     Each frame and box has a place, such as file:line. The ledger shows the place if the frame or box is dropped."""
 
     stamps: list[float] = field(default_factory=list)
@@ -24,6 +26,7 @@ class BoxCollector:
     depths: list[float] = field(default_factory=list)
     track_ids: list[int] = field(default_factory=list)
     box_places: list[str] = field(default_factory=list)
+    corners: dict[int, list[list[float]]] = field(default_factory=dict)
 
     def add_frame(self, stamp: float, place: str) -> None:
         """Start a frame. The next boxes belong to it."""
@@ -31,9 +34,18 @@ class BoxCollector:
         self.frame_places.append(place)
 
     def add_box(
-        self, box: list[float], label: str, score: float, place: str, depth: float = np.nan, track_id: int = -1
+        self,
+        box: list[float],
+        label: str,
+        score: float,
+        place: str,
+        depth: float = np.nan,
+        track_id: int = -1,
+        corners: list[list[float]] | None = None,
     ) -> None:
-        """Add a box x1, y1, x2, y2 (px) to the last frame."""
+        """Add a box x1, y1, x2, y2 (px) to the last frame. corners: the four corners x, y (px) of a square fiducial."""
+        if corners is not None:
+            self.corners[len(self.boxes)] = corners
         self.frame.append(len(self.stamps) - 1)
         self.boxes.append(box)
         self.labels.append(label)
@@ -44,7 +56,7 @@ class BoxCollector:
 
     def checked(self, ledger: Ledger) -> Detections:
         """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted.
-        A depth that is not above zero, or too large, becomes unknown and is counted."""
+        A depth that is not above zero, or too large, becomes unknown and is counted. So do corners that are no square's."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)
@@ -62,6 +74,7 @@ class BoxCollector:
             "depth of a box that is not above zero or too large (taken as unknown)", good & wrong, self.box_places, ledger
         )
         depths[wrong] = np.nan
+        corners = self._valid_corners(good, ledger) if self.corners else None
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(
             frame_stamps=stamps[forward],
@@ -72,4 +85,15 @@ class BoxCollector:
             depths=depths[good],
             track_ids=np.array(self.track_ids, dtype=np.int64)[good],
             label_names=label_names,
+            corners=None if corners is None else corners[good],
         )
+
+    def _valid_corners(self, good: Bools, ledger: Ledger) -> Floats:
+        """Return the corners (M, 4, 2) px of all boxes (M,), NaN where they are unknown or not valid."""
+        corners = np.full((len(self.boxes), 4, 2), np.nan)
+        corners[list(self.corners)] = np.array(list(self.corners.values()), dtype=np.float64)
+        wrong = np.isin(np.arange(len(corners)), list(self.corners)) & ~valid_corners(corners)
+        reason = "corners that are not those of a square (taken as unknown)"
+        drop_rows(reason, good & wrong, self.box_places, ledger)
+        corners[wrong] = np.nan
+        return corners

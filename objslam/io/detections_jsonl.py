@@ -59,6 +59,8 @@ def write_detections(detections: Detections, path: Path) -> None:
         columns["depths"] = [None if math.isnan(depth) else depth for depth in detections.depths.tolist()]
     if (detections.track_ids >= 0).any():
         columns["track_ids"] = [None if track_id < 0 else track_id for track_id in detections.track_ids.tolist()]
+    if detections.corners is not None and not np.isnan(detections.corners).all():
+        columns["corners"] = [None if math.isnan(c[0][0]) else c for c in detections.corners.tolist()]
     whole = {"whole": True} if detections.whole else {}
     with path.open("w", encoding="utf-8") as file:
         for stamp, start, end in zip(detections.frame_stamps.tolist(), bounds[:-1], bounds[1:], strict=True):
@@ -99,18 +101,22 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
     unknown = [None] * len(boxes)
     depths = [_depth(depth) for depth in _list(frame, "depths", unknown)]
     track_ids = [_track_id(track_id) for track_id in _list(frame, "track_ids", unknown)]
+    corners = [_corners(four) for four in _list(frame, "corners", unknown)]
     if any(type(label) is not str for label in labels):
         raise Malformed("a label is not a string")
     if any(len(box) != 4 for box in boxes):
         raise Malformed("a box is not 4 numbers")
     if not len(boxes) == len(labels) == len(scores) == len(depths) == len(track_ids):
         raise Malformed("boxes, labels, scores, depths and track_ids differ in length")
+    if len(corners) != len(boxes):
+        raise Malformed("boxes and corners differ in length")
     whole = frame.get("whole", False)
     if type(whole) is not bool:
         raise Malformed("whole is neither true nor false")
     collector.add_frame(stamp, place)
-    for box, label, score, depth, track_id in zip(boxes, labels, scores, depths, track_ids, strict=True):
-        collector.add_box(box, label, score, place, depth, track_id)
+    columns = (boxes, labels, scores, depths, track_ids, corners)
+    for box, label, score, depth, track_id, four in zip(*columns, strict=True):
+        collector.add_box(box, label, score, place, depth, track_id, four)
     return whole
 
 
@@ -136,6 +142,17 @@ def _depth(value: Any) -> float:
         return math.nan
     (depth,) = read_numbers([value], "depths")
     return 0.0 if math.isnan(depth) else depth  # A NaN in the file is counted as an invalid depth, like zero.
+
+
+def _corners(value: Any) -> list[list[float]] | None:
+    if value is None:
+        return None
+    if type(value) is not list or len(value) != 4:
+        raise Malformed("corners must hold four points x, y each, and null only")
+    corners = [read_numbers(point, "a corner") for point in value]
+    if any(len(point) != 2 for point in corners):
+        raise Malformed("a corner is not 2 numbers")
+    return corners
 
 
 def _track_id(value: Any) -> int:

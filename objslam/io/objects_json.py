@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
+from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
@@ -107,8 +107,23 @@ def _entry(o: MapObject) -> dict[str, Any]:
     if o.life is not None:
         moved = o.life.moved_from
         entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
+    if o.tag is not None:
+        entry["tag"] = _tag_entry(o.tag)
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
+    return entry
+
+
+def _tag_entry(tag: TagPose) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "rotation_xyzw": tag.xyzw.tolist(),
+        "rotation_covariance": tag.covariance.tolist(),
+        "size": tag.size,
+        "size_sigma": tag.size_sigma,
+    }
+    if tag.other_xyzw is not None:
+        entry["other_rotation_xyzw"] = tag.other_xyzw.tolist()
+        entry["other_probability"] = tag.other_probability
     return entry
 
 
@@ -210,6 +225,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
         seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
+        tag=None if entry.get("tag") is None else _tag(entry["tag"]),
     )
 
 
@@ -223,6 +239,34 @@ def _seen_from(value: Any) -> SeenFrom:
     if not (np.abs(np.linalg.norm(sides, axis=1) - 1) < _UNIT).all():
         raise _Malformed("a side of seen_from must have the length 1")
     return SeenFrom(near, far, sides)
+
+
+def _tag(value: Any) -> TagPose:
+    if not isinstance(value, dict):
+        raise _Malformed("tag must be a mapping")
+    rows = value.get("rotation_covariance")
+    if not isinstance(rows, list) or len(rows) != 3:
+        raise _Malformed("tag.rotation_covariance must be 3 rows of 3 numbers")
+    covariance = np.stack([_vector(row, "a row of tag.rotation_covariance") for row in rows])
+    if (fault := covariance_fault(covariance)) is not None:
+        raise _Malformed(f"tag.rotation_covariance {fault}")
+    size, sigma = (_number(value.get(name), f"tag.{name}") for name in ("size", "size_sigma"))
+    if not (0 < size < MAX_POSITION and 0 <= sigma < MAX_POSITION):
+        raise _Malformed("tag.size must be above 0 m, and tag.size_sigma not below")
+    rotation, other, probability = _quaternion(value.get("rotation_xyzw"), "tag.rotation_xyzw"), None, 0.0
+    if value.get("other_rotation_xyzw") is not None:
+        other = _quaternion(value["other_rotation_xyzw"], "tag.other_rotation_xyzw")
+        probability = _number(value.get("other_probability"), "tag.other_probability")
+        if not 0 <= probability <= 1:
+            raise _Malformed("tag.other_probability must be from 0 to 1")
+    return TagPose(rotation, covariance, size, sigma, other, probability)
+
+
+def _quaternion(value: Any, name: str) -> Floats:
+    xyzw = _vector(value, name, 4)
+    if not abs(float(np.linalg.norm(xyzw)) - 1) < _UNIT:
+        raise _Malformed(f"{name} must have the length 1")
+    return xyzw
 
 
 def _life(value: Any) -> Life:

@@ -116,11 +116,15 @@ def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
-    """Return the used rays of objects with a position, if their boxes show a size."""
+    """Return the used rays of objects with a position, if their boxes show a size.
+
+    Fiducials whose corners were used have none: their position does not come from boxes.
+    """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0) & sees_size)
+    placed[list(estimate.tags)] = False
     which = which[placed[association.object[which]]]
     rays, landmark = solution.rays.take(which), association.object[which]
     origin, direction = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)

@@ -108,6 +108,7 @@ def describe(
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
+                tag=estimate.tags.get(j) if known else None,
             )
         )
     return ObjectMap(tuple(objects)), residual

@@ -86,8 +86,9 @@ def localize(
     told["matches"] = [
         {"id": known.objects[k].id, "label": known.objects[k].label, "drive": i} for i, k in found.matches.tolist()
     ]
-    estimate = replace(solution.estimate, map_T_base=solved.map_T_base, positions=solved.seen)
     at = solved.map_T_drive
+    tags = {j: tag.turned(at[:3, :3], float(sigma[3])) for j, tag in solution.estimate.tags.items()}
+    estimate = replace(solution.estimate, map_T_base=solved.map_T_base, positions=solved.seen, tags=tags)
     moved = replace(
         solution,
         keyframes=replace(solution.keyframes, map_T_base=at @ solution.keyframes.map_T_base),

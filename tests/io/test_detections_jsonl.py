@@ -88,6 +88,23 @@ def test_whole_is_kept_and_holds_where_every_frame_says_so(tmp_path):
     assert not read_detections(file, Ledger()).whole
 
 
+def test_corners_are_read_back_and_those_of_no_square_are_unknown(tmp_path):
+    square, bow_tie = [[1, 1], [9, 2], [8.5, 9], [1, 8]], [[1, 1], [9, 9], [9, 1], [1, 9]]
+    frame = {"stamp": 1.0, "boxes": [[0, 0, 9, 9]] * 4, "labels": ["tag_1"] * 4, "scores": [1, 1, 1, 1]}
+    corners = [square, None, bow_tie, square[::-1]]
+    detections, ledger, _ = _read(tmp_path, frame | {"corners": corners})
+    assert ledger.dropped == {"corners that are not those of a square (taken as unknown)": 1}
+    assert np.isnan(detections.corners[1:3]).all()
+    assert detections.corners[0].tolist() == square
+    assert detections.corners[3].tolist() == square[::-1]
+    file = tmp_path / "again.jsonl"
+    write_detections(detections, file)
+    np.testing.assert_array_equal(read_detections(file, Ledger()).corners, detections.corners, strict=True)
+    assert detections.take(np.array([0, 3])).corners.shape == (2, 4, 2)
+    write_detections(detections.take(np.array([1])), file)
+    assert "corners" not in file.read_text()
+
+
 def test_a_frame_as_the_format_describes_it(tmp_path):
     frame = {"stamp": 12.5, "boxes": [[1, 2, 30, 40], [5, 6, 7, 8.5]], "labels": ["cup", "Tür"], "scores": [0.9, 1]}
     detections, ledger, _ = _read(tmp_path, "# comment", frame | {"depths": [1.2, None], "track_ids": [None, 3], "more": 1})
@@ -135,6 +152,10 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         (_GOOD | {"depths": None}, "depths is missing or not a list"),
         (_GOOD | {"depths": ["1.2"]}, "depths must hold numbers only"),
         (_GOOD | {"track_ids": [1, 2]}, "boxes, labels, scores, depths and track_ids differ in length"),
+        (_GOOD | {"corners": []}, "boxes and corners differ in length"),
+        (_GOOD | {"corners": [[[1, 2], [3, 4], [5, 6]]]}, "corners must hold four points x, y each, and null only"),
+        (_GOOD | {"corners": [[1, 2, 3, 4]]}, "a corner must hold numbers only"),
+        (_GOOD | {"corners": [[[1], [2], [3], [4]]]}, "a corner is not 2 numbers"),
         (_GOOD | {"track_ids": [1.5]}, "track_ids must hold integers and null only"),
         (_GOOD | {"track_ids": [2**63]}, "track_ids must hold integers and null only"),
         (

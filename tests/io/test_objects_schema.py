@@ -9,15 +9,24 @@ import jsonschema
 import numpy as np
 import pytest
 
-from objslam.core.object_map import Life, MapObject, ObjectMap, SeenFrom
+from objslam.core.object_map import Life, MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.errors import OutputError
 from objslam.io.objects_json import dump_objects, parse_objects
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[2] / "docs" / "objects.schema.json").read_text("utf-8"))
 PLAIN = MapObject(0, "cup", np.array([1.0, 2.0, 0.5]), np.eye(3) * 1e-4, "ok", 9, 8, 40.0, 0.3, 0.0, 1.0)
 LIFE = Life("moved", 0.9, 3, 2, 120, 40, 86_400.0, np.array([0.0, 1.0, 0.5]))
+TURNS = np.array([[0.0, 0.6, 0.0, 0.8], [0.0, 0.0, 1.0, 0.0]])
+TAG = TagPose(TURNS[0], np.diag([0.01, 0.02, 0.001]), 0.16, 0.002, TURNS[1], 0.25)
 FULL = replace(
-    PLAIN, id=1, extent=(0.1, 0.2), labels={"cup": 1.0}, existence=0.9, seen_from=SeenFrom(0.5, 3.0, np.eye(3)), life=LIFE
+    PLAIN,
+    id=1,
+    extent=(0.1, 0.2),
+    labels={"cup": 1.0},
+    existence=0.9,
+    seen_from=SeenFrom(0.5, 3.0, np.eye(3)),
+    life=LIFE,
+    tag=TAG,
 )
 LOST = replace(
     PLAIN, id=2, status="unresolved", covariance=None, position=np.full(3, np.nan), ray=(np.zeros(3), np.eye(3)[0])
@@ -38,6 +47,11 @@ def test_what_is_written_fits_the_schema_and_is_read_back(objects):
     for one, other in zip((*objects, *objects.gone), (*back, *back.gone), strict=True):
         assert (one.seen_from is None) == (other.seen_from is None)
         assert (one.life is None) == (other.life is None)
+        assert (one.tag is None) == (other.tag is None)
+        if one.tag is not None and other.tag is not None:
+            np.testing.assert_array_equal(other.tag.rotation, one.tag.rotation)
+            np.testing.assert_array_equal(other.tag.other, one.tag.other)
+            assert (other.tag.size, other.tag.size_sigma, other.tag.other_probability) == (0.16, 0.002, 0.25)
 
 
 def test_format_1_is_read():
@@ -58,6 +72,13 @@ WRONG = [
     (("objects", 1, "seen_from"), [1.0, 2.0]),
     (("objects", 1, "seen_from", "near"), -1.0),
     (("objects", 1, "seen_from", "sides"), [[1.0, 0.0]]),
+    (("objects", 1, "tag"), [1.0]),
+    (("objects", 1, "tag", "rotation_xyzw"), [0.0, 0.0, 1.0]),
+    (("objects", 1, "tag", "rotation_covariance"), [[1.0]]),
+    (("objects", 1, "tag", "size"), 0.0),
+    (("objects", 1, "tag", "size_sigma"), -1.0),
+    (("objects", 1, "tag", "other_rotation_xyzw"), "up"),
+    (("objects", 1, "tag", "other_probability"), 2.0),
     (("objects", 1, "life"), "long"),
     (("objects", 1, "life", "state"), "dead"),
     (("objects", 1, "life", "probability"), 1.5),

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from small_log import small_log
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
@@ -247,3 +248,12 @@ def test_small_errors_widen_the_covariances_to_the_true_errors(name):
     estimated = sigmas_off()
     assert np.median(estimated) < 1.5
     assert (estimated < 3).mean() > 0.85
+
+
+def test_what_a_run_corrects_itself_is_no_reason_to_warn():
+    """A short lap around the things. Another clock fits a little better, and with it a camera that is 1.7 m aside."""
+    truth = simulate(preset("demo", objects=12), 50).truth
+    things = tuple((o.label, tuple(o.position)) for o in truth.objects)
+    found = diagnose(small_log(0, placed=things, frames=120), load_settings(None, ("mode=fixed",)))
+    assert not found.findings
+    assert found.errors is None

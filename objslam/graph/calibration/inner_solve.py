@@ -10,9 +10,9 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem
-from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.outlier_rejection import supported
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.variables import read_poses, with_points
 
 _INNER = 3
 """The most steps of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
@@ -73,8 +73,7 @@ class InnerSolve(Linearised):
     def _damped(self) -> Self:
         """Return the state after iterations of Levenberg-Marquardt. Steps of Gauss-Newton do not lower the cost."""
         landmarks = self.landmarks
-        graph = build_graph(self.measured.factors(self.association.object, self.which, landmarks, self.positions))
-        values = make_values(self.map_T_camera, self.positions, landmarks)
+        graph, values = self.measured.whole(self.association.object, self.used, self.map_T_camera, self.positions)
         found = levenberg_marquardt(graph, values, _INNER, _TOLERANCE).values
         return replace(self, map_T_camera=read_poses(found), positions=with_points(self.positions, landmarks, found))
 

@@ -180,6 +180,7 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
     range_ = graph.rays.range[ranged]
     range_root, _ = graph.range_roots(np.linalg.norm(to_landmark[ranged], axis=1))
     moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[steps]
+    motion_weight, _ = graph.motion_weights(map_T_camera)
     floor = of.measured.settings.odometry.floor_xy
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
     absolute = map_T_camera[: len(absolute_root)]
@@ -198,7 +199,7 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
 
     def motions(motion: Floats, way: Floats) -> Floats:
         off = log_se3(inverse(motion) @ moved) / np.repeat([1.0, float(way)], 3)
-        return np.einsum("kij,kj->ki", graph.motion_roots, off)
+        return motion_weight[:, None] * np.einsum("kij,kj->ki", graph.motion_roots, off)
 
     def poses(measured: Floats) -> Floats:
         return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
@@ -231,7 +232,9 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
     which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
         return sides
-    keyframes, steps, root = of.measured.keyframes, of.graph.steps, of.graph.motion_roots
+    keyframes, steps = of.measured.keyframes, of.graph.steps
+    robust, _ = of.graph.motion_weights(of.map_T_camera)
+    root = robust[:, None, None] * of.graph.motion_roots
     covariance = of.measured.odometry()[1][steps]
     to_base = adjoint(keyframes.base_T_camera[1:][steps])
     seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
@@ -239,7 +242,7 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
     near = from_neighbours(in_base.reshape(-1, 36), seconds).reshape(-1, 6, 6)
     size = np.einsum("kii->k", near) / np.einsum("kii->k", in_base)
     near = np.where(((size > 1 / _ALIKE) & (size < _ALIKE))[:, None, None], near, in_base)
-    weight = np.swapaxes(to_base, 1, 2) @ np.linalg.inv(near) @ to_base
+    weight = robust[:, None, None] ** 2 * (np.swapaxes(to_base, 1, 2) @ np.linalg.inv(near) @ to_base)
     instruments = sides.copy()
     for k in which:
         own = (to_base @ np.linalg.solve(root, sides[motions, k].reshape(-1, 6, 1)))[..., 0]

@@ -119,7 +119,10 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     to_landmark = of.positions[of.association.object[of.which]] - origins
     off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
     second = np.floor(np.maximum.accumulate(keyframes.stamps) / TOGETHER).astype(np.int64)
-    pair = np.column_stack([of.association.object[of.which], second[rays.keyframe]])
+    owner = of.association.object[of.which]
+    if of.measured.tags is not None:  # The corners of a fiducial may err together.
+        owner = of.measured.tags.object_of_landmark()[owner]
+    pair = np.column_stack([owner, second[rays.keyframe]])
     to_camera = adjoint(inverse(keyframes.base_T_camera[1:][steps]))
     return _Rows(
         bearing_axes=_azimuth_elevation(rays.direction, keyframes.base_T_camera[rays.keyframe]),
@@ -281,8 +284,22 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     if by_neighbours > _LEAST_TOLD * ways:
         force -= product(told, solved - said) * ways / by_neighbours
     ranged = np.isfinite(rays.range)
-    lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum())
+    lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum()) + _of_tags(of)
     return max(force, 0.0), max(lengths, 1.0)
+
+
+def _of_tags(of: Linearised) -> float:
+    """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
+
+    A view of angular diagonal d (rad) tells the distance by its four corners, half a diagonal from the centre each.
+    """
+    tags = of.measured.tags
+    if tags is None:
+        return 0.0
+    seen = tags.seen(of.measured.rays, of.map_T_camera)
+    across = np.linalg.norm(seen.direction[:, 2] - seen.direction[:, 0], axis=1)
+    known = np.isfinite(tags.side)[seen.square]
+    return float(((across[known] / seen.sigma[known]) ** 2).sum())
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:

@@ -19,13 +19,16 @@ from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.bearing import EQ1_SIGMA, ray_jacobians, ray_residuals, residual_axes
 from objslam.graph.factors.localization import localization_covariance
+from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
+from objslam.graph.least_squares.square_rows import SquareRows
 
 
 @dataclass(frozen=True)
 class JointRows:
-    """A graph at some values: M rows in the order of `Measurements.factors`. The robust weights are in the rows.
+    """A graph at some values: M rows in the order of `Measurements.factors`, then twelve for each fiducial with corners.
 
+    The robust weights are in the rows.
     jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. residual: (M,) whitened.
     cost: half the sum of the squared residuals, with the robust losses.
     """
@@ -40,20 +43,22 @@ class JointGraph:
     """The measurements of a joint solve with Huber's loss.
 
     rays: the n rays in the graph. landmark: (n,) the row of each ray's landmark in `weak`. weak: (m, 3) m, the means of the
-    landmarks' weak priors.
+    landmarks' weak priors. squares: fiducials, whose corners are landmarks.
     """
 
     measured: Measurements
     rays: Rays
     landmark: Ints
     weak: Floats
+    squares: SquareRows
 
     @classmethod
     def of(cls, measured: Measurements, association: Association, used: Bools, positions: Floats) -> Self:
         """Make the graph of the rays `used` (R,). Landmarks without a position (N, 3) are not in it."""
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         landmark = np.searchsorted(landmarks, association.object[which])
-        return cls(measured, measured.rays.take(which), landmark, positions[landmarks])
+        squares = SquareRows.of(measured.tags, landmarks)
+        return cls(measured, measured.rays.take(which), landmark, positions[landmarks], squares)
 
     @cached_property
     def ranged(self) -> Ints:
@@ -115,6 +120,7 @@ class JointGraph:
             np.arange(first_pose)[:, None],
             np.repeat(moved, 6, axis=0),
             np.repeat(absolute, 6, axis=0),
+            np.repeat(self.squares.columns, 12, axis=0),
         )
         lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
         columns = np.concatenate([part.ravel() for part in parts])
@@ -174,30 +180,48 @@ class JointGraph:
         ray = np.concatenate([np.repeat(np.arange(len(rays)), 2), ranged])
         on_landmark = (map_T_camera[rays.keyframe, :3, :3][ray] @ by_seen[..., None])[..., 0]
         seen_rows = np.hstack([on_landmark, np.cross(by_seen, seen[ray]), -by_seen])
-        way, move_rows = self._motion_rows(map_T_camera)
+        way, move_rows, move_cost = self._motion_rows(map_T_camera)
+        bent, by_corner = self.squares.rows(landmarks)
         apart, absolute_roots, absolute_cost = self.absolute_roots(map_T_camera)
         held = (absolute_roots @ apart[..., None]).ravel()
         weak = (landmarks - self.weak).ravel() / self.measured.settings.joint.prior_sigma
         by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
         by_absolute = (absolute_roots @ _by_end(apart)).ravel()
-        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute])
+        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, by_corner.ravel()])
         columns, first = self._pattern
         jacobian = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=(len(first) - 1, len(self.blocks)))
         jacobian.eliminate_zeros()  # On a plane, half of the entries are zero.
         past = range_root * (distance - rays.range[ranged])
-        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held])
-        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + (weak @ weak + way @ way) / 2
+        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held, bent.ravel()])
+        squared = (weak @ weak + (bent**2).sum()) / 2
+        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + move_cost.sum() + squared
         return JointRows(jacobian, residual, float(cost))
 
-    def _motion_rows(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
-        """Return the residuals (6 s,) of the motions, and their derivatives (s, 6, 12) by the poses before and after."""
+    def motion_weights(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
+        """Return the roots (s,) of the weights of motions, and their costs (s,).
+
+        A motion that fiducials measure too has Cauchy's loss. The others have none.
+        """
         if not len(self.steps):
-            return np.zeros(0), np.zeros((0, 6, 12))
+            return np.zeros(0), np.zeros(0)
         moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[self.steps]
         off = log_se3(inverse(self.measured.odometry()[0][self.steps]) @ moved)
-        after = self.motion_roots @ _by_end(off)
+        square = ((self.motion_roots @ off[..., None])[..., 0] ** 2).sum(axis=1)
+        robust, ratio = self.measured.seen_twice[self.steps], square / JUMP**2
+        return np.where(robust, 1 / np.sqrt(1 + ratio), 1.0), np.where(robust, JUMP**2 * np.log1p(ratio), square) / 2
+
+    def _motion_rows(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the residuals (6 s,) of the motions, their derivatives (s, 6, 12) by the poses before and after, and their
+        costs (s,)."""
+        if not len(self.steps):
+            return np.zeros(0), np.zeros((0, 6, 12)), np.zeros(0)
+        moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[self.steps]
+        off = log_se3(inverse(self.measured.odometry()[0][self.steps]) @ moved)
+        weight, cost = self.motion_weights(map_T_camera)
+        roots = weight[:, None, None] * self.motion_roots
+        after = roots @ _by_end(off)
         before = -after @ adjoint(inverse(moved))
-        return (self.motion_roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2)
+        return (roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2), cost
 
 
 def from_origins(rays: Rays, seen: Floats) -> Floats:

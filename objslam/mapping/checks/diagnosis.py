@@ -46,7 +46,7 @@ _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
 _GAIN_MOVED = 0.03
 """The least growth of the score if each half has its own camera rotation. A larger value reports fewer moved cameras."""
 _GAIN = 0.02
-"""The least growth of the score if small errors are removed. A larger value reports fewer errors."""
+"""The least growth of the score if the errors that the run does not estimate are removed. A larger value reports fewer."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,12 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     errors = replace(errors, estimated=frozenset(possible(part.log, settings) if estimated else ()))
     if not errors.harmful:
         return None
-    after = agreement(part, errors.corrected(part.log), settings)
-    return errors if after is not None and after.score > found.score + _GAIN else None
+    # What the run corrects itself is no reason for a warning. Only what the harmful errors explain beyond it counts.
+    before, after = (
+        agreement(part, log, settings) for log in (errors.corrected(part.log, errors.estimated), errors.corrected(part.log))
+    )
+    least = found.score if before is None else max(found.score, before.score)
+    return errors if after is not None and after.score > least + _GAIN else None
 
 
 def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:

@@ -3,6 +3,7 @@
 The points of an `Agreement` move with the errors. Errors are added one by one. The error that explains most comes first.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,11 +66,12 @@ class SmallErrors:
         named = zip(self.names, self.values.tolist(), strict=True)
         return tuple(n for n, v in named if abs(v) > _HARMFUL[kind(n)] and n not in self.estimated)
 
-    def corrected(self, log: Log) -> Log:
-        """Return a log without the errors."""
+    def corrected(self, log: Log, only: Collection[str] | None = None) -> Log:
+        """Return a log without the errors, or without `only` those of these names."""
         every = np.zeros(len(self.errors.names))
         for name, value in zip(self.names, self.values.tolist(), strict=True):
-            every[self.errors.names.index(name)] = value
+            if only is None or name in only:
+                every[self.errors.names.index(name)] = value
         return shared(log, self.errors.keyframes, self.errors.rays, self.errors.settings).corrected_log(every)
 
     def in_words(self) -> str:

@@ -76,6 +76,35 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
     return lives
 
 
+def joined(old: Life, new: Life) -> Life:
+    """Return the life of an object that two sites have, the sessions of one before those of the other.
+
+    The later site began with an object of which nothing was known (`UNPROVEN`). What its sessions say of the object goes on
+    from what the earlier site knew, after the first of them found it.
+    """
+    days = np.array([max(new.updated - old.updated, 0.0) / _DAY])
+    one, none = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
+    met = float(persistence(np.array([old.probability]), days, one, none, none, none)[0])
+    odds = _odds(new.probability) * _odds(met) / _odds(UNPROVEN)
+    probability = odds / (1 + odds)
+    state: Fate = "gone" if probability < GONE else "moved" if new.state == "moved" else "confirmed"
+    return Life(
+        state,
+        probability,
+        old.sessions_expected + new.sessions_expected,
+        old.sessions_seen + new.sessions_seen,
+        old.looks + new.looks,
+        old.detections + new.detections,
+        new.updated,
+        old.moved_from if new.moved_from is None else new.moved_from,
+    )
+
+
+def _odds(probability: float) -> float:
+    p = min(max(probability, 1e-9), 1 - 1e-9)  # The limits of `persistence`.
+    return p / (1 - p)
+
+
 def _fate(life: Life, probability: float, found: bool) -> Fate:
     if probability < GONE:
         return "gone"

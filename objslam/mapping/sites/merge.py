@@ -14,8 +14,8 @@ from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse
-from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
-from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, may_be_one
+from objslam.core.object_map import MapObject, ObjectMap, SeenFrom, TagPose
+from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
 from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
@@ -51,7 +51,7 @@ def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
 
     The sessions are in the order of time, and the first of an island gives its frame. Sessions whose registrations are all
     refused stay alone. A site among the sessions brings the life of its objects, so that adding a session to it costs what
-    that session costs.
+    that session costs. Two sites are joined in the same way: what the later one lacks lives through its `visits`.
     """
     edges = {
         (a, b): found
@@ -166,20 +166,41 @@ def _live(
             if turn == 0 or here[at].life is not None:
                 tracks[at].number = here[at].id
         site = any(item.life is not None for item in here.values())
-        begun += fresh
-        some = [at for at in begun if not (site and at in fresh and tracks[at].life is not None)]
-        back = inverse(solved.site_T_map[number])
+        if site:
+            _join_lives(tracks, begun, here)
         for at in fresh:
             tracks[at].item = _in_site(here[at], None, solved.site_T_map[number])
-        looks = session.looks(tuple(tracks[at].item for at in some), solved.positions[some], back)
+        back = inverse(solved.site_T_map[number])
+        missed = [at for at in begun if at not in here]
+        begun += fresh
+        some = begun if not site else [at for at in fresh if tracks[at].life is None]
+        _visit(tracks, some, here, session, solved.positions, back)
+        if site and missed:
+            for visit in session.visits():
+                _visit(tracks, missed, {}, visit.session, solved.positions, visit.session_T_site @ back)
         for at, item in here.items():
             tracks[at].item, tracks[at].met = _in_site(item, tracks[at].item, solved.site_T_map[number]), turn
-        found = np.array([at in here for at in some], dtype=bool)
-        lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
-        for at, life in zip(some, lives, strict=True):
-            tracks[at].life = life
-        begun = _follow(tracks, begun, solved.positions)
+        begun = _follow(tracks, begun, solved.positions, fresh if site and turn else ())
     return begun
+
+
+def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
+    """Give the tracks that a site also has the lives that both say together."""
+    for at in begun:
+        old, new = tracks[at].life, here[at].life if at in here else None
+        if old is not None and new is not None:
+            tracks[at].life = joined(old, new)
+
+
+def _visit(
+    tracks: list[Track], some: list[int], here: dict[int, MapObject], session: Session, positions: Floats, back: Floats
+) -> None:
+    """Let some tracks live through one session. here: the objects that it found, by track. back: session_T_site."""
+    looks = session.looks(tuple(tracks[at].item for at in some), positions[some], back)
+    found = np.array([at in here for at in some], dtype=bool)
+    lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
+    for at, life in zip(some, lives, strict=True):
+        tracks[at].life = life
 
 
 def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) -> MapObject:
@@ -193,18 +214,22 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
     return replace(item, life=None, seen_from=seen)
 
 
-def _follow(tracks: list[Track], begun: list[int], positions: Floats) -> list[int]:
-    """Give an object that moved the number of the one that is gone. Return the tracks that are left."""
+def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
+    """Give an object that moved the number of the one that is gone. Return the tracks that are left.
+
+    came: the tracks that a later site brought. However often it saw them, they are new to the sessions before.
+    """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}
     old = [at for at, life in lives.items() if life.state == "gone"]
-    young = [at for at, life in lives.items() if life.state != "gone" and life.sessions_seen <= _YOUNG]
+    young = [at for at, life in lives.items() if life.state != "gone" and (life.sessions_seen <= _YOUNG or at in came)]
     left = list(begun)
     for at in old:
         may = [k for k in young if _later(tracks[k], tracks[at]) and may_be_one(tracks[at].item, tracks[k].item)]
         if not may:
             continue
         now = min(may, key=lambda k: float(np.linalg.norm(positions[k] - positions[at])))
-        tracks[now].life = replace(lives[now], state="moved", moved_from=positions[at])
+        state = "moved" if lives[now].sessions_seen <= _YOUNG else lives[now].state
+        tracks[now].life = replace(lives[now], state=state, moved_from=positions[at])
         if tracks[at].number is not None:
             tracks[now].number = tracks[at].number
         left.remove(at)
@@ -240,6 +265,7 @@ def _objects(
             first_seen=min(o.first_seen for _, _, o in of),
             last_seen=max(o.last_seen for _, _, o in of),
             life=track.life,
+            tag=_best_tag(solved, of),
         )
         item = replace(item, label=max(item.labels, key=lambda n: (item.labels or {})[n]) if item.labels else item.label)
         if track.life.probability >= GONE:
@@ -257,6 +283,12 @@ def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, Ma
     best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
     rotation = solved.site_T_map[best[1], :3, :3]
     return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
+
+
+def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:
+    """Return the rotation and size of a fiducial by the session that knew its rotation best, None for another object."""
+    best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
+    return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])
 
 
 def _labels(items: list[MapObject]) -> dict[str, float] | None:

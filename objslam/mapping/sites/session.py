@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -26,12 +27,14 @@ take the wrong frame of a fast camera."""
 @dataclass(frozen=True)
 class Session:
     """A map in a frame of its own. name: how messages call it. views, rays: what a result folder says of its drive, None for
-    a map alone, which does not say what was in view."""
+    a map alone, which does not say what was in view. visits: returns the sessions of a site, in the order of time; none
+    where the site does not say, and its sessions then count no miss."""
 
     name: str
     objects: ObjectMap
     views: Views | None = None
     rays: RaysTable | None = None
+    visits: Callable[[], tuple[Visit, ...]] = tuple
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -72,6 +75,14 @@ class Session:
         obs, distance = _boxes(self.rays, self.objects, views)
         looks[known] = count_looks(here, extent, seen, frames, obs, distance)
         return looks
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A session of a site. session_T_site: (4, 4), the inverse of its pose in the frame of the site."""
+
+    session: Session
+    session_T_site: Floats
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:

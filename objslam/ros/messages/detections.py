@@ -24,6 +24,7 @@ class Found(NamedTuple):
     score: float
     track: str = ""  # The track name may be empty.
     points: Floats | None = None  # Centre and corners (5, 3) of a tag, m, in the camera frame. None if `box` is known.
+    corners: list[list[float]] | None = None  # The four corners x, y of a tag, px, in the order of the message.
 
 
 def find_boxes(type_: str, message: Any) -> Iterator[Found]:
@@ -84,16 +85,19 @@ def tag_boxes(message: Any) -> Iterator[Found]:
     """
     for tag in message.apriltags if hasattr(message, "apriltags") else message.detections:
         if hasattr(tag, "corners"):
-            yield Found(_box_around(tag.corners), f"tag_{int(tag.id)}", 1.0)
+            corners = _corners(tag.corners)
+            yield Found(_box_around(corners), f"tag_{int(tag.id)}", 1.0, corners=corners)
         elif len(tag.id) == 1:
             yield Found(_UNKNOWN, f"tag_{int(tag.id[0])}", 1.0, points=_tag_points(tag.pose.pose.pose, float(tag.size[0])))
 
 
-def _box_around(tag_corners: Any) -> list[float]:
-    if hasattr(tag_corners[0], "x"):
-        corners = [(float(corner.x), float(corner.y)) for corner in tag_corners]
-    else:
-        corners = [(float(tag_corners[i]), float(tag_corners[i + 1])) for i in range(0, 8, 2)]
+def _corners(corners: Any) -> list[list[float]]:
+    if hasattr(corners[0], "x"):
+        return [[float(corner.x), float(corner.y)] for corner in corners]
+    return [[float(corners[i]), float(corners[i + 1])] for i in range(0, 8, 2)]
+
+
+def _box_around(corners: list[list[float]]) -> list[float]:
     (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners
     ux, uy, vx, vy = cx - ax, cy - ay, dx - bx, dy - by
     cross = ux * vy - uy * vx

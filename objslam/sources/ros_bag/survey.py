@@ -183,7 +183,8 @@ def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: st
     _note_header(connection, topic, data)
     place = f"{topic.name} at {logged / 1e9:.3f} s"
     topic.boxes.add_frame(logged / 1e9, place)
-    for box, name, score, track, points in found:
+    for box, name, score, track, points, corners in found:
         if points is not None:
             topic.points[len(topic.boxes.boxes)] = points
-        topic.boxes.add_box(box, name or label, score, place, track_id=track_number(track, topic.tracks))
+        track_id = track_number(track, topic.tracks)
+        topic.boxes.add_box(box, name or label, score, place, track_id=track_id, corners=corners)

@@ -72,6 +72,7 @@ def test_the_centre_of_a_tag_is_the_image_of_its_centre(seed):
     assert (corners <= [x2 + 1e-9, y2 + 1e-9]).all()
     assert np.isclose(corners.max(axis=0), [x2, y2]).any() or np.isclose(corners.min(axis=0), [x1, y1]).any()
     assert (found.label, found.score) == ("tag_12", 1.0)
+    np.testing.assert_array_equal(found.corners, corners)
 
 
 _MAKER = Maker("4")

@@ -1,0 +1,29 @@
+"""The settings of square fiducials (AprilTag, ArUco)."""
+
+from pydantic import Field
+
+from objslam.config.section import Positive, Section
+
+
+class Tags(Section):
+    """Configure fiducials whose four corners are known. Each becomes a landmark with a position and a rotation."""
+
+    use: bool = True
+    """Use the corners. false: a fiducial is a point where its diagonals meet, as other objects are."""
+    size: Positive | None = None
+    """Side in m of every fiducial, from corner to corner as the detector reports them. It gives the map its scale. null: the
+    size of each fiducial is estimated, in the scale that the poses have."""
+    sizes: dict[int | str, Positive | None] = Field(default_factory=dict)
+    """Sides in m of single fiducials, instead of `size`. A key is the number in the label (12 for tag_12) or a whole label.
+    null: the size of this one is estimated."""
+    corner_sigma: Positive = 1.0
+    """Standard deviation of a corner per axis in px. A detector finds corners better than that. The rest is what the
+    calibration of a lens leaves. Where the noise of rays is estimated, it has the same factor."""
+
+    def size_of(self, label: str) -> float | None:
+        """Return the side (m) of the fiducial with a label, None if it is not known."""
+        number = label.rpartition("_")[2]
+        for key in (label, number, int(number) if number.isascii() and number.isdigit() and len(number) < 10 else number):
+            if key in self.sizes:
+                return self.sizes[key]
+        return self.size

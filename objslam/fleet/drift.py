@@ -1,0 +1,70 @@
+"""How the calibration of each robot drifts over the days: one curve for each robot and shared error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.fleet.driver import Mapped
+
+_MOST = 24
+"""The most curves of a page. A larger number shows robots whose calibration changes less."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The weighted mean of one shared error of one robot on each day.
+
+    days: their names, in order. value, sigma: (D,) in `unit`. change: of the last day from the first, in
+    standard deviations.
+    """
+
+    robot: str
+    name: str
+    unit: str
+    days: tuple[str, ...]
+    value: Floats
+    sigma: Floats
+    change: float
+
+    def curve(self, width: float, height: float) -> tuple[str, list[tuple[float, float, float, str]], float, float]:
+        """Return the path of an SVG of this size, its points (x, y, half the bar, text), and the limits of its axis."""
+        low, high = float((self.value - self.sigma).min()), float((self.value + self.sigma).max())
+        span = max(high - low, 1e-12)
+        x = np.linspace(0, width, len(self.days)) if len(self.days) > 1 else np.array([width / 2])
+        y = height - (self.value - low) / span * height
+        bar = self.sigma / span * height
+        texts = (
+            f"{day}: {v:.4g} ± {s:.2g} {self.unit}" for day, v, s in zip(self.days, self.value, self.sigma, strict=True)
+        )
+        points = list(zip(x.tolist(), y.tolist(), bar.tolist(), texts, strict=True))
+        path = "".join(f"{'L' if k else 'M'}{a:.2f} {b:.2f}" for k, (a, b, _, _) in enumerate(points))
+        return path, points, low, high
+
+
+def drifts(mapped: Sequence[Mapped]) -> list[Drift]:
+    """Return the curves of robots that drove on two days or more, the largest change first, at most `_MOST`.
+
+    Only values that a log determined count. The sessions of a day are averaged by their variances.
+    """
+    found: dict[tuple[str, str, str], dict[str, list[tuple[float, float]]]] = {}
+    for one in mapped:
+        for parameter in one.calibration if one.place.robot else ():
+            if parameter.known and parameter.sigma > 0:
+                days = found.setdefault((one.place.robot, parameter.name, parameter.unit), {})
+                days.setdefault(one.day, []).append((parameter.value, parameter.sigma))
+    curves = []
+    for (robot, name, unit), days in found.items():
+        if len(days) < 2:
+            continue
+        order = sorted(days)
+        weights = [np.array([sigma**-2 for _, sigma in days[day]]) for day in order]
+        value = np.array([np.average([v for v, _ in days[day]], weights=w) for day, w in zip(order, weights, strict=True)])
+        sigma = np.array([w.sum() ** -0.5 for w in weights])
+        change = float((value[-1] - value[0]) / np.hypot(sigma[0], sigma[-1]))
+        curves.append(Drift(robot, name, unit, tuple(order), value, sigma, change))
+    curves.sort(key=lambda one: (-abs(one.change), one.robot, one.name))
+    return curves[:_MOST]

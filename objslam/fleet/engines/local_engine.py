@@ -1,0 +1,109 @@
+"""The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
+
+An engine is a function of the work, as "module:function", and of the arguments. It never holds more than a bounded number of
+arguments and answers, so that a fleet of any size needs the memory of a small one.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from objslam.errors import ObjslamError, one_line
+from objslam.fleet.engines.worker import LimitError, Limits, LostError, Worker
+from objslam.fleet.stores.store import StoreError
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
+
+    kind: `memory`, `time`, `lost`, `store` or `error`, empty after a success.
+    """
+
+    argument: Any
+    value: Any
+    kind: str = ""
+    message: str = ""
+
+
+Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
+"""A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
+
+_QUEUED = 2
+"""How many arguments are prepared for each process. A larger number hides a slow source of arguments."""
+
+
+def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
+    """Run one task in a worker, and return its answer or its failure. Any engine calls this function beside its worker."""
+    try:
+        return Answer(argument, worker.call(work, argument, limits))
+    except LimitError as error:
+        return Answer(argument, None, error.kind, str(error))
+    except LostError as error:
+        return Answer(argument, None, "lost", str(error))
+    except StoreError as error:
+        return Answer(argument, None, "store", str(error))
+    except ObjslamError as error:
+        return Answer(argument, None, "error", str(error))
+    except MemoryError as error:
+        return Answer(argument, None, "memory", f"out of memory: {one_line(error)}")
+
+
+def local_engine(jobs: int, limits: Limits) -> Engine:
+    """Return the engine of this machine, with one process for each of `jobs` tasks at a time.
+
+    A thread waits for each process, and computes nothing.
+    """
+
+    def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:
+        own = threading.local()
+        with ExitStack() as stack:
+            pool = stack.enter_context(ThreadPoolExecutor(jobs, "objslam fleet"))
+            closing = stack.enter_context(ExitStack())  # It ends the processes before the pool waits for its threads.
+
+            def task(argument: Any) -> Answer:
+                if not hasattr(own, "worker"):
+                    own.worker = Worker()
+                    closing.callback(own.worker.close)
+                return attempt(own.worker, work, argument, limits)
+
+            try:
+                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs * _QUEUED)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    return run
+
+
+def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], most: int) -> Iterator[Answer]:
+    """Yield the answers of tasks, of which at most so many are submitted and not yet answered."""
+    left = iter(arguments)
+    running = {submit(argument) for argument in islice(left, most)}
+    while running:
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        for one in done:
+            running |= {submit(argument) for argument in islice(left, 1)}
+            yield one.result()
+
+
+def cores() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def memory_of_machine() -> int:
+    """Return the bytes of RAM of this machine, or of its container if that may use less."""
+    whole = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):  # There is no control group, or its limit is "max".
+        return whole

@@ -1,0 +1,121 @@
+"""The engine of a Ray cluster. Each task is a Ray Core task; its worker is a process of the node that runs it.
+
+Ray places the tasks and runs them again when a node is lost. Results go to the store by their names, never through Ray.
+"""
+
+from __future__ import annotations
+
+import atexit
+import socket
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from objslam.errors import ConfigError, ObjslamError, first_line
+from objslam.fleet.engines.local_engine import Answer, Engine, attempt
+from objslam.fleet.engines.worker import Limits, Worker
+
+_QUEUED = 2
+"""How many tasks are submitted for each CPU of the cluster. A larger number keeps more tasks ready, and loses none."""
+_PATIENT = 10.0
+"""How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
+_GB = 1e9
+
+_worker = Worker()
+"""The process that does the tasks of one process of Ray. It is kept, so that libraries are imported once."""
+atexit.register(_worker.close)
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A cluster that was joined. cpus, gpus: of all nodes. dashboard: the address of its own page, empty if it has none."""
+
+    cpus: float
+    gpus: float
+    dashboard: str
+
+
+def join_cluster(address: str) -> Cluster:
+    """Join the Ray cluster at an address, or with `auto` the one that runs here. It is never started.
+
+    ObjslamError if Ray is not installed, or if no cluster answers.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise ObjslamError("Ray is not installed", hint="pip install objslam[fleet]") from error
+    hint = "start one with ray start, or leave --ray out to use the processes of this machine"
+    host, mark, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        if mark and port.isdigit():  # Ray itself waits for minutes where nobody listens.
+            socket.create_connection((host.strip("[]"), int(port)), _PATIENT).close()
+        context = ray.init(address, log_to_driver=False, logging_level="ERROR")
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
+        raise ObjslamError(f"no Ray cluster answers: {first_line(error)}", where=address, hint=hint) from error
+    found = ray.cluster_resources()
+    return Cluster(found.get("CPU", 0.0), found.get("GPU", 0.0), str(getattr(context, "dashboard_url", "") or ""))
+
+
+def leave_cluster() -> None:
+    """Leave the cluster that `join_cluster` joined. It goes on."""
+    import ray
+
+    ray.shutdown()
+
+
+def ray_engine(limits: Limits, *, most: int, memory: int, gpus: float) -> Engine:
+    """Return the engine of the cluster that was joined. Each task takes one CPU.
+
+    most: the most tasks in flight, 0 for twice the CPUs of the cluster. memory: the bytes that each task reserves on its
+    node, 0 for none. gpus: the share of a GPU that each task takes. ConfigError if no node has as much.
+    """
+    import ray
+
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    wanted = {"CPU": 1.0, "memory": float(memory), "GPU": gpus}
+    if not any(all(node.get(name, 0.0) >= amount for name, amount in wanted.items()) for node in nodes):
+        asked = f"1 CPU, {memory / _GB:.1f} GB of memory and {gpus:g} GPU"
+        raise ConfigError(f"no node of the cluster has {asked} for a task", hint="change --memory, or add nodes")
+    options: dict[str, Any] = {"num_cpus": 1, "num_gpus": gpus, "max_retries": limits.retries}
+    if memory:
+        options["memory"] = memory
+    remote = ray.remote(**options)(_task)
+    cpus = sum(node.get("CPU", 0.0) for node in nodes)
+
+    def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:
+        left, running = iter(arguments), {}
+
+        def submit(count: int) -> None:
+            for argument in islice(left, count):
+                running[remote.remote(work, argument, limits)] = argument
+
+        submit(most or max(int(_QUEUED * cpus), 1))
+        try:
+            while running:
+                done, _ = ray.wait(list(running), num_returns=1)
+                argument = running.pop(done[0])
+                submit(1)
+                yield _answer(done[0], argument)
+        finally:
+            for reference in running:
+                ray.cancel(reference, force=True)
+
+    return run
+
+
+def _answer(reference: Any, argument: Any) -> Answer:
+    """Return the answer of a task of Ray, or that the cluster lost it in every try."""
+    import ray
+
+    try:
+        value, kind, message = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        return Answer(argument, None, "lost", f"the cluster lost the task: {first_line(error)}")
+    return Answer(argument, value, kind, message)
+
+
+def _task(work: str, argument: Any, limits: Limits) -> tuple[Any, str, str]:
+    """Run on a node: do one task in the process that belongs to this process of Ray."""
+    answer = attempt(_worker, work, argument, limits)
+    return answer.value, answer.kind, answer.message

@@ -1,0 +1,50 @@
+"""What all logs of a fleet have in common, from the settings of a user: with the files that the settings name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from objslam.config import is_file
+from objslam.fleet.keys import file_content, hash_settings, key_of
+from objslam.fleet.stores.open_store import is_remote, open_store
+from objslam.fleet.tasks.map_task import Job
+
+if TYPE_CHECKING:
+    from objslam.config import Settings
+    from objslam.sources import SourceOptions
+
+_INPUTS = "inputs"
+"""The folder of the files that settings name, in a store that is no folder of this machine."""
+
+
+def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:
+    """Return the job of a fleet. Workers of other machines get the files of the settings through the store.
+
+    ConfigError if a file cannot be read, StoreError if the store refuses.
+    """
+    files: dict[str, Path] = {}
+    if settings.calibration.file is not None:
+        files["calibration.file"] = Path(settings.calibration.file)
+    names = settings.detector.names
+    if isinstance(names, str):
+        beside = [] if detector is None else [detector.parent / names]
+        found = next((file for file in (Path(names), *beside) if is_file(file)), None)
+        if found is not None:
+            files["detector.names"] = found
+    if detector is not None:
+        files["detector"] = detector
+    content = {key: file_content(file) for key, file in files.items()}
+    url = store if is_remote(store) else open_store(store).url
+    placed = tuple((key, _placed(url, file, content[key])) for key, file in files.items())
+    digest = key_of(hash_settings(settings, options, content), "report" if report else "")
+    return Job(url, settings, options, digest, placed, report)
+
+
+def _placed(store: str, file: Path, content: bytes) -> str:
+    """Return where workers find a file: its path, or its name in a remote store."""
+    if not is_remote(store):
+        return str(file.resolve())
+    name = f"{_INPUTS}/{key_of(content.hex())}/{file.name}"
+    open_store(store).write(name, content)
+    return name

@@ -1,0 +1,61 @@
+"""The keys of a fleet: what a result depends on, as a hash, so that a second run does only what is missing or changed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from objslam import __version__
+from objslam.config.settings import change_settings
+from objslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from objslam.config import Settings
+    from objslam.sources import SourceOptions
+
+_LETTERS = 32
+"""The hexadecimal digits of a key. A larger number makes longer names. With 32, two contents never have one key by
+chance."""
+_BLOCK = 1 << 20  # The bytes that are read at once.
+
+
+def hash_log(path: Path) -> str:
+    """Return the hash of the content of a log: of the relative name and the bytes of each file. OSError from the disk."""
+    digest = sha256()
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    for file in files:
+        digest.update(f"\0{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0".encode())
+        with file.open("rb") as stream:
+            while block := stream.read(_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
+    """Return the hash of what else decides a result: settings, options of the source, the version, and `files`.
+
+    files: the content of each file that a setting names, by the dotted key of the setting, and of other inputs by their
+    names. The path of a file does not count.
+    """
+    values = change_settings(settings, dict.fromkeys((key for key in files if "." in key), "a file")).model_dump(mode="json")
+    said: dict[str, Any] = {"version": __version__, "settings": values}
+    said["options"] = {name: value for name, value in asdict(options).items() if value not in (None, ())}
+    said["files"] = {name: sha256(content).hexdigest() for name, content in files.items()}
+    return key_of(json.dumps(said, sort_keys=True, default=str))
+
+
+def key_of(*parts: str) -> str:
+    """Return the key of some texts, in their order."""
+    return sha256("\0".join(parts).encode()).hexdigest()[:_LETTERS]
+
+
+def file_content(file: Path) -> bytes:
+    """Return the content of a file that the settings name. ConfigError if it cannot be read."""
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(file)) from error

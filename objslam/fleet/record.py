@@ -1,0 +1,95 @@
+"""The record of a log: what a fleet keeps of one run beside its result. It is written last, and marks a whole result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+from objslam.fleet.stores.store import StoreError
+from objslam.results.files import dump_json
+
+RESULTS, RECORDS, SEEN = "results", "records", "seen"
+"""The folders of a fleet: of the results by key, of their records, and of the keys of the logs that were seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A shared error that a run estimated, with its standard deviation. known: whether the log determines it."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+    known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What became of one log.
+
+    key: of its content, the settings and the version. error: what is wrong with the log, empty if it was mapped. begin, end:
+    the stamps of its path, s. verdict: good, check or bad. cpu, seconds: of the task, s. memory: the most RAM of its
+    process so far, bytes. files: of the result. report: whether it has a report.html.
+    """
+
+    key: str
+    source: str
+    log: str
+    settings: str
+    version: str
+    error: str = ""
+    mode: str = ""
+    begin: float = 0.0
+    end: float = 0.0
+    verdict: str = ""
+    counts: Mapping[str, int] | None = None
+    calibration: tuple[Parameter, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cpu: float = 0.0
+    seconds: float = 0.0
+    memory: int = 0
+    size: int = 0
+    files: tuple[str, ...] = ()
+
+    def dump(self) -> bytes:
+        """Return the content of the file of the record."""
+        return dump_json(asdict(self)).encode()
+
+    @classmethod
+    def parse(cls, data: bytes, where: str) -> Self:
+        """Return the record in a file. StoreError with `where` if it is damaged."""
+        try:
+            said: dict[str, Any] = json.loads(data)
+            said["calibration"] = tuple(Parameter(**one) for one in said["calibration"])
+            said |= {name: tuple(said[name]) for name in ("warnings", "files")}
+            return cls(**said)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise StoreError("not the record of a fleet: delete it, and its log is mapped again", where=where) from error
+
+
+def record_name(key: str) -> str:
+    """Return the name of the record of a key in the store."""
+    return f"{RECORDS}/{key}.json"
+
+
+def result_name(key: str) -> str:
+    """Return the folder of the result of a key in the store."""
+    return f"{RESULTS}/{key}"
+
+
+def seen_name(task: str, key: str, good: bool) -> str:
+    """Return the name of the empty file that says which key a log has, and whether it was mapped."""
+    return f"{SEEN}/{task}.{key}.{'done' if good else 'failed'}"
+
+
+def parse_seen(names: list[str]) -> dict[str, tuple[str, bool]]:
+    """Return for each task its key, and whether its log was mapped, from the names of the files in the folder `SEEN`."""
+    found: dict[str, tuple[str, bool]] = {}
+    for name in names:
+        task, _, rest = name.partition(".")
+        key, _, state = rest.partition(".")
+        if state in ("done", "failed") and (task not in found or state == "done"):
+            found[task] = key, state == "done"
+    return found

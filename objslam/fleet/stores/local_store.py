@@ -1,0 +1,124 @@
+"""Folders of this machine, or of a disk that all workers have."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from objslam.fleet.stores.store import FileState, StoreError
+from objslam.io.atomic_files import write_file
+
+
+def local_path(url: str) -> Path:
+    """Return the path of a `file://` URL, or of a path."""
+    return Path(unquote(url.removeprefix("file://")) if url.startswith("file://") else url)
+
+
+class LocalStore:
+    """A folder of this machine, or of a disk that all workers have."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder.absolute()
+        self.url = str(self._folder)
+
+    def names(self, prefix: str) -> list[str]:
+        """Return the names of the files directly in the folder `prefix`, without the folder, in order."""
+        try:
+            with os.scandir(self._folder / prefix) as entries:
+                return sorted(entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file())
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise _failed(self._folder / prefix, error) from error
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file. FileNotFoundError if there is none, StoreError if the disk refuses."""
+        try:
+            return (self._folder / name).read_bytes()
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise _failed(self._folder / name, error) from error
+
+    def read_many(self, names: Iterable[str]) -> dict[str, bytes]:
+        """Return the contents of files by name. Files that do not exist are left out."""
+        found = {}
+        for name in names:
+            try:
+                found[name] = self.read(name)
+            except FileNotFoundError:
+                continue
+        return found
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file, and replace an older one. OutputError if the disk refuses."""
+        file = self._folder / name
+        self._make(file.parent)
+        write_file(file, data)
+
+    def upload(self, folder: Path, name: str) -> list[str]:
+        """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""
+        to = self._folder / name
+        self._make(to)
+        names = sorted(file.name for file in folder.iterdir() if file.is_file())
+        try:
+            for one in names:
+                part = to / f".{one}.{os.getpid()}"
+                shutil.copyfile(folder / one, part)
+                part.replace(to / one)
+        except OSError as error:
+            raise _failed(to, error) from error
+        return names
+
+    def remove(self, name: str) -> None:
+        """Delete a file, if it exists."""
+        (self._folder / name).unlink(missing_ok=True)
+
+    def _make(self, folder: Path) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _failed(folder, error) from error
+
+
+class LocalSource:
+    """The disk of this machine."""
+
+    def expand(self, pattern: str) -> list[str]:
+        """Return the paths that a path or a glob pattern names, in order; none if nothing is there."""
+        path = Path(local_path(pattern))
+        if os.path.lexists(path):
+            return [str(path)]
+        root = Path(path.anchor)
+        return sorted(str(found) for found in root.glob(str(path.relative_to(root))))
+
+    def files(self, path: str) -> Mapping[str, FileState]:
+        """Return every file below a path, by its relative name. A path of a file gives this file, named ""."""
+        root = Path(path)
+        if root.is_file():
+            return {"": _state(root)}
+        found = {}
+        for folder, inner, names in os.walk(root):
+            inner.sort()
+            below = PurePosixPath(Path(folder).relative_to(root).as_posix())
+            for name in sorted(names):
+                file = Path(folder, name)
+                if file.is_file():  # Not a link to nothing.
+                    found[str(below / name)] = _state(file)
+        return found
+
+    def fetch(self, path: str, to: Path) -> Path:
+        """Return the path itself."""
+        return Path(path)
+
+
+def _state(file: Path) -> FileState:
+    found = file.stat()
+    return FileState(found.st_size, str(found.st_mtime_ns))
+
+
+def _failed(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"cannot be read or written: {error.strerror or error}", where=str(path))

@@ -1,0 +1,184 @@
+"""The task of one log: read it, map it, and put its result into the store, whole or not at all.
+
+The files of a result lie below its key, and the key is of the content. So a task that is run twice writes the same files,
+and nobody reads them before the record is there.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from objslam import __version__
+from objslam.errors import ObjslamError
+from objslam.fleet.keys import hash_log, key_of
+from objslam.fleet.record import Parameter, Record, record_name, result_name, seen_name
+from objslam.fleet.stores.open_store import is_remote, open_source, open_store
+from objslam.fleet.stores.store import StoreError
+from objslam.io.atomic_files import write_file
+
+if TYPE_CHECKING:
+    from objslam.api.result import Result
+    from objslam.config import Settings
+    from objslam.core.diagnostics import Ledger
+    from objslam.core.types import Log
+    from objslam.detection.detector import Detector
+    from objslam.sources import SourceOptions
+
+WORK = "objslam.fleet.tasks.map_task:map_one"
+"""The name of the function of this task, for an engine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What all logs of a fleet have in common.
+
+    store: the URL of the output. digest: of the settings and of all files that they name. files: for each of these, by the
+    dotted key of its setting, its path, or its name in the store. report: whether to write the report of each log.
+    """
+
+    store: str
+    settings: Settings
+    options: SourceOptions
+    digest: str
+    files: tuple[tuple[str, str], ...] = ()
+    report: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class MapTask:
+    """One log of a job. task: the key under which the log is known as seen. again: whether to map it although a run of the
+    same content failed."""
+
+    job: Job
+    path: str
+    task: str
+    again: bool = False
+
+
+def map_one(given: MapTask) -> Record:
+    """Map one log, and return its record. A log that cannot be mapped gives a record with its error.
+
+    A result that is in the store already, of a log with the same content, is not made again. StoreError if the store or the
+    source does not answer.
+    """
+    begin, cpu = time.monotonic(), time.process_time()
+    store = open_store(given.job.store)
+    with tempfile.TemporaryDirectory(prefix="objslam-fleet-") as folder:
+        log = open_source(given.path).fetch(given.path, Path(folder, "log"))
+        try:
+            content = hash_log(log)
+        except OSError as error:
+            raise StoreError(f"cannot be read: {error.strerror or error}", where=given.path) from error
+        key = key_of(content, given.job.digest)
+        made = store.read_many([record_name(key)])
+        record = Record.parse(made[record_name(key)], record_name(key)) if made else None
+        if record is None or (record.error and given.again):
+            record = Record(key, given.path, content, given.job.digest, __version__)
+            out = Path(folder, "result")
+            try:
+                record = _mapped(given, log, out, record)
+            except StoreError:
+                raise
+            except ObjslamError as error:
+                record = replace(record, error=str(error).replace(str(log), given.path))
+            else:
+                record = replace(record, files=tuple(store.upload(out, result_name(key))))
+            used, took = time.process_time() - cpu, time.monotonic() - begin
+            record = replace(record, cpu=used, seconds=took, memory=_most_memory())
+            store.write(record_name(key), record.dump())
+    store.write(seen_name(given.task, key, not record.error), b"")
+    return record
+
+
+def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
+    """Map a log into the folder `out`, and return its record with what the summary says."""
+    from objslam.api.mapping import map_log
+    from objslam.api.result import Result
+    from objslam.core.diagnostics import Ledger
+    from objslam.sources import read
+
+    settings, detector = _settings(given.job)
+    ledger = Ledger()
+    found = read(log, ledger, given.job.options)
+    if detector is not None:
+        found = _with_boxes(found, detector, settings, ledger)
+    path = found.robot_path
+    mapped, found = map_log(found, settings, ledger, None, lambda stage, done, total: None)
+    result = Result.of(mapped, found, detected=detector is not None)
+    result.summary["log_path"] = given.path  # The copy of a log of a store is deleted.
+    result.save(out)
+    if given.job.report:
+        from objslam.output.report.page import write_report
+
+        write_report(out, log=log)
+    size = sum(file.stat().st_size for file in out.iterdir())
+    begin, end = (0.0, 0.0) if path is None else (float(path.stamps[0]), float(path.stamps[-1]))
+    return replace(record, begin=begin, end=end, size=size, **_said(result))
+
+
+def _with_boxes(log: Log, detector: Path, settings: Settings, ledger: Ledger) -> Log:
+    """Return a log with the boxes of a detector. A process loads a model once, and keeps it for its next logs."""
+    from objslam.detection import default_cache, detect_log
+
+    return detect_log(log, _network(detector, settings.detector.model_dump_json()), settings, ledger, cache=default_cache())
+
+
+@lru_cache(maxsize=1)
+def _network(detector: Path, settings: str) -> Detector:
+    from objslam import config
+    from objslam.detection import load_detector
+
+    return load_detector(detector, config.Detector.model_validate_json(settings))
+
+
+def _said(result: Result) -> dict[str, Any]:
+    parameters = (result.summary.get("calibration") or {}).get("parameters", {})
+    return {
+        "mode": result.summary["mode"],
+        "verdict": result.assessment.level,
+        "counts": dict(result.summary["counts"]),
+        "warnings": (*result.warnings, *(f"{reason}: {count}" for reason, count in result.dropped.items())),
+        "calibration": tuple(
+            Parameter(name, one["value"], one["sigma"], one["unit"], one["observable"]) for name, one in parameters.items()
+        ),
+    }
+
+
+def _settings(job: Job) -> tuple[Settings, Path | None]:
+    """Return the settings of a job with local paths, and its detector."""
+    from objslam.config.settings import change_settings
+
+    local = {key: _local_file(job.store, name) for key, name in job.files}
+    detector = local.pop("detector", None)
+    return change_settings(job.settings, {key: str(path) for key, path in local.items()}), detector
+
+
+@lru_cache(maxsize=16)
+def _local_file(store: str, name: str) -> Path:
+    """Return a file of a job on this machine. A process copies a file of a store once."""
+    if not is_remote(store):
+        return Path(name)
+    from objslam.detection import default_cache
+
+    data = open_store(store).read(name)
+    cache = default_cache()
+    if cache is None:
+        raise StoreError("there is no folder for the files of the settings", where=name)
+    folder = cache.parent / "fleet" / sha256(data).hexdigest()
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / name.rpartition("/")[2]
+    write_file(file, data)
+    return file
+
+
+def _most_memory() -> int:
+    """Return the most bytes of RAM that this process had."""
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,55 @@
+"""The rows that hold the corners of fiducials together as squares, without variables of their own.
+
+The pose of a square is that nearest to its corners. What the corners lack to it is the residual, so a step of the corners
+changes the residual by its part that moves no square.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.graph.factors.tags import TIE
+from objslam.graph.tags.corner_rays import TagCorners
+from objslam.graph.tags.shapes import squares_of, turned_by_squares
+
+
+@dataclass(frozen=True)
+class SquareRows:
+    """T squares among the landmarks of a graph, twelve rows each.
+
+    corner: (T, 4) the row of each corner among the landmarks. shape: (T, 4, 3) the corners at side 1. side: (T,) m, NaN for
+    a free side.
+    """
+
+    corner: Ints
+    shape: Floats
+    side: Floats
+
+    @classmethod
+    def of(cls, tags: TagCorners | None, landmarks: Ints) -> Self:
+        """Return the squares all of whose corners are among the landmarks (m,), which are in increasing order."""
+        if tags is None:
+            return cls(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4, 3)), np.zeros(0))
+        tied = tags.tied(landmarks)
+        return cls(np.searchsorted(landmarks, tags.landmarks[tied]), tags.shape[tied], tags.side[tied])
+
+    @property
+    def columns(self) -> Ints:
+        """(T, 12) the columns of the corners of each square."""
+        return (3 * self.corner[:, :, None] + np.arange(3)).reshape(-1, 12)
+
+    def rows(self, landmarks: Floats) -> tuple[Floats, Floats]:
+        """Return the whitened residuals (T, 12) at landmarks (m, 3), m, and their derivatives (T, 12, 12) by the corners."""
+        corners = landmarks[self.corner]
+        rotation, centre, found = squares_of(corners, self.shape)
+        free = np.isnan(self.side)
+        side = np.where(free, found, self.side)
+        local = self.shape * side[:, None, None]
+        square = np.einsum("tij,tcj->tci", rotation, local) + centre[:, None]
+        by_square = turned_by_squares(local, rotation)
+        by_square[:, :, 6] *= free[:, None]
+        off = np.eye(12) - by_square @ np.linalg.pinv(by_square)
+        sigma = TIE * side * np.linalg.norm(self.shape[:, 0], axis=1)
+        return (corners - square).reshape(-1, 12) / sigma[:, None], off / sigma[:, None, None]

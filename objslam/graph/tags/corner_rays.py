@@ -1,0 +1,117 @@
+"""The rays of a log with four rays, one to each corner, in place of the one ray of a fiducial."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.types import Association, Rays
+from objslam.graph.tags.placement import placed
+from objslam.graph.tags.shapes import CLOCKWISE, COUNTER_CLOCKWISE, goes_clockwise
+from objslam.graph.tags.square_fit import Corners
+
+
+@dataclass(frozen=True)
+class TagCorners:
+    """The T fiducials among N objects, as four landmarks each: the corners. M = N + 3 T landmarks in all.
+
+    source: (n,) the ray of each new ray, non-decreasing. corner: (n,) 0 to 3, -1 for a ray that is as before. association:
+    of the new rays with the landmarks. The first corner of a fiducial has the number of its object. count: N. object: (T,)
+    of each fiducial. landmarks: (T, 4). shape: (T, 4, 3) the corners at side 1. side: (T,) m, NaN if unknown. first: (V,)
+    the new ray to the first corner of each view of a fiducial; the rays to the other corners follow. tag: (V,) its fiducial.
+    """
+
+    source: Ints
+    corner: Ints
+    association: Association
+    count: int
+    object: Ints
+    landmarks: Ints
+    shape: Floats
+    side: Floats
+    first: Ints
+    tag: Ints
+
+    @classmethod
+    def of(cls, rays: Rays, association: Association, settings: Settings) -> Self | None:
+        """Return the fiducials among the objects of rays (R,), None if there are none.
+
+        A fiducial is an object with corners in any of its rays. Its rays without corners belong to no landmark.
+        """
+        if rays.corners is None or rays.corner_sigma is None:
+            return None
+        owner = association.object
+        squares = np.isfinite(rays.corner_sigma) & (owner >= 0)
+        if not squares.any():
+            return None
+        object_, tag_of_view = np.unique(owner[squares], return_inverse=True)
+        of_tag = np.isin(owner, object_)
+        source = np.repeat(np.arange(len(rays)), np.where(squares, 4, 1))
+        first = np.flatnonzero(squares[source])[::4]
+        corner = np.full(len(source), -1)
+        for c in range(4):
+            corner[first + c] = c
+        landmarks = association.count + 3 * np.arange(len(object_))[:, None] + np.arange(-1, 3)
+        landmarks[:, 0] = object_
+        landmark = np.where(of_tag & ~squares, -1, owner)[source]
+        for c in range(4):
+            landmark[first + c] = landmarks[tag_of_view, c]
+        label = np.concatenate([association.label, np.repeat(association.label[object_], 3)])
+        turns = np.where(goes_clockwise(rays.corners[squares]), 1, -1)
+        clockwise = np.bincount(tag_of_view, turns) > 0
+        sides = [settings.tags.size_of(rays.label_names[i]) for i in association.label[object_].tolist()]
+        return cls(
+            source=source,
+            corner=corner,
+            association=Association(landmark, label),
+            count=association.count,
+            object=object_,
+            landmarks=landmarks,
+            shape=np.where(clockwise[:, None, None], CLOCKWISE, COUNTER_CLOCKWISE),
+            side=np.array([np.nan if side is None else side for side in sides]),
+            first=first,
+            tag=tag_of_view,
+        )
+
+    def rays(self, rays: Rays) -> Rays:
+        """Return the new rays (n,) of the rays (R,). A ray to a corner has the noise of a corner, and no range."""
+        assert rays.corners is not None
+        assert rays.corner_sigma is not None
+        new = rays.take(self.source)
+        at = self.corner >= 0
+        source, corner = self.source[at], self.corner[at]
+        direction, sigma, range_ = new.direction.copy(), new.sigma.copy(), new.range.copy()
+        direction[at], sigma[at], range_[at] = rays.corners[source, corner], rays.corner_sigma[source], np.nan
+        return replace(new, direction=direction, sigma=sigma, range=range_, corners=None, corner_sigma=None)
+
+    def seen(self, rays: Rays, map_T_camera: Floats) -> Corners:
+        """Return the corners in all views of fiducials, with the camera poses (K, 4, 4). rays: (n,) the new rays."""
+        views = (self.first[:, None] + np.arange(4)).ravel()
+        origin, direction = rays.take(views).in_map(map_T_camera)
+        return Corners(self.tag, origin[::4], direction.reshape(-1, 4, 3), rays.sigma[self.first])
+
+    def placed(self, rays: Rays, map_T_camera: Floats, positions: Floats) -> Floats:
+        """Return the positions (M, 3) m of landmarks with each fiducial at its best pose, as `placement.placed` does."""
+        return placed(self.seen(rays, map_T_camera), self.shape, self.side, self.landmarks, positions)
+
+    def measured_motions(self, rays: Rays, count: int) -> Bools:
+        """Return which of the motions (count - 1,) between consecutive of `count` poses have one fiducial in both views."""
+        seen = np.unique(rays.keyframe[self.first] * len(self.object) + self.tag)
+        again = np.intersect1d(seen + len(self.object), seen) // len(self.object) - 1
+        return np.isin(np.arange(count - 1), again)
+
+    def tied(self, landmarks: Ints) -> Ints:
+        """Return the fiducials (t,) all of whose corners are among the landmarks."""
+        return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
+
+    def is_corner(self) -> Bools:
+        """Return which landmarks (M,) are corners of fiducials."""
+        return np.isin(np.arange(self.association.count), self.landmarks)
+
+    def object_of_landmark(self) -> Ints:
+        """Return the object (M,) of each landmark."""
+        objects = np.arange(self.association.count)
+        objects[self.landmarks] = self.object[:, None]
+        return objects

@@ -1,0 +1,207 @@
+"""Fit the poses of squares to the directions of their corners, at fixed camera poses: many squares at once."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import make_pose
+from objslam.core.rotation import rotation_from_vector, skew
+from objslam.core.statistics import CAUCHY_K
+from objslam.graph.factors.bearing import tangent_basis
+
+_BEHIND = 1e-3
+"""The least share of a corner's distance that must be ahead along its ray. A corner further back costs `_BEHIND_COST` and
+pulls at nothing. A larger share calls more corners behind."""
+_BEHIND_COST = 1e6
+"""The squared deviation of a corner behind its camera. A larger value is a surer no."""
+_DAMPING = 1e-3
+"""The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
+
+
+@dataclass(frozen=True)
+class Corners:
+    """The corners that V views of squares show. Each view belongs to one square.
+
+    square: (V,) index of the square. origin: (V, 3) m in map, where the rays begin. direction: (V, 4, 3) unit, in map.
+    sigma: (V,) rad.
+    """
+
+    square: Ints
+    origin: Floats
+    direction: Floats
+    sigma: Floats
+
+    def __len__(self) -> int:
+        return len(self.square)
+
+    def take(self, views: Bools | Ints) -> Self:
+        """Select views by a mask or indices."""
+        return replace(self, **{name: value[views] for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Squares:
+    """H squares in map. shape: (H, 4, 3) the corners at side 1. pose: (H, 4, 4) map_T_square. side: (H,) m."""
+
+    shape: Floats
+    pose: Floats
+    side: Floats
+
+    @property
+    def corners(self) -> Floats:
+        """(H, 4, 3) m in map."""
+        local = self.shape * self.side[:, None, None]
+        return np.asarray(np.einsum("hij,hcj->hci", self.pose[:, :3, :3], local) + self.pose[:, None, :3, 3])
+
+    def take(self, which: Bools | Ints) -> Self:
+        """Select squares by a mask or indices."""
+        return replace(self, shape=self.shape[which], pose=self.pose[which], side=self.side[which])
+
+
+def costs(seen: Corners, squares: Squares) -> Floats:
+    """Return the cost (H,) of each square: Cauchy's loss of its corners' deviations, summed."""
+    residual, _, ahead = _residuals(seen, squares.corners)
+    return _cost(residual, ahead, seen, len(squares.side))
+
+
+def fit(seen: Corners, squares: Squares, free: Bools, iterations: int) -> tuple[Squares, Floats, Floats]:
+    """Return the squares that fit the corners best, near the given ones, by Levenberg-Marquardt with Cauchy's loss.
+
+    free: (H,) whether the side is fitted too. Returns the squares, their costs (H,), and the information (H, 7, 7) about
+    each: rotation and position in the frame of the square, then the logarithm of the side. The rows of a fixed side are
+    those of the identity.
+    """
+    count = len(squares.side)
+    damping = np.full(count, _DAMPING)
+    cost, information, gradient = _linearised(seen, squares, free)
+    for _ in range(iterations):
+        diagonal = np.einsum("hii->hi", information)
+        damped = information.copy()
+        np.einsum("hii->hi", damped)[...] += damping[:, None] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-9
+        step = np.asarray(-np.linalg.solve(damped, gradient[..., None])[..., 0], dtype=np.float64)
+        other = _moved(squares, step)
+        tried, other_information, other_gradient = _linearised(seen, other, free)
+        better = tried < cost
+        squares = Squares(
+            squares.shape,
+            np.where(better[:, None, None], other.pose, squares.pose),
+            np.where(better, other.side, squares.side),
+        )
+        information = np.where(better[:, None, None], other_information, information)
+        gradient = np.where(better[:, None], other_gradient, gradient)
+        cost, damping = np.where(better, tried, cost), np.where(better, damping / 5, damping * 8)
+    return squares, cost, information
+
+
+def _moved(squares: Squares, step: Floats) -> Squares:
+    turned = squares.pose[:, :3, :3] @ rotation_from_vector(step[:, :3])
+    place = squares.pose[:, :3, 3] + np.einsum("hij,hj->hi", squares.pose[:, :3, :3], step[:, 3:6])
+    return Squares(squares.shape, make_pose(turned, place), squares.side * np.exp(np.clip(step[:, 6], -1.0, 1.0)))
+
+
+def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
+    """Return whitened residuals (V, 4, 2), their derivatives (V, 4, 2, 3) by the corners in map, and which are ahead."""
+    to = corners[seen.square] - seen.origin[:, None]
+    along = np.einsum("vci,vci->vc", seen.direction, to)
+    ahead = along > _BEHIND * np.linalg.norm(to, axis=2)
+    safe = np.where(ahead, along, 1.0)
+    basis = tangent_basis(seen.direction.reshape(-1, 3)).reshape(*seen.direction.shape, 2)
+    plane = np.einsum("vcij,vci->vcj", basis, to) / safe[..., None]
+    by_point = np.swapaxes(basis, 2, 3) - plane[..., None] * seen.direction[:, :, None, :]
+    by_point /= (safe * seen.sigma[:, None])[..., None, None]
+    return plane / seen.sigma[:, None, None], by_point, np.asarray(ahead)
+
+
+def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
+    squared = (residual**2).sum(axis=2)
+    each = np.where(ahead, CAUCHY_K**2 * np.log1p(squared / CAUCHY_K**2), _BEHIND_COST)
+    return np.asarray(np.bincount(seen.square, each.sum(axis=1), count), dtype=np.float64)
+
+
+def scatter(seen: Corners, squares: Squares, free: Bools) -> Floats:
+    """Return the sums (H, 7, 7) of the squared gradients of the views of each square: the errors of one view may be common.
+
+    Between two inverses of the information, this is the covariance of a fit (cluster-robust; Liang and Zeger 1986).
+    """
+    _, weighted, residual, _ = _jacobians(seen, squares, free)
+    gradient = np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8))
+    result = np.zeros((len(squares.side), 7, 7))
+    np.add.at(result, seen.square, gradient[:, :, None] * gradient[:, None, :])
+    return result
+
+
+def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats]:
+    """Return the costs (H,), the information (H, 7, 7), and half the gradients (H, 7), with the weights of Cauchy's loss."""
+    count = len(squares.side)
+    flat, weighted, residual, ahead = _jacobians(seen, squares, free)
+    information, gradient = np.zeros((count, 7, 7)), np.zeros((count, 7))
+    np.add.at(information, seen.square, np.swapaxes(weighted, 1, 2) @ flat)
+    np.add.at(gradient, seen.square, np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8)))
+    information[:, 6, 6] += ~free
+    return _cost(residual, ahead, seen, count), information, gradient
+
+
+def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats, Bools]:
+    """Return the derivatives (V, 8, 7) of the residuals of views by their squares, the same times the weights of Cauchy's
+    loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead."""
+    count, rotation = len(squares.side), squares.pose[:, :3, :3]
+    residual, by_point, ahead = _residuals(seen, squares.corners)
+    local = squares.shape * squares.side[:, None, None]
+    by_square = np.concatenate(
+        [-skew(local), np.broadcast_to(np.eye(3), (count, 4, 3, 3)), (local * free[:, None, None])[..., None]], axis=3
+    )
+    turned = np.einsum("hij,hcjk->hcik", rotation, by_square)
+    jacobian = np.einsum("vcai,vcik->vcak", by_point, turned[seen.square])
+    weight = np.where(ahead, 1 / (1 + (residual**2).sum(axis=2) / CAUCHY_K**2), 0.0)[..., None]
+    weighted = jacobian * weight[..., None]
+    return jacobian.reshape(len(seen), 8, 7), weighted.reshape(len(seen), 8, 7), residual, ahead
+
+
+def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
+    """Return the two poses of each view of a square of side 1, as 2 V squares: first one pose a view, then the other.
+
+    A flat square that is far off, or seen from the front, looks nearly alike in two poses (Schweighofer and Pinz 2006). The
+    first pose is that of the homography between the square and its image. The second one has the normal on the other side
+    of the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
+    """
+    middle = seen.direction.mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    axes = np.concatenate([tangent_basis(middle), middle[:, :, None]], axis=2)
+    local = np.einsum("vij,vci->vcj", axes, seen.direction)
+    image = local[..., :2] / local[..., 2:]
+    x, y = shapes[..., 0], shapes[..., 1]
+    rows = np.zeros((len(seen), 4, 2, 8))
+    rows[:, :, 0, 0], rows[:, :, 0, 1], rows[:, :, 0, 2] = x, y, 1
+    rows[:, :, 1, 3], rows[:, :, 1, 4], rows[:, :, 1, 5] = x, y, 1
+    rows[..., 6], rows[..., 7] = -image * x[..., None], -image * y[..., None]
+    found = np.linalg.solve(rows.reshape(-1, 8, 8), image.reshape(-1, 8, 1))[..., 0]
+    matrix = np.concatenate([found, np.ones((len(seen), 1))], axis=1).reshape(-1, 3, 3)
+    size = np.linalg.norm(matrix[:, :, :2], axis=1).mean(axis=1)
+    u, _, vt = np.linalg.svd(matrix[:, :, :2], full_matrices=False)
+    two = u @ vt
+    rotation = np.concatenate([two, np.cross(two[:, :, 0], two[:, :, 1])[:, :, None]], axis=2)
+    pose = make_pose(axes @ rotation, np.einsum("vij,vj->vi", axes, matrix[:, :, 2] / size[:, None]) + seen.origin)
+    one = Squares(shapes, pose, np.ones(len(seen)))
+    both = stacked(one, mirrored(one, seen.origin))
+    views = replace(seen, square=np.arange(len(seen)))
+    twice = Corners(
+        np.concatenate([views.square, views.square + len(seen)]),
+        *(np.concatenate([part, part]) for part in (seen.origin, seen.direction, seen.sigma)),
+    )
+    return fit(twice, both, np.zeros(len(both.side), dtype=bool), iterations)[0]
+
+
+def mirrored(squares: Squares, origins: Floats) -> Squares:
+    """Return the squares with their normals on the other side of the lines of sight from points (H, 3) m in map."""
+    sight = squares.pose[:, :3, 3] - origins
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    half_turn = 2 * sight[:, :, None] * sight[:, None, :] - np.eye(3)
+    turned = half_turn @ squares.pose[:, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
+    return replace(squares, pose=make_pose(turned, squares.pose[:, :3, 3]))
+
+
+def stacked(*parts: Squares) -> Squares:
+    """Return the squares of all parts, one part after the other."""
+    return Squares(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shape", "pose", "side")))

@@ -1,0 +1,27 @@
+"""The squares of fiducials in a graph: their ties, and what the solved graph says of them."""
+
+import gtsam
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import make_pose
+from objslam.graph.factors.tags import tag_ties
+from objslam.graph.tags.corner_rays import TagCorners
+from objslam.graph.tags.shapes import squares_of
+from objslam.graph.variables import TAG0, TAG_SIZE0
+
+
+def add_squares(
+    tags: TagCorners, landmarks: Ints, positions: Floats, values: gtsam.Values, prior_sigma: float
+) -> list[gtsam.NonlinearFactor]:
+    """Return the ties of the fiducials whose corners are all in the graph. Their poses and sizes are added to the values.
+
+    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, of an unknown side.
+    """
+    which = tags.tied(landmarks)
+    rotation, centre, side = squares_of(positions[tags.landmarks[which]], tags.shape[which])
+    for t, pose in zip(which.tolist(), make_pose(rotation, centre), strict=True):
+        values.insert(TAG0 + t, gtsam.Pose3(pose))
+    for t in which[np.isnan(tags.side[which])].tolist():
+        values.insert(TAG_SIZE0 + t, 0.0)
+    return tag_ties(which, tags.landmarks[which], tags.shape[which], tags.side[which], side, prior_sigma)

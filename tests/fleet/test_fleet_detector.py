@@ -1,0 +1,59 @@
+"""A fleet with a detector: the boxes come from the images of each log."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from detection.tiny_models import COLOURS, scene, tiny_model
+from fleet.fleet_logs import write_logs
+
+import objslam
+from objslam.config import Settings
+from objslam.config.settings import change_settings
+from objslam.core.types import Images
+from objslam.fleet.driver import run_fleet
+from objslam.fleet.engines.local_engine import local_engine
+from objslam.fleet.engines.worker import Limits
+from objslam.fleet.job import make_job
+from objslam.fleet.logs import Layout, find_logs
+from objslam.sources import SourceOptions
+from objslam.sources.log_folder import write_log_folder
+
+STEP = 10
+"""Every so many frames have an image."""
+
+
+def with_images(folder, path):
+    """Write a log whose images show its boxes, and which has no boxes."""
+    log = objslam.read(path)
+    camera = log.cameras[0]
+    found = camera.detections
+    files = []
+    for k in range(0, len(found.frame_stamps), STEP):
+        file = folder / f"{path.name}_{k}.png"
+        boxes = found.boxes[found.frame == k].astype(int).tolist()
+        cv2.imwrite(str(file), scene(boxes, camera.camera.width, camera.camera.height))
+        files.append(file)
+    images = Images(found.frame_stamps[::STEP], tuple(files))
+    write_log_folder(replace(log, cameras=(replace(camera, detections=None, rgb=images),)), folder / "logs" / path.name)
+
+
+def test_a_fleet_finds_the_boxes_as_a_run_does(tmp_path):
+    for path in write_logs(tmp_path / "simulated", range(2), sites=1):
+        with_images(tmp_path, path)
+    model = tiny_model(tmp_path / "m.onnx", "yolov8", size=(640, 640), batch=None, metadata={"names": list(COLOURS)})
+    settings = change_settings(Settings(), {"output": {"recording": False, "picture": False}})
+    job = make_job(str(tmp_path / "out"), settings, SourceOptions(), model, report=False)
+    logs = find_logs([str(tmp_path / "logs")], Layout("{log}", "none"))
+    found = run_fleet(job, logs, local_engine(1, Limits()))
+    assert [one.error for one in found.failures] == []
+    assert found.new == 2
+    for one in found.mapped:
+        hand = objslam.run(objslam.read(one.place.path), settings, detector=model).rays
+        mapped = objslam.Result.load(tmp_path / "out" / "results" / one.key).rays
+        assert len(mapped) > 20
+        np.testing.assert_array_equal(mapped.box, hand.box)
+        np.testing.assert_array_equal(mapped.direction, hand.direction)
+        assert (tmp_path / "out" / "results" / one.key / "detections.jsonl").is_file()
+    other = make_job(str(tmp_path / "out"), settings, SourceOptions(), None, report=False)
+    assert other.digest != job.digest
