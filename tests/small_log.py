@@ -41,7 +41,7 @@ def small_log(seed: int = 0, **changes: Any) -> Log:
 
 
 def crowded(log: Log, frames: NDArray[np.int64], count: int, label: str = "leaf") -> Log:
-    """The log with so many more boxes of a label anywhere in the image of each of the frames of its first camera."""
+    """The log with `count` more boxes of a label, anywhere in the image, in each of these frames of its first camera."""
     rng, first = np.random.default_rng(0), log.cameras[0]
     assert first.detections is not None
     names = (*first.detections.label_names, label)

@@ -13,7 +13,7 @@ spec.loader.exec_module(licences)
 
 
 def test_every_package_is_on_the_page():
-    """`python tools/licences.py` writes the page anew."""
+    """If this fails, `python tools/licences.py` writes the page again."""
     found = licences.packages(licences.requirements(licences.ROOT / "pyproject.toml"))
     assert {"gtsam", "torch", "numpy", "zstandard"} <= {one.name for one in found}
     listed = set(licences.names_on(licences.PAGE.read_text(encoding="utf-8")))

@@ -19,7 +19,7 @@ _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared devia
 def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
     """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
 
-    Each ray costs its squared deviation from the best landmark of its label, but no more than a stray ray. positions,
+    Each ray costs its squared deviation from the best landmark of its label, but no more than `STRAY_RAY`. positions,
     labels: (N, 3) m and (N,), of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,)
     standard deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
     """
@@ -60,6 +60,6 @@ def _misfit(
 
 
 def _steps(sigma: float, finest: float, most: int) -> Floats:
-    """Return the grid values along one axis, which include 0."""
+    """Return the grid values along one axis, which include 0. finest: the least step. most: the most steps."""
     half = int(min(np.ceil(_GRID_SIGMAS * sigma / finest), most // 2))
     return np.linspace(-_GRID_SIGMAS * sigma, _GRID_SIGMAS * sigma, 2 * half + 1) if half else np.zeros(1)

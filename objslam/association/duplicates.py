@@ -19,5 +19,5 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. `frames` frames show the rarer one, and `together` of these frames show both."""
+    """Return whether two objects differ. `frames` frames show the rarer one, and `together` of them show both."""
     return together > TOGETHER * frames

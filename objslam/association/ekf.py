@@ -115,7 +115,7 @@ class Expected:
 
 
 def predict(f: Filter, motion: Floats, by_shared: Floats, noise: Floats) -> None:
-    """Move the base by a motion (4, 4) without its shared errors.
+    """Move the base by a measured motion (4, 4), corrected for its shared errors.
 
     by_shared: (3, S) the derivative of the motion's yaw, x and y by the shared errors. noise: (3, 3) the covariance of the
     motion's yaw, x and y. Both are in the base frame after the motion.

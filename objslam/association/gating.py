@@ -12,8 +12,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 TRACK_GAIN = 2.0
-"""A match costs less by this if most other boxes of the ray's track have its landmark. A larger value trusts the tracker
-more."""
+"""The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
+trusts the tracker more."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
@@ -46,9 +46,9 @@ def tangent_basis(direction: Floats) -> Floats:
 def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None = None) -> Edges:
     """Return the possible matches of a ray and a landmark.
 
-    The landmark accepts the label of the ray, and the squared bearing deviation of the match is at most `gate`.
-    pose: (R, 6, 6) covariance of the camera pose of each ray. Its first three rows are rotations about the map axes (rad),
-    its last three the position (m).
+    The landmark lies ahead of the camera and accepts the label of the ray. The squared bearing deviation of the match is at
+    most `gate`. pose: (R, 6, 6) covariance of the camera pose of each ray. Its first three rows are rotations about the map
+    axes (rad), its last three the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
     direction = obs.direction[ray]
@@ -75,8 +75,9 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
-    """Return the rays and the landmarks of the pairs that may be within the gate. A lower bound on the deviation decides. It
-    takes only matrix products, which are fast."""
+    """Return the rays and the landmarks of the pairs that may be within the gate. A few pairs are all returned if the
+    landmark lies ahead. Of many pairs, a lower bound on the deviation leaves out most. It takes only matrix products, which
+    are fast."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -148,7 +149,8 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
     """Return the best edge of each value of `one`, and (E,) whether the edges belong to a part without conflicts.
 
-    A part has no conflict if the best edges of its values of `one` differ in `other`. Then these edges are the best
+    one, other: (E,) the rays and the places of the edges, or the places and the rays. landmark, gain, part: (E,) of the
+    edges. A part has no conflict if the best edges of its values of `one` differ in `other`. Then these edges are the best
     assignment of the part, because no assignment can gain more. If gains are equal, the lowest landmark is taken.
     """
     order = np.lexsort((landmark, -gain, one))
@@ -185,10 +187,11 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 
 
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
-    """Return the cost reduction (E,) of each edge. An edge has one if most other boxes of the ray's track, and at least two,
-    have the landmark of the edge. Otherwise it is 0.
+    """Return the cost reduction (E,) of each edge. It is `TRACK_GAIN` if the other boxes of the ray's track support the
+    edge, and 0 if they do not.
 
-    track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
+    They support it if at least two of them, and most of those with a landmark, have the landmark of the edge. track,
+    matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))

@@ -1,7 +1,8 @@
 """Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
 
 One error of the pose shifts all measurements of a frame. So each accepted pairing predicts the others. A hypothesis grows
-from its first pairing, and the best pairing is added next. Its odds compare it with "all measurements are of new things".
+from its first pairing by the best further pairing, one after the other. The odds of a hypothesis compare it with "all
+measurements are of new things".
 """
 
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ class JointAssignment:
 
 
 def assign_jointly(pairings: Pairings) -> JointAssignment:
-    """Return the hypothesis with the highest odds. A row and a column are in at most one of its pairings."""
+    """Return the hypothesis with the highest odds. A measurement and a landmark are in at most one of its pairings."""
     none = JointAssignment(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool), 0.0)
     if len(pairings.row) == 0:
         return none
@@ -103,7 +104,7 @@ def _best(pairings: Pairings, odds: Floats, allowed: Bools) -> tuple[Ints, float
         if tried[seed]:
             continue
         chosen, total = _grow(pairings, odds, allowed, seed)
-        tried[chosen] = True  # This hypothesis covers all its pairings as seeds.
+        tried[chosen] = True  # Its other pairings would grow much the same hypothesis.
         if total > most:
             best, most = chosen, total
     return best, most

@@ -13,7 +13,7 @@ from objslam.association.refinement import variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
-_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds trust fewer.
+_MIN_ODDS = 4.5  # The least log odds of a landmark, given the others, over an unknown object. Larger odds keep fewer.
 _MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
@@ -24,8 +24,8 @@ def jointly_compatible(
     """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
     A landmark stays if it is much more likely than an unknown object, given all other landmarks that stay. doubt: (6, 6)
-    covariance of the camera's pose relative to the landmarks, in camera coordinates. unknown: (n,) expected number of
-    unknown objects per steradian along each ray that have the label of the ray.
+    covariance of the camera's pose relative to the landmarks, in camera coordinates, rotation first. unknown: (n,) expected
+    number of unknown objects per steradian along each ray that have the label of the ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)
@@ -54,11 +54,11 @@ def jointly_compatible(
 
 
 def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks, novelty: float) -> Floats:
-    """Return the expected number (n,) of unknown objects per steradian along each ray. They have the label of its landmark.
+    """Return the expected number (n,) of unknown objects with the label of the ray's landmark, per steradian along each ray.
 
-    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. The
-    assumed ratio of unknown to known objects is the same. Unknown objects are spread evenly over the room. They are visible
-    up to the end of the room, but not beyond the greatest distance at which a landmark was seen.
+    rows: (n,) the landmark of each ray. novelty: the recent number of boxes of unknown objects per box of a known one. It is
+    taken for the ratio of unknown to known objects. Unknown objects are spread evenly over the room. They are visible up to
+    the end of the room, but not beyond the greatest distance at which a landmark was seen.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -43,11 +43,11 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class PredictedLandmarks:
-    """Predicted positions in the next frame of a live session, n in all: of its landmarks, then of its candidates.
-    landmarks: the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays
-    were grouped by label alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry
-    at the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark
-    was seen."""
+    """The n landmarks and candidates that the next frame of a live session may show. The landmarks come first. landmarks:
+    the number of landmarks. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped
+    by label alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift up to
+    the last observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was
+    seen."""
 
     landmarks: int
     id: Ints
@@ -98,8 +98,8 @@ class State:
 
     @cached_property
     def deviation(self) -> Floats:
-        """Deviation (P,) of each assigned ray from its landmark, in standard deviations of its nominal noise; `BEHIND` for a
-        landmark behind the camera."""
+        """Deviation (P,) of each assigned ray from its landmark, in standard deviations of its nominal noise. It is `BEHIND`
+        for a landmark behind the camera."""
         return np.minimum(normalised_residuals(self.obs, self.landmarks.position[self.owner], of=self.assigned), BEHIND)
 
     @cached_property

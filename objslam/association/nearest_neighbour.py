@@ -23,7 +23,7 @@ def assign(
 ) -> Ints:
     """Return the most likely landmark (R,) of each ray, -1 for none. A landmark gets at most one ray per frame.
 
-    A known range changes the cost of a match. A wrong range adds little.
+    A measured range changes the cost of a match. A wrong range adds at most `RANGE_LOSS`.
 
     Args:
         positions: (N, 3) m, NaN to leave a landmark out. covariances: (N, 3, 3) m^2.

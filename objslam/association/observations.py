@@ -42,7 +42,7 @@ class Observations:
     def of_lines(
         cls, origin: Floats, direction: Floats, sigma: Floats, range_: Floats, range_sigma: Floats, label: Ints | None = None
     ) -> Self:
-        """Make observations of R lines in map, all in one frame, without boxes and tracks."""
+        """Make observations of R lines in map, all in one frame, without boxes and tracks. label: (R,), 0 by default."""
         zero, minus, size, box = _nothing(len(origin))
         label = zero if label is None else label
         return cls(zero, label, origin, direction, sigma, 0.0, range_, range_sigma, size, box, minus)
@@ -63,7 +63,7 @@ def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats]:
 
 
 def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the closest approach of P pairs of rays.
+    """Return the closest approach of P pairs of rays. first, second: (P,) the indices of the two rays of each pair.
 
     The values are the distances along the first and the second ray (P,) m, the midpoint (P, 3) m, the squared gap (P,) m^2,
     and the squared sine of the angle between the rays (P,).
@@ -84,6 +84,9 @@ def observe(
 
     Frames are sorted by time and camera. Boxes in a frame are sorted by label and coordinates. So the input order has no
     effect.
+
+    map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, noise of the directions. position_sigma: m, noise of the
+    origins.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]

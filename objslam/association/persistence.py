@@ -1,7 +1,7 @@
 """How likely objects of a map are still there, session after session: the persistence filter.
 
-Rosen, Mason, Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. An object survives for a time
-that is exponentially distributed, so that the filter needs only the last probability and the time since. A session is one
+Rosen, Mason, Leonard 2016, Towards lifelong feature-based mapping in semi-static environments. The time for which an object
+stays is exponentially distributed. So the filter needs only the last probability and the time since then. A session is one
 measurement: it finds the object or misses it. A miss counts only as far as the object was in view.
 """
 
@@ -24,7 +24,8 @@ finds."""
 _RATE = 0.5
 """The share of looks that detect an object of which nothing is known. A larger value makes a miss count more."""
 _LOOKS = 4.0
-"""How many looks the share `_RATE` counts for. A larger value trusts it longer."""
+"""The number of looks as which `_RATE` counts beside the looks at the object. A larger value needs more looks to change the
+rate."""
 _LEAST, _MOST = 1e-9, 1 - 1e-9
 """The limits of a probability. They let an object come back after any number of misses."""
 

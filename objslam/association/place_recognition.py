@@ -18,12 +18,12 @@ MIN_LANDMARKS = 2
 """The fewest common landmarks for recognising a place."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
 """The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
-_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the robot.
+_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot.
 _MARGIN = 2.0  # The margin (m) around all landmarks that counts as area in their density.
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
-_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Each two of these pairs form a hypothesis.
+_CANDIDATES = 3000  # The most pairs of a landmark here and a landmark there. Two such pairs form a hypothesis.
 _HYPOTHESES = 2000  # The most hypotheses from two pairs, with the longest bases. A larger number costs time.
-_VERIFIED = 20  # The hypotheses with the best quick scores that get a best assignment. A larger number costs time.
+_VERIFIED = 20  # The number of hypotheses, by quick score, that get a best assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
 _MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
@@ -31,7 +31,8 @@ _SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two cor
 
 @dataclass(frozen=True)
 class Constellation:
-    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 relative to it. label: (N,)."""
+    """Landmarks of one neighbourhood. position: (N, 3) m. covariance: (N, 3, 3) m^2 relative to the neighbourhood. label:
+    (N,)."""
 
     position: Floats
     covariance: Floats
@@ -39,10 +40,9 @@ class Constellation:
 
 
 def neighbourhood(position: Floats, covariance: Floats, label: Ints, pivot: Floats) -> Constellation:
-    """Make a constellation of landmarks with larger covariances.
+    """Make a constellation of landmarks. Their covariances get larger, because a neighbourhood may be deformed.
 
-    The added standard deviation grows with the horizontal distance from the pivot (2,) m, because a neighbourhood may be
-    deformed.
+    The added standard deviation grows with the horizontal distance from the pivot (2,) m.
     """
     bent = _BENT**2 + _BENT_PER_M**2 * ((position[:, :2] - pivot) ** 2).sum(axis=1)
     return Constellation(position, covariance + bent[:, None, None] * np.eye(3), label)
@@ -60,6 +60,7 @@ class Recognition:
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
     second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the best other place.
+    Negative evidence of the other place counts as 0.
     """
 
     correction: Floats
@@ -222,7 +223,10 @@ def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2), or None."""
+    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2).
+
+    None if no pair gains, or if a pair leaves its gate. one, two: (C,) the candidates.
+    """
     gain = np.zeros(problem.possible.shape)
     for _ in range(_REFINEMENTS):
         gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)

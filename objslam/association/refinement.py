@@ -120,8 +120,8 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
 def velocity_gain(
     obs: Observations, ray: Ints, index: Ints, position: Floats, noise: Floats, stamps: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Fit a velocity to each point. Return the sum (N,) of squared deviations that it explains, the share (N,) of all that
-    this is, and the motion (N,) m.
+    """Fit a velocity to each point. Return the sum (N,) of squared deviations that the velocity explains, the share (N,) of
+    all squared deviations that this is, and the distance (N,) m that each point moves while its rays see it.
 
     Pairs and points are as in `refine`. stamps: (P,) s of the rays.
     """
@@ -151,7 +151,7 @@ def velocity_gain(
 def _across(to: Floats) -> tuple[Floats, Floats]:
     """Return the lengths (P,) m of offsets (P, 3) m from cameras, and projections (P, 3, 3) perpendicular to them.
 
-    Residuals are angles, which do not change along the line of sight. So a point gains nothing by moving with its camera.
+    Residuals are angles, which do not change along the line of sight. So a point gains nothing by a motion along this line.
     """
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)
     toward = to / distance[:, None]

@@ -21,7 +21,8 @@ _FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis, so that u
 
 @dataclass(frozen=True)
 class PointFit:
-    """One fitted point. position: (3,) m. covariance: (3, 3) m^2. parallax: rad, of the inliers. inlier: (R,) bool."""
+    """One fitted point. position: (3,) m. covariance: (3, 3) m^2. parallax: rad, the widest angle between the inliers.
+    inlier: (R,) bool."""
 
     position: Floats
     covariance: Floats
@@ -55,7 +56,8 @@ def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -
 
 
 def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Floats | None:
-    """Return the point with the most agreeing rays, among the midpoints of ray pairs and the ends of ranges."""
+    """Return the point (3,) with the least robust cost, among the midpoints of ray pairs and the ends of ranges. None if no
+    pair of rays meets and no ray has a range."""
     count = len(obs)
     some = np.arange(count) if count <= _MOST_RAYS else np.sort(rng.permutation(count)[:_MOST_RAYS])
     a, b = (some[i] for i in np.triu_indices(len(some), 1))

@@ -15,19 +15,24 @@ from objslam.core.statistics import grouped_median, grouped_quantile, grouped_qu
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
 _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
-_CORE_SHARE = 0.8  # The strongest objects, with this share of a class's boxes, set its distances. Others may be phantoms.
+_CORE_SHARE = 0.8
+"""The share of a class's boxes that sets its usual distances. They are the boxes of the objects with the most boxes, because
+the other objects may be phantoms. A larger share lets phantoms widen the usual distances."""
 _FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
-_CLOSER = (0.3, 0.1)  # The least distance from an occluder to the object behind it: in m, and as a share of its distance.
-_SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. More are finer.
-_SAME_SIDE = np.cos(np.radians(45.0))  # The cosine of the turn within which a side looks alike. A smaller one counts more.
+_CLOSER = (0.3, 0.1)
+"""The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
+counts. Larger values hide fewer objects."""
+_SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. A larger number is finer.
+_SAME_SIDE = np.cos(np.radians(45.0))
+"""The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
 
 
 @dataclass(frozen=True)
 class CameraFrames:
     """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
-    (F, 4, 4). The distance of a usable box from the image edge is at least `margin` px, and at least `margin_share` of its
-    size. A negative margin allows any box."""
+    (F, 4, 4). The distance of a usable box from the image edge is at least `margin` px, and at least `margin_share` of the
+    box's size. A negative margin allows any box."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -47,8 +52,8 @@ class CameraFrames:
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains the box of each object. A frame counts
-    up to the greatest usual distance of the class or the greatest distance of the object's own boxes.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains the box of each object. A frame does
+    not count if it is farther away than the greatest usual distance of the class and than all boxes of the object.
     """
 
     object: Ints
@@ -70,11 +75,12 @@ class DetectionHistory:
 def detection_history(
     obs: Observations, matched: Ints, position: Floats, label: Ints, view: CameraFrames
 ) -> DetectionHistory:
-    """Return where the objects are or should be detected.
+    """Return in which frames the objects are or should be detected.
 
-    An object should be detected under four conditions. Its box lies in the image. Its distance is usual for its class or for
-    itself. No closer box hides it. The camera sees its front, if it has one. matched: (R,) the object of each observation,
-    -1 for none. position, label: (N, 3) m and (N,), of the objects.
+    An object should be detected under four conditions. Its box lies in the image. Its distance is within the usual distances
+    of its class, which are widened to include the median distance of its own boxes. No closer box hides it. The camera sees
+    its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,),
+    of the objects.
     """
     count = len(position)
     held = np.flatnonzero(matched >= 0)
@@ -126,7 +132,7 @@ def count_looks(
 
     Its box lies in the image, it is seen from a distance and from a side from which it was detected before, and no closer
     box covers it. extent: (N, 2) m, NaN where unknown. known: for each object from where it was detected, with the sides in
-    the frame of the positions. obs: the boxes of the frames. distance: (R,) m, how far their objects are, NaN where unknown.
+    the frame of the positions. obs: the boxes of the frames. distance: (R,) m to the object of each box, NaN where unknown.
     """
     near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
     found = np.zeros(len(position), dtype=np.int64)
@@ -158,7 +164,11 @@ def _from_known_sides(obj: Ints, toward: Floats, known: list[SeenFrom]) -> Bools
 
 
 def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
-    """Return the least and the greatest usual distance (C,) of each class, from the distances (P,) m of its boxes."""
+    """Return the least and the greatest usual distance (C,) of each class, from the distances (P,) m of boxes.
+
+    Only the objects with the most boxes count (`_CORE_SHARE`). index: (P,) the object of each box. label: (N,) of the
+    objects.
+    """
     number = np.bincount(index, minlength=len(label))
     order = np.lexsort((-number, label))
     before = np.cumsum(number[order]) - number[order]
@@ -208,7 +218,11 @@ def _in_image(
 
 
 def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, reach: Floats) -> Bools:
-    """Return whether the box of a closer object covers each pixel (V, 2). reach: (R,) m, the distance of its object."""
+    """Return whether the box of a closer object covers each pixel (V, 2).
+
+    frame, distance: (V,) the frame and the distance, m, of the object at each pixel. reach: (R,) m, the distance of the
+    object of each observation, NaN if unknown.
+    """
     hidden = np.zeros(len(frame), dtype=bool)
     useful = np.flatnonzero(np.isfinite(reach))
     frames = np.arange(int(max(frame.max(initial=0), obs.frame.max(initial=0))) + 2)

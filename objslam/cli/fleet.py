@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 _GB = 1e9
 _RAY_MEMORY = 4.0
 """The memory limit of a task on a cluster, GB, where the user gives none. A larger value lets larger logs pass."""
-_TENTHS = 10  # How often progress is told where stderr is no terminal.
+_TENTHS = 10  # The lines of progress of a stage, if stderr is no terminal. More lines show the progress more finely.
 
 Sources = Annotated[
     list[str], typer.Argument(metavar="SOURCE...", help="Logs, folders with logs, glob patterns, or URLs such as s3://...")
 ]
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
-    str, typer.Option("--by", help="What makes a site: a field of --layout, `folder` (the folder of a log), or `none`.")
+    str, typer.Option("--by", help="What makes a site: a field of --layout, `folder` (that of a log), or `none` (one site).")
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")
@@ -49,11 +49,11 @@ MemoryLimit = Annotated[
     ),
 ]
 TimeLimit = Annotated[float, typer.Option("--time-limit", min=0.0, help="Time limit of a task, s; 0 for none.")]
-Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task begins again whose process was lost.")]
+Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task begins again after its process died.")]
 Gpus = Annotated[
     float, typer.Option("--gpus", min=0.0, help="With --ray and --detector: the share of a GPU that each task takes.")
 ]
-Again = Annotated[bool, typer.Option("--retry-failed", help="Map the logs again that failed because of what is in them.")]
+Again = Annotated[bool, typer.Option("--retry-failed", help="Map again the logs that failed because of their content.")]
 WithReport = Annotated[bool, typer.Option("--report", help="Write report.html for each log.")]
 Price = Annotated[float | None, typer.Option("--price", min=0.0, help="Price of an hour of one core, for the column cost.")]
 FAILED = 1
@@ -183,7 +183,7 @@ def _shown() -> Iterator[Tell]:
 
 
 def _progress(done: int, failed: int, total: int, first: int, seconds: float) -> str:
-    """Return the progress in words. first: how many were done before, in so many `seconds` less."""
+    """Return the progress in words. first: the tasks that had ended at the first call. seconds: the time since then, s."""
     by_now = done + failed - first
     line = f"{done} of {total} done, {failed} failed, {total - done - failed} to do"
     if by_now <= 0 or seconds <= 0:

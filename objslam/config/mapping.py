@@ -132,6 +132,16 @@ class Triangulation(Section):
     object is unresolved."""
 
 
+class Bodies(Section):
+    """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
+
+    use: bool = True
+    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, it is the
+    point at which the rays through the centres of its boxes meet."""
+    sizes: dict[str, tuple[Positive, Positive, Positive]] = Field(default_factory=dict)
+    """Known length, width and height in m by label. The sizes of other labels are learnt from the log."""
+
+
 class Fixed(Section):
     """Configure the estimation of objects when the robot's poses are given and not estimated."""
 

@@ -41,6 +41,7 @@ class Settings(Section):
     checks: Checks = Checks()
     association: mapping.AssociationSettings = mapping.AssociationSettings()
     triangulation: mapping.Triangulation = mapping.Triangulation()
+    bodies: mapping.Bodies = mapping.Bodies()
     fixed: mapping.Fixed = mapping.Fixed()
     joint: mapping.Joint = mapping.Joint()
     live: mapping.Live = mapping.Live()

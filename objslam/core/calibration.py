@@ -127,7 +127,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
 
 
 class CalibratedMeasurements(Protocol):
-    """The measurements of a log, corrected by shared errors, as a function of these errors."""
+    """The measurements of a log, as logged, and corrected for given values of the shared errors (`at`)."""
 
     @property
     def names(self) -> tuple[str, ...]:

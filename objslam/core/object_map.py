@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.bodies.body import Body, surer_body
+from objslam.core.bodies.body_entry import BODY_COLUMNS, body_row
 from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
 from objslam.core.statistics import SAME_POINT
 
@@ -27,8 +29,10 @@ COLUMNS: dict[str, str] = {
     **dict.fromkeys(("x", "y", "z", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"), "float64"),
     **{"rays": "int64", "frames": "int64"},
     **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
+    **BODY_COLUMNS,
 }
-"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s."""
+"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
+yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,9 @@ class MapObject:
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
     label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
-    in the map of a single run. tag: the rotation and size of a fiducial, None for another object.
+    in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
+    heading around the position, None for a point. ray_point: (3,) m, the point at which the rays through the centres of its
+    boxes meet, if the position is the centre of the body.
     """
 
     id: int
@@ -138,6 +144,8 @@ class MapObject:
     existence: float | None = None
     seen_from: SeenFrom | None = None
     life: Life | None = None
+    body: Body | None = None
+    ray_point: Floats | None = None
     tag: TagPose | None = None
 
     @property
@@ -158,6 +166,7 @@ class MapObject:
                 self.last_seen,
                 self.existence,
             ),
+            *body_row(self.body),
         )
         known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
         return dict(zip(COLUMNS, known, strict=True))
@@ -335,4 +344,6 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
         extent=None if extent is None else (float(extent[0]), float(extent[1])),
         labels=labels,
         existence=None if a.existence is None or b.existence is None else float(np.fmax(a.existence, b.existence)),
+        body=surer_body(a.body, b.body),
+        ray_point=None,
     )

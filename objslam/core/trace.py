@@ -13,7 +13,7 @@ from objslam.core.estimate import Estimate
 from objslam.core.geometry import inverse
 from objslam.core.types import Association
 
-Why = Literal["fixed", "labels", "association", "merge"]
+Why = Literal["fixed", "labels", "association", "merge", "bodies"]
 Stage = Literal["grow", "solve"]
 
 

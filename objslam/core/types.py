@@ -127,11 +127,14 @@ class CameraLog:
 
 @dataclass(frozen=True)
 class TruthObject:
-    """One object of the ground truth. position: (3,) m in map."""
+    """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height. yaw: rad, the
+    direction of its length. Both are None if unknown."""
 
     id: int
     label: str
     position: Floats
+    size: Floats | None = None
+    yaw: float | None = None
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory, Truth, TruthObject
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_objects, correspondences, match_points
+from objslam.evaluation.bodies import BodyMatch, body_scores, match_bodies
 
 MAX_TRUTH_GAP = 1.0
 """The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
@@ -28,6 +29,7 @@ class Match:
 
     squared: squared Mahalanobis distance of the offset in x and y, by the object's covariance, rotated and scaled like the
     map. squared_3d: the same in x, y and z. Both are None without a covariance.
+    body: how the two bodies fit, None if one of the two has no size.
     """
 
     object: MapObject
@@ -35,6 +37,7 @@ class Match:
     offset: Floats
     squared: float | None
     squared_3d: float | None
+    body: BodyMatch | None = None
 
     @property
     def error(self) -> float:
@@ -179,11 +182,12 @@ def _score_objects(
 
 def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
     """Return a match. offset: (3,) m, after the alignment. The covariance of the object gives its Mahalanobis distance."""
+    body = match_bodies(found, true, transform)
     if found.covariance is None:
-        return Match(found, true, offset, None, None)
+        return Match(found, true, offset, None, None, body)
     turn = transform.scale * transform.pose[:3, :3]
     covariance = turn @ found.covariance @ turn.T
-    return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance))
+    return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance), body)
 
 
 def _squared(offset: Floats, covariance: Floats) -> float:
@@ -210,7 +214,8 @@ def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
     counts = ("matched", "missed", "false", "unresolved", "precision", "recall")
     honest = ("mahalanobis_median", "inside_95", "inside_95_3d")
     if scores is None:
-        return {**dict.fromkeys((*counts, *honest)), **_summary("position_", None), "transform": None}
+        none = dict.fromkeys((*counts, *honest, *body_scores([])))
+        return {**none, **_summary("position_", None), "transform": None}
     found = (len(scores.matches), len(scores.missed), len(scores.false), scores.unresolved, scores.precision, scores.recall)
     numbers = dict(zip(counts, found, strict=True))
     squared = np.array([(m.squared, m.squared_3d) for m in scores.matches if m.squared is not None])
@@ -219,7 +224,8 @@ def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
         numbers |= dict(zip(honest, (float(np.median(squared[:, 0])), *inside), strict=True))
     else:
         numbers |= dict.fromkeys(honest)
-    return {**numbers, **_summary("position_", scores.errors), "transform": _transform_dict(scores.transform)}
+    bodies = body_scores([m.body for m in scores.matches if m.body is not None])
+    return {**numbers, **_summary("position_", scores.errors), **bodies, "transform": _transform_dict(scores.transform)}
 
 
 def _path_dict(path: PathScores | None) -> dict[str, Any]:
@@ -247,6 +253,7 @@ def _listing(scores: ObjectScores | None) -> dict[str, Any]:
             "offset": m.offset.tolist(),
             "mahalanobis": m.squared,
             "mahalanobis_3d": m.squared_3d,
+            **({} if m.body is None else m.body.to_dict()),
         }
         for m in scores.matches
     ]

@@ -23,6 +23,14 @@ _OBJECT_ROWS = (
     ("inside_95", "share of truths inside the 95 % ellipse", ""),
     ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
+_BODY_ROWS = (
+    ("bodies", "bodies compared", ""),
+    ("size_error_median", "error of length, width and height, share, median", ""),
+    ("yaw_error_deg_median", "error of the yaw, median", " deg"),
+    ("iou_median", "3D overlap (IoU) of the bodies, median", ""),
+)
+"""The rows about bodies, if there are any: key in evaluation.json, name in the table, and unit."""
+
 """The rows about objects: key in evaluation.json, name in the table, and unit."""
 
 _PATH_ROWS = (
@@ -50,7 +58,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
-    for key, name, unit in rows:
+    for key, name, unit in (*rows, *(_BODY_ROWS if data["bodies"] else ())):
         scores.add_row(name, _cell(data[key], unit))
     parts: list[RenderableType] = [scores]
     if evaluation.objects is not None:

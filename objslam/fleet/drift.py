@@ -18,8 +18,8 @@ _MOST = 24
 class Drift:
     """The weighted mean of one shared error of one robot on each day.
 
-    days: their names, in order. value, sigma: (D,) in `unit`. change: of the last day from the first, in
-    standard deviations.
+    name: of the shared error. days: their names, in order. value, sigma: (D,) in `unit`. change: the value of the last day
+    minus that of the first, in standard deviations of this difference.
     """
 
     robot: str
@@ -31,7 +31,10 @@ class Drift:
     change: float
 
     def curve(self, width: float, height: float) -> tuple[str, list[tuple[float, float, float, str]], float, float]:
-        """Return the path of an SVG of this size, its points (x, y, half the bar, text), and the limits of its axis."""
+        """Return the curve in an SVG drawing of this size.
+
+        These are its path data, its points (x, y, half the error bar, text), and the ends of the vertical axis, in `unit`.
+        """
         low, high = float((self.value - self.sigma).min()), float((self.value + self.sigma).max())
         span = max(high - low, 1e-12)
         x = np.linspace(0, width, len(self.days)) if len(self.days) > 1 else np.array([width / 2])
@@ -46,9 +49,10 @@ class Drift:
 
 
 def drifts(mapped: Sequence[Mapped]) -> list[Drift]:
-    """Return the curves of robots that drove on two days or more, the largest change first, at most `_MOST`.
+    """Return at most `_MOST` curves, the largest change first.
 
-    Only values that a log determined count. The sessions of a day are averaged by their variances.
+    A curve belongs to a robot that the layout names, and to an error that its logs determine on two days or more. The value
+    of a day is the mean of its sessions, weighted by the inverse variances.
     """
     found: dict[tuple[str, str, str], dict[str, list[tuple[float, float]]]] = {}
     for one in mapped:

@@ -1,4 +1,4 @@
-"""Drive a fleet: find the logs, run what is missing on an engine, merge each site, and write the tables and the page."""
+"""Drive a fleet: run the logs without a result on an engine, merge each site, and write the tables."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from objslam.fleet.tree import MERGES, tree_of
 UNDATED = "undated"
 """The day of a log whose layout says none and whose clock does not count from 1970."""
 _CHUNK = 500
-"""How many records are read at once. A larger number asks a store less often, and takes more memory for a moment."""
+"""The records that are read at once. A larger number asks a store less often, and takes more memory for a moment."""
 
 Stage = Literal["mapping", "merging"]
 Tell = Callable[[Stage, int, int, int], None]
-"""A function that is told the stage, and how many of its tasks are done, have failed, and are there in all."""
+"""A function that is called with the stage, and with the numbers of its tasks that succeeded, that failed, and of all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """What the driver keeps of a log that was mapped. new: whether this run mapped it."""
+    """What the driver keeps of a log that was mapped.
+
+    key: of the result. begin: the first stamp of the path, s. warnings: their number. seconds: of the task, s. report:
+    whether the result has a report.html. new: whether this run mapped the log.
+    """
 
     place: LogPlace
     key: str
@@ -48,7 +52,10 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A log or a site that failed. kind: `log` if the log is to blame, `site`, or a kind of `Answer`. place: of a log."""
+    """A log or a site that failed. name: the path of the log, or the site. place: of the log, None for a site.
+
+    kind: `log` if something is wrong with the log, `site` for a site, else the kind of the task's `Answer`.
+    """
 
     name: str
     kind: str
@@ -58,7 +65,10 @@ class Failure:
 
 @dataclass
 class FleetResult:
-    """A fleet, which grows during a run. copies: the logs that have the content of another one, which count once."""
+    """What became of the logs and the sites of a fleet. A run adds to it.
+
+    copies: the number of mapped logs that have the same content as another log of their site. A merge takes one of them.
+    """
 
     mapped: list[Mapped] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
@@ -86,9 +96,10 @@ def run_fleet(
     Args:
         price: of an hour of one core, for the column cost; NaN if unknown.
         again: whether logs that failed before because of their content are tried once more.
-        merge_engine: the engine of the merges, if they need other resources than the mapping.
+        tell: is called at the start of the mapping, and when a task ends.
+        merge_engine: the engine of the merges, if they need other resources than the mapping. The default is `engine`.
     Raises:
-        StoreError: the output cannot be read or written.
+        StoreError, OutputError: the output cannot be read or written.
     """
     store = open_store(job.store)
     found = FleetResult()
@@ -191,7 +202,7 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
     done = 0
 
     def run(work: str, tasks: dict[Any, str]) -> Iterator[Answer]:
-        """Run the tasks of sites, of which each is named."""
+        """Run tasks, and yield their answers. tasks: the site of each task."""
         nonlocal done
         for answer in engine(work, tasks):
             done += 1
@@ -219,9 +230,10 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
 
 
 def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, paths: set[str]) -> dict[str, Member]:
-    """Return the sessions of a site by key, in the order of time, with those of earlier runs that had other logs.
+    """Return the sessions of a site by key, in the order of time: `members`, and those of earlier runs with other logs.
 
-    paths: of the logs of this run. What an earlier run found at one of them has been mapped again, or has failed.
+    state: the content of the site's `state_name`. digest: of the job. paths: of the logs that this run mapped or could not
+    map. An earlier session at one of these paths is left out, because this run replaces it.
     """
     before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
     return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))

@@ -1,4 +1,4 @@
-"""What all logs of a fleet have in common, from the settings of a user: with the files that the settings name."""
+"""Make the job that all logs of a fleet share, from the settings of the user and the files that the settings name."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ _INPUTS = "inputs"
 
 
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:
-    """Return the job of a fleet. Workers of other machines get the files of the settings through the store.
+    """Return the job of a fleet. If the store is remote, workers get the files of the settings through it.
 
+    store: the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html.
     ConfigError if a file cannot be read, StoreError if the store refuses.
     """
     files: dict[str, Path] = {}

@@ -36,10 +36,10 @@ def hash_log(path: Path) -> str:
 
 
 def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
-    """Return the hash of what else decides a result: settings, options of the source, the version, and `files`.
+    """Return the hash of what decides a result besides its log: settings, options of the source, the version, and `files`.
 
-    files: the content of each file that a setting names, by the dotted key of the setting, and of other inputs by their
-    names. The path of a file does not count.
+    files: the content of each file that a setting names, by the dotted key of the setting, and of the detector, by the key
+    "detector". The path of a file does not count.
     """
     values = change_settings(settings, dict.fromkeys((key for key in files if "." in key), "a file")).model_dump(mode="json")
     said: dict[str, Any] = {"version": __version__, "settings": values}
@@ -49,7 +49,7 @@ def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str
 
 
 def key_of(*parts: str) -> str:
-    """Return the key of some texts, in their order."""
+    """Return the key of texts: the first digits of the hash of the texts, in their order."""
     return sha256("\0".join(parts).encode()).hexdigest()[:_LETTERS]
 
 

@@ -1,4 +1,4 @@
-"""Find the logs that the sources of a fleet name, and say of which site, robot and day each is."""
+"""Find the logs that the sources of a fleet name, and the site, the robot and the day of each."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from objslam.fleet.stores.open_store import open_source
 from objslam.fleet.stores.store import FileState
 
 DEFAULT_LAYOUT = "{site}/{log}"
-"""The layout of logs that nobody described: the folder that holds a log is its site."""
+"""The default layout: the folder that holds a log is its site."""
 NO_SITE = "all"
-"""The name of the site if all logs are of one."""
+"""The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
 _LOG_MARKS = {
     *("camera.yaml", "cameras", "odometry.txt", "localization.txt", "journal.objslam"),  # Log folders and journals.
     *("Barcodes.dat", "groundtruth.txt", "groundtruth.txt.gz", "truth_cam_poses.txt"),  # MRCLAM and TUM RGB-D.
@@ -28,8 +28,8 @@ _BAG_FOLDER = "metadata.yaml"
 
 @dataclass(frozen=True, slots=True)
 class LogPlace:
-    """A log that was found. path: as a path or URL. size: bytes. fingerprint: of its names, sizes and times, which changes
-    if a file changes. site, robot, day: empty if the layout does not say."""
+    """A log that was found. path: a path or URL. size: bytes. fingerprint: the hash of its path, and of the name, the size
+    and the stamp (`FileState`) of each file. site, robot, day: empty if the layout does not say."""
 
     path: str
     size: int
@@ -43,7 +43,8 @@ class Layout:
     """The folders above a log, as "{site}/{robot}/{day}/{log}". Each {name} is one part of a path."""
 
     def __init__(self, template: str, by: str) -> None:
-        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`.
+        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`
+        for one site of all logs.
 
         ConfigError for a wrong template or field.
         """
@@ -57,11 +58,17 @@ class Layout:
         if len(set(fields)) < len(fields) or not fields:
             raise ConfigError(f"a layout names each field once: {template!r}", hint=hint)
         if by not in (*fields, "folder", "none"):
-            raise ConfigError(f"--by {by!r} is no field of the layout {template!r}", hint="or folder, or none")
+            raise ConfigError(
+                f"--by {by!r} is no field of the layout {template!r}", hint="name a field of it, folder or none"
+            )
         self._template, self._by = template, by
 
     def fields(self, path: str) -> tuple[str, str, str]:
-        """Return the site, the robot and the day of a log. ConfigError if the path is too short for the layout."""
+        """Return the site, the robot and the day of a log.
+
+        If a path does not fit the layout, its robot and day are empty with --by folder or none. With a field of the layout,
+        this is a ConfigError.
+        """
         parts = [part for part in path.partition("://")[2 if "://" in path else 0].split("/") if part]
         tail = parts[-len(self._parts) :]
         found: dict[str, str] = {}
@@ -88,8 +95,9 @@ class Layout:
 def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
     """Return the logs that paths, glob patterns and URLs name, each once, in order.
 
-    A folder that is no log is searched. A path that is named and holds no log counts as one: its run says what is wrong with
-    it. Of the files that a pattern names, only bags count. LogError if a source names nothing.
+    A folder that is no log is searched. A path that is named and has no log counts as one: its run says what is wrong with
+    it. Of the files that a pattern names, only bags count. LogError if a source names nothing, ConfigError if a path does
+    not fit the layout.
     """
     found: dict[str, LogPlace] = {}
     for source in sources:
@@ -108,7 +116,10 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
 
 
 def _split(files: Mapping[str, FileState]) -> Iterator[tuple[str, dict[str, FileState]]]:
-    """Yield the relative path of each log among files, with the files of the log. Without one, all files are one log."""
+    """Yield the relative path of each log among files, with the files of the log. If there is no log, all files are one.
+
+    A log inside another log is a part of the outer one.
+    """
     names: dict[str, set[str]] = {}
     for name in files:
         folder, _, last = name.rpartition("/")

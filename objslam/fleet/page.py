@@ -23,7 +23,8 @@ PAGE = "fleet.html"
 _FAILURES = 500
 """The most failures on the page. failed.parquet has all of them."""
 _SESSIONS = 1000
-"""The most sessions on the page, those that need attention and the newest first. sessions.parquet has all of them."""
+"""The most sessions on the page. Bad verdicts come first, then check, then good, each with the newest first.
+sessions.parquet has all of them."""
 _WIDTH, _HEIGHT = 100.0, 36.0  # The size of a curve, in units of its drawing.
 
 
@@ -63,7 +64,7 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return what the table of sites says of the sessions of a site."""
+    """Return what the table of sites says of the sessions of a site that this run has."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),
@@ -74,7 +75,7 @@ def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
 
 
 def _chosen(mapped: Sequence[Mapped]) -> list[Mapped]:
-    """Return the sessions that the page lists."""
+    """Return the sessions that the page lists, as `_SESSIONS` says."""
     return sorted(mapped, key=lambda one: ("bad", "check", "good").index(one.verdict) * 1e12 - one.begin)[:_SESSIONS]
 
 

@@ -1,4 +1,4 @@
-"""The record of a log: what a fleet keeps of one run beside its result. It is written last, and marks a whole result."""
+"""The record of a log: what a fleet keeps of one run besides the result. It is written last, and marks a whole result."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from objslam.fleet.stores.store import StoreError
 from objslam.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"
-"""The folders of a fleet: of the results by key, of their records, and of the keys of the logs that were seen."""
+"""The folders of a fleet: of the results by key, of their records, and of the empty files that `seen_name` names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A shared error that a run estimated, with its standard deviation. known: whether the log determines it."""
+    """A shared error that a run estimated. value, sigma: in `unit`. known: whether the log determines the error."""
 
     name: str
     value: float
@@ -29,9 +29,10 @@ class Parameter:
 class Record:
     """What became of one log.
 
-    key: of its content, the settings and the version. error: what is wrong with the log, empty if it was mapped. begin, end:
-    the stamps of its path, s. verdict: good, check or bad. cpu, seconds: of the task, s. memory: the most RAM of its
-    process so far, bytes. files: of the result. report: whether it has a report.html.
+    key: of the content, the settings and the version. source: the path or URL of the log. log: the hash of its content.
+    settings: the digest of the job. error: what is wrong with the log, empty if it was mapped. begin, end: the first and the
+    last stamp of the path, s. verdict: good, check or bad. cpu, seconds: the processor time and the duration of the task, s.
+    memory: the most RAM that its process had so far, bytes. size: of the result, bytes. files: the names in the result.
     """
 
     key: str
@@ -59,7 +60,7 @@ class Record:
 
     @classmethod
     def parse(cls, data: bytes, where: str) -> Self:
-        """Return the record in a file. StoreError with `where` if it is damaged."""
+        """Return the record from the content of its file. StoreError, with the name `where`, if it is damaged."""
         try:
             said: dict[str, Any] = json.loads(data)
             said["calibration"] = tuple(Parameter(**one) for one in said["calibration"])
@@ -80,12 +81,15 @@ def result_name(key: str) -> str:
 
 
 def seen_name(task: str, key: str, good: bool) -> str:
-    """Return the name of the empty file that says which key a log has, and whether it was mapped."""
+    """Return the name of the empty file that says which key a log has, and whether it was mapped (`good`).
+
+    task: the key of the log's fingerprint and the job, which is known before the log is read.
+    """
     return f"{SEEN}/{task}.{key}.{'done' if good else 'failed'}"
 
 
 def parse_seen(names: list[str]) -> dict[str, tuple[str, bool]]:
-    """Return for each task its key, and whether its log was mapped, from the names of the files in the folder `SEEN`."""
+    """Return the key of each task, and whether its log was mapped, from the names of the files in the folder `SEEN`."""
     found: dict[str, tuple[str, bool]] = {}
     for name in names:
         task, _, rest = name.partition(".")

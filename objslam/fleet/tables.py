@@ -27,7 +27,10 @@ _LIFE = ("state", "probability", "sessions_expected", "sessions_seen", "updated"
 
 
 def session_schema() -> pa.Schema:
-    """Return the columns of the table of sessions. Stamps are in s, memory and size in bytes, seconds and cpu in s."""
+    """Return the columns of the table of sessions.
+
+    Stamps, seconds and cpu are in s, memory and size in bytes, x, y and z in m, yaw in rad, cost in the unit of the price.
+    """
     import pyarrow as pa
 
     parameter = pa.struct([("name", pa.string()), ("value", pa.float64()), ("sigma", pa.float64())])
@@ -52,7 +55,8 @@ def session_row(
 ) -> dict[str, Any]:
     """Return the row of a session.
 
-    pose: (4, 4) in the frame of its island. odds, common: as in `Placed`. price: of an hour of one core, NaN if unknown.
+    island: its number from 1. pose: (4, 4) of the session in the frame of its island, m. odds, common: the `log_odds` and
+    `common` of `Placed`. price: of an hour of one core, NaN if unknown.
     """
     counts = record.counts or {}
     return {
@@ -96,9 +100,9 @@ def dump_sessions(rows: Sequence[dict[str, Any]]) -> bytes:
 
 
 def dump_objects(rows: Sequence[dict[str, Any]], *, lives: bool = False) -> bytes:
-    """Return the content of a GeoParquet file of objects. lives: with the columns of `core.object_map.Life`.
+    """Return the content of a GeoParquet file of objects. The geometry of an unresolved object is null.
 
-    The geometry of an object without a position is null.
+    lives: whether the objects are those of a site. Then the columns `_LIFE` replace session, source and robot.
     """
     import pyarrow as pa
 

@@ -1,7 +1,7 @@
 """The merge of a site as a tree: groups of sessions, pairs of groups, pairs of pairs.
 
-The sessions are in the order of time. The key of a node is of the keys below it. So when sessions are added at the end, only
-the nodes on the way from them to the root are new, and the sessions cost what they cost and not what the site costs.
+The sessions are in the order of time. The key of a node is a hash of the keys below it. So when sessions are added at the
+end, only the nodes on the way from them to the root are new. The other nodes are not merged again.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from objslam import __version__
 from objslam.fleet.keys import key_of
 
 LEAF = 4
-"""The most sessions that are merged at once. A larger number makes fewer tasks, and each of them longer: all pairs of its
-sessions are registered."""
+"""The most sessions of one group. A larger number makes fewer tasks, and each of them longer, because all pairs of sessions
+in a group are registered."""
 MERGES = "merges"
 """The folder of the nodes in the store."""
 
@@ -30,8 +30,8 @@ class Node:
 
 
 def tree_of(sessions: Sequence[str]) -> list[list[Node]]:
-    """Return the nodes of a site, level by level. The last level is the root alone. A level may repeat a node of the one
-    before, which had no partner.
+    """Return the nodes of a site, level by level. The last level is the root alone. A node without a partner is also in the
+    next level.
 
     sessions: the keys of the results, one at least, in the order of time.
     """

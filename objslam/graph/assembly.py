@@ -29,8 +29,8 @@ from objslam.graph.variables import make_values
 class Measurements:
     """The measurements of a log, as P multiframes.
 
-    images: the keyframes before they were joined. keyframes: (P,) the first keyframe of each multiframe. The graph has the
-    poses of these. rays: in the frames of these keyframes. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions
+    images: the K keyframes before they were joined. keyframes: the first keyframe of each multiframe. The graph has only
+    their poses. rays: in the camera frames of `keyframes`. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions
     by odometry, None without odometry. tags: the fiducials whose corners are landmarks, None if there are none.
     """
 
@@ -74,8 +74,8 @@ class Measurements:
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the graph of the whole log, and its values. The ties of fiducials are its last factors.
 
-        owner: (R,) the landmark of each ray. used: (R,) the rays in the graph. map_T_camera: (P, 4, 4). positions: (N, 3) m,
-        NaN for a landmark that is not in the graph.
+        owner: (R,) the landmark of each ray. used: (R,) whether a ray is in the graph. map_T_camera: (P, 4, 4). positions:
+        (N, 3) m, NaN for a landmark that is not in the graph. loss: the loss of the bearings.
         """
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         factors = self.factors(owner, np.flatnonzero(used), landmarks, positions, loss)

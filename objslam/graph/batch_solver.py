@@ -30,9 +30,8 @@ from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
-"""A joint solve ends if the cost decreases by less than this share. The first value is for the last solve. The second is for
-the solve before the shared errors and the noise are estimated, because they move everything again. Larger values end it
-sooner."""
+"""A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
+shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
 _ROUNDS_BEFORE = 2
 """The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
 its steps. A larger number is slower, and leads to the same inliers."""
@@ -48,8 +47,8 @@ def solve_fixed(
 ) -> Estimate:
     """Solve the objects at fixed poses, starting from the triangulation, with one point-to-line factor for each inlier.
 
-    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions of objects
-    that need their ranges. The other losses weigh each ray by the noise across it at the object's distance, and add a
+    The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions that Eq. 1
+    cannot give without ranges. The other losses weigh each ray by the noise across it at the object's distance, and add a
     factor along the ray for a measured range. Objects that the triangulation did not resolve are left out.
     """
     loss = settings.fixed.loss
@@ -108,13 +107,14 @@ def solve_joint(
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
     Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
-    return. Objects enter or move if the poses now determine them better. Solve and test repeat until nothing changes.
-    If most rays of a stretch of the drive were rejected, its poses may be wrong. Then these rays return once, and the better
-    solution counts. Images of one stamp share one pose. SolveError if the linear system is indeterminate, or if the cost is
-    not finite.
+    return. An object is added or moved if the poses now determine it better. Solve and test repeat until nothing changes.
+    If most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong.
+    In this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
+    SolveError if the linear system is indeterminate, or if the cost is not finite.
     start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors.
-    These are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance of objects.
-    hold: whether the shared errors and the noise are kept fixed.
+    The shared errors are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance
+    of objects. hold: whether the shared errors stay at theta, and the noise as it is. In this case, no covariance is added.
+    progress(done, total) counts the keyframes in the growing graph.
     The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
     tags = TagCorners.of(rays, association, settings)
@@ -220,7 +220,8 @@ def solve_joint(
 def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:
     """Return the covariance (N, 3, 3) that the bias of ranges adds, if all ranges of an object share their bias.
 
-    directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times one sigma of the bias.
+    directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times the standard deviation of the
+    bias of its range. landmark: (r,) the object of each ray.
     """
     pull = np.zeros(covariance.shape[:2])
     np.add.at(pull, landmark, strength[:, None] * directions)
@@ -230,8 +231,8 @@ def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, lan
 
 def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
-    # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. n independent ranges with the
-    # variance s^2 + n b^2 have the same.
+    # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. The mean of n independent
+    # ranges with the variance s^2 + n b^2 has the same variance.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
     sigma = rays.range_sigma.copy()

@@ -1,10 +1,10 @@
-"""Explore a log without names by an extended Kalman filter: poses, landmarks, and the landmark of each ray.
+"""Find poses, landmarks, and the landmark of each ray by an extended Kalman filter, from odometry and rays.
 
-The filter keeps all correlations between errors. It includes the errors that all motions share, such as a lagging clock. So
-it knows in each frame where each landmark may appear. The rays of a frame are assigned together, because one error of the
-pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
-After a long way, new landmarks may be old ones. They are tied to the old ones if one drift explains all these pairs much
-better than chance. A frame takes the same time at the start and at the end of a log.
+The filter keeps all correlations between errors. The errors include those that all motions share, such as the one of a
+lagging clock. So the filter knows in each frame where each landmark may appear. The rays of a frame are assigned together,
+because one error of the pose shifts all of them. A ray with a range that fits no landmark gives a new landmark.
+After a long way, a landmark that seems new may be an old one. Recent landmarks are tied to old ones if one drift explains
+all pairs much better than chance. The time for a frame grows with the number of landmarks, hardly with that of frames.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,13 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
-"""A landmark with too few rays is dropped after this number of frames. A larger number keeps false landmarks longer."""
+"""A landmark with too few rays is dropped after this number of frames without a ray, or sooner if the heading drifted by
+`HORIZON` since its last ray. Recent landmarks are compared with old ones until this number of frames after the last new
+landmark or tie. A larger number keeps false landmarks longer, and is slower."""
 _RECENT = 300
 """The number of frames after its first ray in which a landmark can be tied to an old one. A larger number is slower."""
 _SURE = 4.0
-"""The least log odds of a match over the best explanation without this match. Larger odds leave more rays to the solve."""
+"""The least log odds of a match over the best explanation without this match. Larger odds match fewer rays."""
 _NEW = 0.2
 """The expected share of rays that belong to no known landmark. A larger share accepts fewer matches."""
 _PAIRS = 40
@@ -46,9 +48,9 @@ _EXPLAINED = 0.8
 simulated rooms and among the posts of Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM robots, whose landmarks stand
 0.18 m apart. With a larger share, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""How the factors on the motion's variances change: the share of one correction, the largest factor, and the largest ratio
-of a squared correction to its expectation that counts. Larger values adapt sooner to rough odometry, and also to
-outliers."""
+"""How the factors on the motion's variances adapt: the share by which one correction changes a factor, the largest factor,
+and the largest counted ratio of a squared correction to its expectation. Larger values adapt sooner to rough odometry, and
+also to outliers."""
 
 
 def explore(
@@ -58,7 +60,7 @@ def explore(
     progress: Callable[[int, int], None],
     errors: CalibratedMeasurements | None = None,
 ) -> InitialEstimate:
-    """Return poses, landmarks and an association. Rays that are not sure have no landmark.
+    """Return poses, landmarks and an association. A ray has no landmark if its match is not sure.
 
     errors: the same keyframes and rays as a function of shared errors. The filter estimates these errors, starting from
     their mean. progress(done, total) is called with numbers of keyframes.
@@ -71,16 +73,16 @@ def explore(
 def is_sure(start: InitialEstimate) -> bool:
     """Return whether an exploration explains enough rays for a solve to start from it.
 
-    If not, landmarks of one label stand closer together than the error of the odometry, and a single frame cannot tell them
-    apart.
+    If not, landmarks of one label probably stand closer together than the error of the odometry, and a single frame cannot
+    tell them apart.
     """
     return bool((start.association.object >= 0).mean() >= _EXPLAINED)
 
 
 class _Exploration:
     """The filter at the present frame. label, first, last, hits: (N,) of its landmarks: label, first and last frame, and
-    number of rays. owner: (R,) the landmark of each ray. doubtful: (R,) rays that may belong to a known landmark. path:
-    (P, 4, 4) the base at each frame."""
+    number of rays. owner: (R,) the landmark of each ray. doubtful: (R,) rays that may belong to a known landmark, and so
+    give no new one. path: (P, 4, 4) the base at each frame."""
 
     def __init__(
         self,
@@ -107,7 +109,7 @@ class _Exploration:
         self.owner, self.doubtful = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays), dtype=bool)
         self.label, self.first, self.last, self.hits = np.zeros((4, 0), dtype=np.int64)
         self.rarity = -np.log(_NEW) + _log_spread(self.sight)
-        self.birth = -_STRETCH  # The last frame with a new landmark.
+        self.birth = -_STRETCH  # The last frame with a new landmark or a tie.
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
         """Explore all frames."""
@@ -127,7 +129,7 @@ class _Exploration:
         return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 
     def _see(self, rays: Ints, now: int) -> None:
-        """Assign the rays of a frame, correct the filter, and add a landmark for each other ray with a range."""
+        """Assign a frame's rays, and correct the filter. A free ray with a range gives a landmark, unless it is doubtful."""
         if len(self.filter) and len(rays):
             self._match(rays)
         free = rays[(self.owner[rays] < 0) & ~self.doubtful[rays] & np.isfinite(self.rays.range[rays])]
@@ -154,7 +156,7 @@ class _Exploration:
         found = assign_jointly(Pairings(row, column, expected.residual, total, rarity, SAME_POINT_WIDE))
         sure = found.margin >= _SURE
         chosen = found.chosen[sure]
-        # A ray is doubtful if two landmarks compete for it, or if a free landmark could have had it as a sure match.
+        # A ray is doubtful if two landmarks compete for it, or if it would be a sure match of a free landmark by itself.
         could = rarity - 0.5 * np.linalg.slogdet(2 * np.pi * alone[near])[1] >= _SURE
         could &= ~np.isin(column, column[chosen]) & ~np.isin(row, row[chosen])
         self.doubtful[rays[np.concatenate([row[found.chosen[~sure & found.rival]], row[could]])]] = True
@@ -163,14 +165,14 @@ class _Exploration:
             self._learn(*ekf.update(f, expected.take(chosen)))
 
     def _learn(self, step: Floats, expected: Floats) -> None:
-        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with an expected covariance (3, 3)."""
+        """Adapt the roughness of the odometry to a correction (3,) of yaw, x and y with its expected covariance (3, 3)."""
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first frame after which the drift up to now is small."""
+        """Return the first of the last `_STRETCH` frames from which on the drift of the heading is below `HORIZON`."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
@@ -229,14 +231,14 @@ class _Exploration:
 
 
 def _likeliest(squared: Floats) -> Ints:
-    """Return at most `_PAIRS` pairs (p,) within the gate, in their order. The least squared deviations (P,) are chosen."""
+    """Return the increasing indices (p,) of the least squared deviations (P,): at most `_PAIRS`, all within the gate."""
     near = np.flatnonzero(squared <= SAME_POINT_WIDE)
     return np.sort(near[np.argsort(squared[near], kind="stable")[:_PAIRS]])
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the area or volume over which rays of new things spread, estimated from all rays. The unit is
-    rad^2, or rad^2 m with a range."""
+    """Return the log (R,) of the area or volume over which rays to new landmarks spread, estimated from all rays. The unit
+    is rad^2, or rad^2 m with a range."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

@@ -35,7 +35,7 @@ class FactorStore:
     kinds: dict[str, dict[int, Stored]] = field(default_factory=lambda: {kind: {} for kind in _OWN_KINDS})
 
     def add(self, kind: str, numbers: Sequence[int], groups: Sequence[Factors]) -> None:
-        """Store one group of factors for each number. It replaces the factors of this kind that already have the number."""
+        """Store one group of factors for each number. A group replaces the stored factors of its kind and number."""
         stored = self.kinds.setdefault(kind, {})
         for number, group in zip(numbers, groups, strict=True):
             stored[number] = Stored(frozenset(key for factor in group for key in factor.keys()), group)  # noqa: SIM118 (no dict)

@@ -1,4 +1,4 @@
-"""Triangulate objects at fixed camera poses. The noise of these poses counts as noise of the rays."""
+"""Triangulate objects at fixed camera poses. The noise of a localisation counts as noise of the rays."""
 
 import numpy as np
 

@@ -116,7 +116,7 @@ class GrowingGraph(ABC):
             self._at.poses.pop(k, None)
 
     def drop_kind(self, kind: str) -> None:
-        """Remove all factors of a kind from `add`, and the variables from `add_variable` that then have no factor."""
+        """Remove all factors of a kind of `add`, and the variables of `add_variable` that are left without a factor."""
         self._rebuild = None
         self._store.kinds.pop(kind, None)
         self._drop_free_variables()
@@ -162,7 +162,7 @@ class GrowingGraph(ABC):
         self._drop_free_variables()
 
     def _drop_free_variables(self) -> None:
-        """Remove the variables from `add_variable` that no factor holds. They would make the linear system indeterminate."""
+        """Remove the variables of `add_variable` that are in no factor. They would make the linear system indeterminate."""
         if self._at.others:
             held = self._store.variables()
             self._at.others = {key: value for key, value in self._at.others.items() if key in held}

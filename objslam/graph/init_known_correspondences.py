@@ -1,7 +1,7 @@
 """Initialise poses and landmarks with a known association, by growing the graph along the path.
 
-From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes enter a few at a time, at poses that
-continue the solved path by odometry, and a sliding window is solved. A landmark enters when its rays so far determine its
+From dead reckoning alone, a batch solve can diverge by kilometres. So keyframes are added a few at a time, at poses that
+continue the solved path by odometry, and a sliding window is solved. A landmark is added when its rays so far determine its
 position.
 """
 
@@ -19,20 +19,20 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The number of iterations of each solve during growth. Few are enough, because each solve starts close to its optimum, and
-the next solve continues from its result. A larger number is slower."""
+"""The most iterations of each solve during growth. Few are enough, because each solve starts close to its optimum, and the
+next solve continues from its result. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses. Below the first limit, the step
 doubles. Above the second limit, a shorter step is tried. Larger limits take longer steps. On MRCLAM, all limits from 1 and 3
-to 5 and 15 degrees converge to the same map. With iSAM2 instead of these solves, robot 1 or 5 failed."""
+to 5 and 15 degrees converge to the same map. With iSAM2 in place of a window, robot 1 or 5 did not converge."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
 median angle of the step. Larger values accept more false boxes. Both are well above the odometry's drift in one step."""
 _MORE_RAYS = 1
-"""The number of agreeing rays beyond association.min_rays that a landmark needs to enter. With more rays, landmarks enter
-later. With fewer, false boxes agree by chance too often."""
+"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks are added
+later. With fewer rays, false boxes agree by chance too often."""
 _SHORTEST = 4
-"""The shortest step is joint.grow_step divided by this. A larger number allows shorter steps and slower growth."""
+"""The shortest step is joint.grow_step divided by this number, and at least 2. A larger number allows slower growth."""
 _AGAIN = 1.05
 """A landmark that is not yet in the graph is triangulated again when its number of rays has grown by this factor. A larger
 factor is faster, but landmarks come into the graph later. With a factor of 1, the time would grow with the square of the
@@ -53,7 +53,8 @@ def initialize_known(
     window = SlidingWindow(measured, owner, association.count, _ITERATIONS)
     map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)  # Rays without a landmark; how many each had.
+    # The rays without a landmark, and how many of them each object had when it was last triangulated.
+    waiting, tried = np.zeros(0, dtype=np.int64), np.zeros(association.count)
     begin, step, recorded = 1, settings.joint.grow_step, 0
     shortest = max(2, step // _SHORTEST)
     while begin < len(keyframes):
@@ -104,7 +105,7 @@ def _new_landmarks(
     rays: Rays, association: Association, map_T_camera: Floats, waiting: Ints, settings: Settings
 ) -> tuple[Ints, Floats, Floats, Ints]:
     """Return the landmarks (n,) that the rays `waiting` now determine, their positions (n, 3), their covariances (n, 3, 3)
-    at the present poses, and the rays (m,) that agree with them."""
+    at the camera poses (K, 4, 4), and the rays (m,) that agree with them."""
     waiting = waiting[_may_have_parallax(rays.take(waiting), association.object[waiting], map_T_camera, settings)]
     if len(waiting) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), waiting
@@ -119,7 +120,8 @@ def _new_landmarks(
 def _may_have_parallax(rays: Rays, owner: Ints, map_T_camera: Floats, settings: Settings) -> Bools:
     """Return a mask (R,) of the rays whose landmark can have enough parallax, or has a ray with a range.
 
-    This quick test avoids slow triangulations. Two rays differ by at most twice the largest angle from their mean.
+    This quick test avoids slow triangulations. Two rays of a landmark differ by at most twice the largest angle between one
+    of its rays and their mean direction.
     """
     _, directions = rays.in_map(map_T_camera)
     mean = np.zeros((owner.max(initial=-1) + 1, 3))

@@ -1,9 +1,9 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes enter a few at a time, at poses that continue the solved path by odometry. Each
-ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's drift.
-Unassigned rays of recent keyframes give new landmarks, because the drift between these keyframes is small. The result is the
-start of a global association.
+As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry.
+Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's
+drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these keyframes is small. The result
+is the start of a global association.
 """
 
 from collections.abc import Callable
@@ -33,19 +33,20 @@ landmark was observed. A larger value recognises landmarks after a longer absenc
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The error (m) that a measured range may have in addition to its noise. A larger value accepts more wrong ranges."""
+"""The error (m) that a measured range may have beyond 4 standard deviations of its noise. A larger value accepts more wrong
+ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
 """The uncertainty of the poses in a step after their alignment with the landmarks. It is the share `_LEFT` of the drift's
 covariance, plus the standard deviations `_TURN` (rad) and `_SHIFT` (m). Larger values widen the gate of every ray."""
 _MORE_RAYS = 2
-"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks enter later.
-With fewer rays, more wrong landmarks enter, and each of them disturbs all later poses."""
+"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With more rays, landmarks are added
+later. With fewer rays, more wrong landmarks are added, and each of them disturbs all later poses."""
 _ITERATIONS, _ITERATIONS_OF_A_LOOP = 3, 20
-"""The numbers of iterations of the solve after a step and of the solve after a loop closure. The solve after a loop closure
+"""The most iterations of the solve after a step, and of the solve after a loop closure. The solve after a loop closure
 starts farther from its optimum, so it needs more. Larger numbers are slower."""
 _STRAIN = 200.0
 """A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
-closes more wrong loops. On MRCLAM, correct loops took up to 110 for each landmark, and wrong ones 240 or more."""
+closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
 def _recognise(
     rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and poses (K, 4, 4), aligned from keyframe `begin` on."""
+    """Return the active landmark of each new ray (n,), or -1, and the poses (K, 4, 4) with `begin` to `end` - 1 aligned."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)

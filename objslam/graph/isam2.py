@@ -1,7 +1,8 @@
 """Estimate a growing graph by iSAM2: updates, rebuilds, and access to the estimate.
 
 If an update raises an exception, Levenberg-Marquardt solves the stored factors from the last good estimate. iSAM2 is then
-rebuilt at this solution. Levenberg-Marquardt succeeds, because its damping determines the variables without measurements.
+rebuilt at this solution. The damping of Levenberg-Marquardt determines the variables without measurements. If iSAM2 still
+raises an exception, landmarks get priors, and if that is not enough, poses too.
 """
 
 from typing import Any
@@ -27,14 +28,14 @@ number spreads more rebuilds over several images."""
 _SLICE = 100
 """The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays the next image longer."""
 _FRESH = 10
-"""A landmark counts as deep in iSAM2's tree if this many updates did not involve it. A larger number changes the layout of
-the tree less often, and finds returning landmarks deeper in the tree."""
+"""A landmark counts as deep in iSAM2's tree after this number of updates that did not involve it. A larger number changes
+the layout of the tree less often, and finds returning landmarks deeper in the tree."""
 
 
 class IncrementalGraph(GrowingGraph):
     """A growing graph and its estimate.
 
-    rebuilds: how many times the graph was rebuilt because an update raised an exception.
+    rebuilds: how many times the graph was solved and rebuilt because an update or a rebuild raised an exception.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -44,7 +45,7 @@ class IncrementalGraph(GrowingGraph):
         self.rebuilds = 0
 
     def update(self) -> None:
-        """Add the new variables and factors to the estimate."""
+        """Add the new variables and factors to the estimate. SolveError if no rebuild succeeds after an exception."""
         self._updates += 1
         self._work_in()
 
@@ -58,7 +59,8 @@ class IncrementalGraph(GrowingGraph):
         if relinearise or sunk or self._new.size():
             self._work_in(relinearise, self._layout(coming))
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
-            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}  # The others may be deep now.
+            # A landmark that is not in this table counts as deep.
+            self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}
         if self._newest in self._at.poses:
             self.pose(self._newest)  # This makes iSAM2 solve now.
 
@@ -146,10 +148,11 @@ class IncrementalGraph(GrowingGraph):
             self._rescue()
 
     def rebuild_in_slices(self, order: Ints) -> None:
-        """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end the old graph stays in use.
+        """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end, the old graph stays in use.
 
-        If the method is called again before the end, it rebuilds at once. Otherwise, frequent changes could postpone the end
-        for ever. order: (K,) all keyframes. The keyframe at the start of a motion comes before the one at its end.
+        A graph of at most `_AT_ONCE` keyframes is rebuilt at once. So is a graph whose rebuild has not ended, because
+        frequent changes could postpone the end for ever. order: (K,) all keyframes. The keyframe at the start of a motion
+        comes before the one at its end.
         """
         if self._unfinished or len(order) <= _AT_ONCE:
             self.rebuild()
@@ -158,7 +161,7 @@ class IncrementalGraph(GrowingGraph):
         self._clear()
         self._rebuild = IncrementalRebuild(self._store.copy(), order.tolist(), self._at.copy())
         self._unfinished = True
-        self._outgrown = False  # The rebuilt graph knows the letters of all variables that there are now.
+        self._outgrown = False  # The rebuilt graph knows the letters of all present variables.
 
     @property
     def is_rebuilding(self) -> bool:

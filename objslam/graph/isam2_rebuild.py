@@ -18,7 +18,7 @@ relinearisation when it has time. A smaller number would relinearise without a r
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:
-    """Return an empty iSAM2 for poses X, points L, and the letters of other variables (by key)."""
+    """Return an empty iSAM2 that knows the letters of poses X, points L, and the other variables (by key)."""
     parameters = gtsam.ISAM2Params()
     turn, way = _RELINEARISE
     limits = {"x": np.array([turn] * 3 + [way] * 3), "l": np.full(3, way)}
@@ -39,7 +39,7 @@ class IncrementalRebuild:
 
     order: the keyframes in the order of adding. The keyframe at the start of a motion comes before the one at its end.
     variables: the linearisation points. isam: the new iSAM2 so far. new: the keys of the variables that came after the start
-    of the rebuild. later: the factors that came after it.
+    of the rebuild. later: the factors that came after the start.
     """
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:

@@ -14,19 +14,20 @@ from objslam.core.types import Rays
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
-"""The number of past epochs in which a loop is searched, the latest first. An epoch is `_EPOCH` successive keyframes. A
-larger number is slower and closes longer loops."""
+"""The largest number of past epochs that are searched for a loop. The latest epochs are searched. An epoch is `_EPOCH`
+successive keyframes. A larger number is slower and closes longer loops."""
 _SLIPS = (1.0, 3.0, 10.0)
 """The factors that multiply the standard deviations of the drift in the search for a loop, because wheels slip more than a
 Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
 """The number of keyframes in an epoch. The drift since an epoch is computed for only one of its keyframes. So a larger
-number is faster and less exact."""
+number is faster and less exact. A landmark counts as new if it was first seen within this number of keyframes."""
 
 
 @dataclass
 class Landmarks:
-    """A table of landmarks: position (N, 3), covariance (N, 3, 3), label (N,), first and last keyframe that saw it (N,)."""
+    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw
+    each."""
 
     position: Floats
     covariance: Floats
@@ -72,7 +73,10 @@ def find_closure(
     """Return the loop with the most evidence, or None if no loop is certain.
 
     The search has two cases. After a long drift, recently observed landmarks (`active`, (N,)) are matched with the others.
-    After a slip or a push, the landmarks found since then are matched with all others.
+    After a slip or a push, new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
+
+    owner: (R,) the landmark of each ray, or -1. graph, values: solved. map_T_camera: (K, 4, 4) the solved poses. now: the
+    newest keyframe.
     """
     together = seen_together(rays.keyframe, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
@@ -104,7 +108,10 @@ def find_closure(
 
 
 def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
-    """Return for each pair of landmarks (N, N) whether some frame shows both. frame: (R,) the frame of each ray."""
+    """Return for each pair of landmarks (N, N) whether some frame shows both.
+
+    frame, owner: (R,) the frame of each ray and its landmark, or -1. count: the number of landmarks, N.
+    """
     from scipy.sparse import csr_array
 
     held = np.flatnonzero(owner >= 0)
@@ -114,9 +121,10 @@ def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
 
 
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
-    """Return covariances (3, 3) of keyframe `now` relative to each anchor, for x, y and yaw along the axes of map.
+    """Return covariances (3, 3) of the x, y (m) and yaw (rad) of keyframe `now` relative to each anchor, in the axes of map.
 
-    anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`.
+    anchors: keyframes. Each one before `now` gives one covariance for each factor in `_SLIPS`, none if it is not finite. The
+    variance of `POSE_FLOOR` is added before the factor.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]

@@ -19,13 +19,16 @@ the landmarks less. With too large a value, the system stays indeterminate."""
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of the landmarks (n,) at `values`.
 
-    If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior of 1 m.
-    Landmarks that only this prior determines get NaN. The other covariances are corrected for the prior.
+    If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior with the
+    standard deviation `HELD`. Landmarks that only this prior determines get NaN. The other covariances are corrected for the
+    prior. If the system is still indeterminate, all covariances are NaN.
     """
     try:
         return _marginals(graph, values, landmarks)
     except RuntimeError as error:
-        ledger.warn(f"covariances: {indeterminate(error).message}; objects that no measurement holds are left unresolved")
+        ledger.warn(
+            f"covariances: {indeterminate(error).message}; objects that no measurement determines are left unresolved"
+        )
     held = graph.clone()
     for j in landmarks.tolist():
         held.push_back(point_prior(j, values.atPoint3(L0 + j), HELD))

@@ -33,7 +33,7 @@ class Multiframes:
     def of(cls, keyframes: Keyframes) -> Self:
         """Join keyframes of different cameras whose stamps, as logged, agree within `TOGETHER`.
 
-        An unmeasured motion by odometry separates two multiframes.
+        A motion that the odometry did not measure separates two multiframes.
         """
         apart = ~keyframes.measured if keyframes.odom_T_base is not None else np.zeros(max(len(keyframes) - 1, 0), bool)
         first: list[int] = []
@@ -54,7 +54,11 @@ class Multiframes:
         return cls(np.arange(count), np.arange(count))
 
     def keyframes(self, images: Keyframes) -> Keyframes:
-        """Return the first keyframe (P,) of each multiframe. The images (K,) may have different clocks."""
+        """Return the first keyframe of each of the P multiframes, from K images.
+
+        The clocks of the images may have been corrected since the images were joined. Fewer of the returned keyframes share
+        one measurement of the absolute pose, so `localized_every` is smaller.
+        """
         if len(self.first) == len(images):
             return images
         shared = images.localized_every * len(self.first) / len(images)
@@ -66,7 +70,7 @@ class Multiframes:
             return rays
         first_T_camera = inverse(images.base_T_camera[self.first])[self.number] @ self._motion(images) @ images.base_T_camera
         own = self.first[self.number] == np.arange(len(images))
-        first_T_camera[own] = np.eye(4)  # Without rounding errors, their factors need no offset.
+        first_T_camera[own] = np.eye(4)  # With rounding errors, they would need factors with an offset.
         offset, direction = rays.in_map(first_T_camera)
         return replace(rays, keyframe=self.number[rays.keyframe], direction=direction, offset=offset)
 

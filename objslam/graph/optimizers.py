@@ -21,7 +21,7 @@ OnIteration = Callable[[float, gtsam.Values], None]
 class Optimum:
     """The result of an optimisation. SolveError if its cost is not finite.
 
-    weights: (F,) the weight of each factor of the graph by GNC. Other optimisers give None.
+    iterations: of Levenberg-Marquardt, 0 for GNC. weights: (F,) the weight of each factor by GNC, else None.
     """
 
     values: gtsam.Values
@@ -55,7 +55,10 @@ def optimize(
     tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """Minimise from `start` by `graduated` for the loss `gnc`, by `levenberg_marquardt` for the other losses."""
+    """Minimise from `start` by `graduated` for the loss `gnc`, by `levenberg_marquardt` for the other losses.
+
+    Only `gnc` uses known_inliers. Only the other losses use tolerance and on_iteration.
+    """
     if loss == "gnc":
         return graduated(graph, start, settings.joint.max_iterations, known_inliers)
     return levenberg_marquardt(graph, start, settings.joint.max_iterations, tolerance, on_iteration)
@@ -68,7 +71,10 @@ def levenberg_marquardt(
     relative_tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
 ) -> Optimum:
-    """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite."""
+    """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite.
+
+    relative_tolerance: the solve ends if an iteration decreases the cost by less than this share.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)

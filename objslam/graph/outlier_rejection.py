@@ -16,8 +16,9 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""A rejected ray is restored if at least the share `_MOST` of the rays around it in time, `_BESIDE` on each side, is also
-rejected. Then the poses may be wrong. A larger share restores fewer rays. A few false boxes in a row restore no ray."""
+"""A rejected ray is restored if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after it are
+rejected, because the poses may be wrong there. A larger share restores fewer rays. With a larger number on each side, only
+longer stretches are restored. A few false boxes in a row restore no ray."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and the last ones change few rays."""
 _COARSE = 1e-4
@@ -57,8 +58,8 @@ def reject_outliers(
     """Solve, and test which rays agree with their objects, until the set of inliers is stable, or at most `rounds` times.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
-    solve, or all False. back: (R,) rays that count as inliers in the first solve. tolerance: the relative decrease
-    of the cost below which a solve ends.
+    solve, or all False. back: (R,) rays that count as inliers in the first solve. tolerance: the relative decrease of the
+    cost below which the last solve ends. The solves before it may end at `_COARSE`.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
@@ -89,7 +90,7 @@ def reject_outliers(
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
-    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too. Poses may be wrong."""
+    """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))
     order = order[np.argsort(rays.keyframe[order], kind="stable")]
     rejected, window = ~found.used[order], np.ones(2 * _BESIDE + 1)
@@ -114,9 +115,9 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 def second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
 ) -> tuple[Floats, Bools]:
-    """Triangulate undetermined objects and objects with outliers again. Move an object if more of its rays agree then.
+    """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
-    The corners of fiducials stay: rays to four separate points say less than those to a square.
+    The corners of fiducials stay, because rays to four separate points say less than rays to one square.
 
     Return the positions (N, 3), and which rays (R,) agree with them.
     """
@@ -144,7 +145,11 @@ def second_opinion(
 
 
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
-    """Return which rays (R,) agree with their object, given the noise of its inliers (at first, of all its rays)."""
+    """Return which rays (R,) agree with their object, given the noise of the object's inliers.
+
+    used: (R,) the inliers. If no ray of any object is one yet, all rays count. An object with few inliers (`_FEWEST`) has
+    the nominal noise.
+    """
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
     origins, directions = (a[placed] for a in rays.in_map(map_T_camera))

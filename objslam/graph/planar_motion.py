@@ -9,7 +9,10 @@ from objslam.core.geometry import adjoint, inverse
 
 
 def planar_noise(drift: Floats, odom_T_base: Floats, settings: Settings) -> Floats:
-    """Return the covariances (P-1, 3, 3) of the motions' yaw, x and y in the base after each motion."""
+    """Return the covariances (P-1, 3, 3) of the motions' yaw (rad), x and y (m) in the base after each motion.
+
+    drift: (P, 6, 6) and odom_T_base: (P, 4, 4), as in `Keyframes`. The floor of the settings is added.
+    """
     to_base = adjoint(inverse(odom_T_base[1:]))
     noise = (to_base @ np.diff(drift, axis=0) @ np.swapaxes(to_base, 1, 2))[:, 2:5, 2:5]
     of = settings.odometry
@@ -17,9 +20,10 @@ def planar_noise(drift: Floats, odom_T_base: Floats, settings: Settings) -> Floa
 
 
 def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints, motion: Floats) -> tuple[Floats, Floats]:
-    """Return the derivatives (P-1, 3, S) of the motions' yaw, x and y by shared errors, and the prior sigmas (S,) of these.
+    """Return the derivatives (P-1, 3, S) of the motions' yaw, x and y by S shared errors, and the errors' prior sigmas (S,).
 
-    The shared errors are the errors of the odometry, and one clock for all cameras.
+    The shared errors are the errors of the odometry, and one clock for all cameras. first: (P,) the keyframes before and
+    after the motions (P-1, 4, 4) of the base.
     """
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(errors.names if errors is not None else ()):

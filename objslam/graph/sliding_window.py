@@ -31,7 +31,7 @@ class SlidingWindow:
     """
 
     def __init__(self, measured: Measurements, owner: Ints, landmarks: int, iterations: int) -> None:
-        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: of each solve."""
+        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: the most in a solve."""
         self.map_T_camera = measured.keyframes.map_T_camera.copy()
         self.positions = np.full((landmarks, 3), np.nan)
         self._measured, self._owner, self._iterations = measured, owner, iterations
@@ -39,14 +39,14 @@ class SlidingWindow:
         self._weak: dict[int, gtsam.NonlinearFactor] = {}  # The weak prior of each landmark, by its key.
         self._held: dict[int, gtsam.NonlinearFactor] = {}  # By key: the prior in place of factors outside the window.
         self._values = gtsam.Values()
-        self._begin, self.end, self._solved = 0, 0, 0  # The window, and the keyframes of the last whole solve.
+        self._begin, self.end, self._solved = 0, 0, 0  # The window's ends, and the end at the last whole solve.
         nothing = np.zeros(0, dtype=np.int64)
         self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
 
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
         """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
 
-        covariance: (m, 3, 3) of the landmarks by their rays. It replaces the rays of keyframes that have left the window.
+        covariance: (m, 3, 3) m^2, of the landmarks by their rays. It replaces the rays of keyframes before the window.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):
@@ -105,8 +105,8 @@ class SlidingWindow:
     def _move(self, begin: int) -> None:
         """Let the window begin at another keyframe. The marginals of the removed part become priors of the window.
 
-        A landmark that leaves the window keeps its marginal until it is seen again. If the marginals are indeterminate, the
-        window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve raises SolveError.
+        A landmark that leaves the window keeps its marginal for when it is seen again. If the marginals are indeterminate,
+        the window keeps its start and becomes longer. If the whole graph is indeterminate, a later solve raises SolveError.
         """
         if begin == self._begin:
             return

@@ -1,7 +1,7 @@
 """Variables of the graph by their symbols: X(k) is the pose of a camera in map, L(j) is the position of object j.
 
-X(k) belongs to the camera of keyframe k. If images share a pose, it belongs to the first camera of multiframe k. Y(t) is the
-pose of fiducial t, and Z(t) what half its diagonal lacks to its first value, if its size is not known.
+X(k) belongs to the camera of keyframe k. If images share a pose, X(k) belongs to the first camera of multiframe k. Y(t) is
+the pose of fiducial t. If its size is not known, Z(t) (m) is the first value of half its diagonal minus the present one.
 
 A symbol is a letter and a number. A graph may hold other variables too, so variables are found by symbol, never by type.
 """
@@ -98,7 +98,7 @@ class Variables:
         return values
 
     def read(self, values: gtsam.Values) -> None:
-        """Set the variables from the values. Variables that the values lack stay, and unknown values are ignored."""
+        """Set the variables from the values. A variable that the values lack stays. Other values are ignored."""
         poses, points = (
             dict(zip(number.tolist(), found, strict=True)) for number, found in (keyframes_in(values), landmarks_in(values))
         )

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body_entry import body_entry, body_of_entry, size_of
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
@@ -33,7 +34,16 @@ def dump_objects(objects: ObjectMap) -> str:
 
 def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
     """Return the text of a ground truth file. `read_truth_objects` restores the same objects."""
-    return _dump([{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in objects], "map", [])
+    return _dump([_truth_entry(o) for o in objects], "map", [])
+
+
+def _truth_entry(o: TruthObject) -> dict[str, Any]:
+    entry: dict[str, Any] = {"id": o.id, "label": o.label, "position": o.position.tolist()}
+    if o.size is not None:
+        entry["size"] = o.size.tolist()
+    if o.yaw is not None:
+        entry["yaw"] = o.yaw
+    return entry
 
 
 def read_objects(file: Path) -> ObjectMap:
@@ -107,6 +117,10 @@ def _entry(o: MapObject) -> dict[str, Any]:
     if o.life is not None:
         moved = o.life.moved_from
         entry["life"] = {**vars(o.life), "moved_from": None if moved is None else moved.tolist()}
+    if o.body is not None:
+        entry |= body_entry(o.body)
+    if o.ray_point is not None:
+        entry["ray_point"] = o.ray_point.tolist()
     if o.tag is not None:
         entry["tag"] = _tag_entry(o.tag)
     if o.ray is not None:
@@ -174,7 +188,10 @@ def _stamp(entry: dict[str, Any], name: str) -> float:
 def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     if entry.get("status") == "unresolved":
         return None
-    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), _vector(entry.get("position"), "position"))
+    size = None if entry.get("size") is None else _of_body(lambda: size_of(entry, "size"))
+    yaw = None if entry.get("yaw") is None else _number(entry["yaw"], "yaw")
+    place = _vector(entry.get("position"), "position")
+    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), place, size, yaw)
 
 
 def _map_object(entry: dict[str, Any]) -> MapObject:
@@ -225,8 +242,17 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
         seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
+        body=_of_body(lambda: body_of_entry(entry)),
+        ray_point=None if entry.get("ray_point") is None else _vector(entry["ray_point"], "ray_point"),
         tag=None if entry.get("tag") is None else _tag(entry["tag"]),
     )
+
+
+def _of_body(read: Callable[[], _T]) -> _T:
+    try:
+        return read()
+    except ValueError as error:
+        raise _Malformed(str(error)) from error
 
 
 def _seen_from(value: Any) -> SeenFrom:

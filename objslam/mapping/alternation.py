@@ -11,6 +11,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
 from objslam.mapping.joint_alternation import JointState, solve_joint
@@ -34,9 +35,10 @@ def solve(
     """Find and solve the objects of a log.
 
     In fixed mode the association runs once, at the given poses, unless the cameras are calibrated against these poses. In
-    joint mode the poses are explored first. Then association and solve alternate until no ray changes its object. If the
-    settings ask for it, every label is one object instead. The joint mode also tries this if no frame has two boxes of one
-    label, and keeps it if the rays agree.
+    joint mode the poses are explored first, unless the log has a localisation. Then association and solve alternate until no
+    ray changes its object. At the end, bearings may be turned to the centres of bodies. If the settings ask for it, every
+    label is one object instead. The joint mode also tries this if no frame has two boxes of one label, and keeps it if the
+    rays agree.
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
     the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are
@@ -62,8 +64,11 @@ def solve(
     else:
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         association, estimate, rounds = solve_joint(begin, start)
+        estimate, added = solve_to_centres(begin, association, estimate)
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
+        if added is not None:
+            rays_of_keyframes = to_centres(rays_of_keyframes, added)
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     return Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)

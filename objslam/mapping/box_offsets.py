@@ -1,7 +1,7 @@
 """Errors that the boxes of an object share. The centre of a box is not the centre of the object, and from one side all boxes
 have about the same offset.
 
-More rays from the same side do not average such an error out. So many of these rays count as few (Kish 1965).
+More rays from the same side do not average such an error out. Therefore many rays count as few (Kish 1965).
 """
 
 from dataclasses import dataclass, replace
@@ -17,20 +17,13 @@ from objslam.core.geometry import evenly_spread, is_planar
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
+from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
 
-_SIDES = 103
-"""The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All rays from one side
-count as one measurement. A larger number is finer and slower."""
-_ALIKE = np.radians(20.0)
-"""The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
-angle, more views are needed to average them out. On three objects of YCB-Video, it is 5 to 20 degrees for a detector."""
-_WITHIN = 0.7
-"""The variance of the mean error over one side, as a share of the variance in one direction. Two directions in a side are 10
-degrees apart on average, and their correlation is 0.7. A larger share finds smaller errors."""
 _SHARES = 81
-"""The number of tried values of the share, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
+"""The number of tried values of the error of a box as a share of its size, from 0 to `_WIDEST` times the prior. A larger
+number is finer and slower."""
 _WIDEST = 4.0
-"""The largest tried value of the share, in standard deviations of its prior. A larger value admits worse detectors."""
+"""The largest tried value of this share, in standard deviations of its prior. A larger value admits worse detectors."""
 _LOOSE = 1.0
 """The standard deviation (m) of an object's position before its rays count. A larger value leaves more to the rays."""
 _POOLED = 20.0
@@ -45,8 +38,8 @@ class Sides:
     alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
     side miss the object along A axes, in azimuth and elevation. white: (C,) rad, the standard deviation of this mean if the
     rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset:
-    (C, A, 3) rad, its derivative by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3) m, how far
-    such an offset moves the object.
+    (C, A, 3) rad, the derivative of the mean by an offset of the boxes of this side, in sizes of the object. pull: (C, 3, 3)
+    m, how far such an offset moves the object.
     """
 
     alike: Floats
@@ -82,7 +75,8 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     """Return a solution whose covariances contain the errors that boxes share.
 
     The centre of an object's boxes is off by a share of the object's size. One offset is equal from all sides, and another
-    depends on the side. `rays.box_sigma` is the prior of the share. At its default value, the share is estimated from rays.
+    depends on the side. `rays.box_sigma` is the prior of the share. The share is estimated from the rays if `noise.rays` is
+    true, or if it is auto and the prior has its default value. In joint mode, the path must also be planar.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
@@ -118,7 +112,7 @@ def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
     """Return the used rays of objects with a position, if their boxes show a size.
 
-    Fiducials whose corners were used have none: their position does not come from boxes.
+    Fiducials whose corners were used have no such ray, because their position does not come from boxes.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
@@ -142,7 +136,7 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
     deviation. In the other solves it pulls with the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
-    lattice = evenly_spread(_SIDES)
+    lattice = evenly_spread(SIDES)
     pairs = np.column_stack([landmark, (rays.direction @ lattice.T).argmax(axis=1)])
     pairs, cell = np.unique(pairs, axis=0, return_inverse=True)
     cell, owner, axes = cell.ravel(), pairs[:, 0], _azimuth_elevation(lattice[pairs[:, 1]])
@@ -171,9 +165,9 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
     seen = {}
     for j in np.unique(owner).tolist():
         mine = np.flatnonzero(owner == j)
-        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / _ALIKE
+        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / ALIKE
         seen[j] = Sides(
-            alike=_WITHIN * 0.5**turned,
+            alike=WITHIN * 0.5**turned,
             mean=mean[mine, :, 0],
             white=white[mine],
             shift=shift[mine],

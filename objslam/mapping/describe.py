@@ -30,7 +30,7 @@ def make_result(
 ) -> RunResult:
     """Return the result of a solution with the map by `describe`, and add the judgement to the summary.
 
-    more: the fields that are not in the solution.
+    residual: (R,) rad, by `describe`. more: the fields of the result that are not in the solution.
     """
     keyframes, rays, estimate = solution.keyframes, solution.rays, solution.estimate
     missed = misses(objects, keyframes, rays, solution.association, residual, settings)
@@ -61,7 +61,8 @@ def describe(
     """Return the map of the objects, and the angle (R,), rad, between each ray and its object, NaN without an object.
 
     The map counts the rays and frames of an object without its rejected rays. If all its rays are rejected, it counts all.
-    trusted: whether positions are reliable. If not, all objects are unresolved.
+    The position of an object with a body may be the centre of the body (`PlacedBody`). trusted: whether positions are
+    reliable. If not, all objects are unresolved.
     """
     keyframes, rays, association, estimate = solution.keyframes, solution.rays, solution.association, solution.estimate
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
@@ -76,7 +77,9 @@ def describe(
     for j in range(association.count):
         mine = order[bounds[j] : bounds[j + 1]]
         kept = mine[estimate.weight[mine] > 0] if (estimate.weight[mine] > 0).any() else mine
-        covariance = estimate.covariance[j]
+        placed = None if solution.bodies is None else solution.bodies[j]
+        covariance = estimate.covariance[j] if placed is None or placed.centre is None else placed.covariance[:3, :3]
+        position = estimate.positions[j] if placed is None or placed.centre is None else placed.centre
         parallax = widest_angle(directions[kept])
         solved = bool(estimate.solved[j] and np.isfinite(covariance).all())
         status = status_of(
@@ -94,7 +97,7 @@ def describe(
             MapObject(
                 id=j,
                 label=rays.label_names[association.label[j]],
-                position=estimate.positions[j],
+                position=position if known else estimate.positions[j],
                 covariance=covariance if known else None,
                 status=status,
                 rays=len(kept),
@@ -108,6 +111,8 @@ def describe(
                 labels=_label_shares(association, j, rays.label_names),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
+                body=placed.body if placed is not None and known else None,
+                ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
                 tag=estimate.tags.get(j) if known else None,
             )
         )
@@ -133,9 +138,9 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the content of summary.json. counts: the numbers of images, frames and boxes in the log.
 
-    Its entry `map_frame` says what fixed the frame of the map: `localization`, or `odometry` without an absolute
-    measurement, or `map` for a drive that was found in an older map. Its entry `planar` says whether the measured path has
-    one height, roll and pitch. Its entry `up` names the axis of the map that points up.
+    seconds: the time of each stage. The entry `map_frame` says what fixed the frame of the map: `localization`, or
+    `odometry` without an absolute measurement. The entry `planar` says whether the measured path has one height, roll and
+    pitch. The entry `up` names the axis of the map that points up.
     """
     estimate, rays = solution.estimate, solution.rays
     unexplained = rays.label[solution.association.object < 0]

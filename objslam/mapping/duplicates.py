@@ -19,7 +19,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
 
     If poses drift between two visits, an object appears twice. Each copy keeps the poses of its visit where they are. So an
     association at these poses cannot find the error, but a merge closes the loop. The nearest pairs by Mahalanobis distance
-    merge first. An object takes part in one merge at a time. farthest: the largest distance (m) of a pair.
+    merge first. An object merges at most once in one call. farthest: the largest distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
@@ -44,7 +44,7 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
     number = np.searchsorted(kept, into)
     weights, existence = association.label_weights, association.existence
     return Association(
-        object=np.append(number, -1)[association.object],  # -1 indexes the last
+        object=np.append(number, -1)[association.object],  # The index -1 (no object) gives the last entry.
         label=association.label[kept],
         label_weights=None if weights is None else weights[kept],
         existence=None if existence is None else existence[kept],

@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 _ROUNDS = 8
 """The most rounds of association and calibration. Two or three are usual. More rounds are slower."""
 _SAME = 0.05
-"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. So small
-a change moves hardly a ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared errors
-does not work: with precise errors, the association can swing between two states for ever."""
+"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. Such a
+small change moves hardly any ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared
+errors does not work: with precise errors, the association can swing between two states for ever."""
 _EXPLAINED = 0.5
-"""An association explains too few rays below this share. A larger share tries another association more often."""
+"""An association that explains at most this share of the rays is compared with another one. The other one is taken if the
+first explains less than this share of what the other explains. A larger share takes the other one more often."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class FixedPoses:
         return replace(self, settings=settings)
 
     def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
-        """Return the same input without shared errors (P,)."""
+        """Return the same input, corrected for the shared errors theta (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
         seen, rays_seen, _ = errors.at(theta, drift=False)
         return replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
@@ -102,7 +103,8 @@ def calibrate_fixed(
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
     The covariance of the errors is added to the covariance of the objects. Returns the input without the errors, the
-    association, the estimate, and the number of objects in each round.
+    association, the estimate, and the number of objects in each round. If the errors cannot be estimated, they stay as they
+    were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
     from objslam.graph.fixed_pose_triangulation import pose_noise
@@ -141,10 +143,11 @@ def calibrate_fixed(
 
 
 def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
-    """Return the association without shared errors if it explains far more rays than the association `wide`. Else None.
+    """Return an association that allows for no shared errors, if it explains far more rays than the association `wide`.
 
-    `wide` allows for shared errors, which may be many times the noise of a ray. On a short drive among many objects of one
-    label, such wide gates confuse all objects. If the true errors are small, the objects are found without this allowance.
+    None if it does not, or if `wide` explains more than half of the rays (`_EXPLAINED`). `wide` allows for shared errors,
+    which may be many times the noise of a ray. On a short drive among many objects of one label, such wide gates confuse all
+    objects. If the true errors are small, the objects are found without this allowance.
     """
     explained = (wide.object >= 0).sum()
     if explained > _EXPLAINED * len(wide.object):

@@ -40,12 +40,11 @@ _CLEAR = 0.95
 twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: a
 real robot in a forest has its log explored twice for nothing."""
 _LOOSE = 3.0
-"""The factor on the noise of the odometry in this exploration if the solve found only the rays to be noisy. A larger factor
-suits worse odometry, and loses more objects of good odometry."""
-
+"""The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
+factor suits worse odometry, and loses more objects of good odometry."""
 _VIEW = 1.0
-"""The solid angle (sr) in which a stray ray may lie, about that of a camera. A larger value lets more rays outweigh noisier
-ones."""
+"""The solid angle (sr) in which a stray ray may lie, about that of a camera. With a larger value, the number of agreeing
+rays counts more, and their noise less."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
@@ -86,7 +85,7 @@ class JointState:
         trace: Trace | None = None,
         begin: Floats | None = None,
     ) -> Estimate:
-        """Solve an association. start: (K, 4, 4) map_T_camera. begin: (P,) the first values of the shared errors."""
+        """Solve an association. start: (K, 4, 4) map_T_camera. begin: (P,) the first shared errors, else theta."""
         from objslam.graph import batch_solver
 
         at = self.theta if begin is None else begin
@@ -133,8 +132,8 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None, *, drifting: bool = False) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        drifting: whether the association allows for the drift of keyframes without an assigned ray. The rounds also end if
-        an earlier association returns, because a few rays between two objects could change for ever.
+        The rounds also end if an earlier association returns, because a few rays could change for ever. drifting: whether to
+        allow for the drift of keyframes without an assigned ray.
         """
         state, earlier = self, set[bytes]()
         for number in range(self.settings.joint.max_rounds):
@@ -264,10 +263,8 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
 
 
 def _by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether the rays agree with it.
-
-    If only a few labels are wrong, the shared errors and the noise of this state are still better than the nominal ones.
-    """
+    """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
+    the shared errors and the noise of the state are still better than the nominal values."""
     association, errors = associate_by_label(state.rays), state.errors
     solved = state.solve("labels", association)
     assert solved.estimate is not None
@@ -286,7 +283,8 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
 
 
 def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
-    """Return a first association of a log without a localisation, at the poses of odometry."""
+    """Explore a log without a localisation. Return the state and a first association. If the filter for logs with ranges is
+    sure of the association, the state is solved with it and holds the shared errors."""
     from objslam.graph import ekf_exploration
     from objslam.graph.init_unknown_correspondences import initialize_unknown
 
@@ -303,9 +301,10 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
 
 
 def _with_loose_odometry(state: JointState) -> JointState | None:
-    """Return an attempt with the noise of the odometry that the last solve suggests, None if it is about nominal.
+    """Return an attempt with the noise of the odometry that the last solve suggests.
 
-    The solve finds this noise, but the exploration needs it before. A wrong map can hide it in the noise of the rays.
+    None if this noise is about nominal, if the settings fix it, or if nearly all rays agree. The solve finds this noise, but
+    the exploration needs it before. A wrong map can hide it in the noise of the rays.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise or state.agree.mean() >= _CLEAR:
         return None

@@ -14,8 +14,8 @@ from objslam.core.types import Association, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
-"""A label gets a second object if at least this number and this share of its rays disagree with the first one. Larger
-values accept fewer second objects."""
+"""A label has a second object if at least this number, and more than this share, of its rays disagree with the first one.
+Larger values accept fewer second objects."""
 _JUDGEMENTS = 2
 """How often labels are judged again with the noise of the last solve. Rejected rays hide noise, so the second judgement
 finds more noise. More judgements are slower."""
@@ -76,12 +76,13 @@ def clock_explains(association: Association, errors: SharedErrors, solve: Callab
 def noise_explains(
     association: Association, estimate: Estimate, errors: SharedErrors, solve: Callable[[SharedErrors], Estimate]
 ) -> Estimate | None:
-    """Return the solution with one object for each label if larger noise makes all labels agree. None otherwise.
+    """Return the solution with one object for each label if larger noise makes all labels agree. None if it does not.
 
     With too little noise in the settings, poses cannot move far enough. Then rays of one object look like rays of several
     objects. So all noise is estimated, even if the settings fix it, and the labels are judged with this noise.
 
-    estimate: the solution in which labels disagree. errors: the start of the next solve. solve: solves once.
+    estimate: the solution in which labels disagree. errors: the shared errors at the start of the first solve. solve: solves
+    once.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise
@@ -105,5 +106,5 @@ def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> N
     if factors:
         ledger.warn(
             f"the settings say too little noise for this log (factors found: {factors}), and many boxes are rejected; "
-            f"leave it out of the settings, or set {', '.join(f'noise.{kind}=true' for kind in sorted(said))}"
+            f"leave the noise out of the settings, or set {', '.join(f'noise.{kind}=true' for kind in sorted(said))}"
         )

@@ -9,6 +9,8 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body import turned
+from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import split_se2
 from objslam.core.object_map import MapObject, ObjectMap
@@ -16,6 +18,8 @@ from objslam.core.trace import Round
 from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.bodies import with_bodies
+from objslam.mapping.describe import describe
 from objslam.mapping.solution import Solution
 
 if TYPE_CHECKING:
@@ -32,7 +36,7 @@ class PriorMap:
 
     @property
     def first_free_id(self) -> int:
-        """The first id that no object of the map has, nor any id after it."""
+        """The largest id in the map plus 1. The objects that are gone count too."""
         return max((o.id for o in (*self.objects.objects, *self.objects.gone)), default=-1) + 1
 
 
@@ -41,8 +45,8 @@ class Localization:
     """A drive in the frame of an older map, or the reason why it is not there.
 
     registration: of the drive to the map. told: the entry of summary.json. solution: the drive in the frame of the map, with
-    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2, the same with the map's objects
-    as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
+    the objects where its rays see them. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of the objects, with the map's
+    objects as priors. map_T_drive: (4, 4). The last four are None for a drive that was not found.
     """
 
     registration: Registration
@@ -61,7 +65,7 @@ def localize(
     objects: the map of the drive. errors: its shared errors, None if none were estimated. If the registration is refused, or
     the solve has no solution, the ledger gets a warning, and the drive stays in its own frame.
     """
-    # They import scipy.optimize, which takes longer than the map of a small log.
+    # These functions import scipy.optimize, which takes longer than the map of a small log.
     from objslam.association.registration.object_maps import placed, reason, register
 
     found = register(objects, known.objects)
@@ -77,7 +81,9 @@ def localize(
     if not found.accepted:
         return _refused(found, told, why, ledger)
     try:
-        solved = _solve(_with_covariances(solution, objects), placed(objects), known.objects, found, errors, settings)
+        solved = _solve(
+            _with_covariances(solution, objects), objects, placed(objects), known.objects, found, errors, settings
+        )
     except SolveError as error:
         return _refused(found, told, error.message, ledger)
     sigma = np.sqrt(np.diagonal(solved.covariance))
@@ -100,7 +106,7 @@ def localize(
 
 
 def _with_covariances(solution: Solution, objects: ObjectMap) -> Solution:
-    """Return the solution with the covariances of its map, which hold the errors that checks found after the solve."""
+    """Return the solution with the covariances of its map, which include the errors that checks found after the solve."""
     widened = objects.covariances
     covariance = np.where(np.isfinite(widened), widened, solution.estimate.covariance)
     return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
@@ -115,6 +121,7 @@ def _refused(found: Registration, told: dict[str, Any], why: str, ledger: Ledger
 
 def _solve(
     solution: Solution,
+    objects: ObjectMap,
     there: list[int],
     known: ObjectMap,
     found: Registration,
@@ -127,26 +134,57 @@ def _solve(
     from objslam.graph.multiframes import Multiframes
 
     ours, theirs = found.matches.T
-    matched = MapObjects(ours, known.positions[theirs], known.covariances[theirs])
+    # The graph of the drive has the points where rays meet. The map has the centres of bodies, where there are bodies.
+    beside = found.b_T_a[:3, :3] @ (objects.positions - at_ray_points(objects).positions)[ours][..., None]
+    matched = MapObjects(ours, known.positions[theirs] - beside[..., 0], known.covariances[theirs])
     measured = None
     if settings.mode == "joint":
         estimate, images, keyframes, rays = solution.estimate, solution.keyframes, solution.keyframes, solution.rays
         if errors is not None and estimate.calibration is not None:
-            # Inside a solve, lengths make up for its shrinkage. Those of the solution are as measured.
+            # Inside a solve, lengths are corrected for its shrinkage. The lengths of the solution are as measured.
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
+            rays = replace(rays, direction=solution.rays.direction)  # They may point to the centres of bodies.
         rays = share_bias(rays, solution.association, settings)
         measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)
     return solve_in_map(solution.estimate, solution.association, resolved, matched, found.b_T_a, measured)
 
 
-def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
-    """Return the objects of a drive that was found in a map, at the places that the map gives them, with the ids of the map.
+def describe_in_map(
+    where: Localization,
+    known: PriorMap,
+    cameras: tuple[Camera, ...],
+    settings: Settings,
+    ids: list[int] | None = None,
+    *,
+    trusted: bool = True,
+) -> tuple[Solution, ObjectMap, Floats]:
+    """Return the solution of a drive that was found in a map, its objects there, and its residuals by `describe`.
 
-    objects: the drive's, described in the frame of the map. Objects that the map does not have get the first free id of the
-    map, plus their id in the drive.
+    ids: (N,) of the objects in the drive, their indices by default. trusted: whether positions are reliable.
+    """
+    assert where.solution is not None
+    solution = with_bodies(where.solution, cameras, settings)
+    objects, residual = describe(solution, cameras, settings, trusted=trusted)
+    if ids is not None:
+        objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
+    return solution, with_map(objects, where, known), residual
+
+
+def at_ray_points(objects: ObjectMap) -> ObjectMap:
+    """Return a map with each object where its rays meet, also if its position is the centre of a body."""
+    found = (o if o.ray_point is None else replace(o, position=o.ray_point) for o in objects.objects)
+    return replace(objects, objects=tuple(found))
+
+
+def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> ObjectMap:
+    """Return the objects of a drive that was found in a map, with the ids of the map. The map's objects count as priors of
+    their positions.
+
+    objects: of the drive, described in the frame of the map. An object without a covariance keeps its position. Objects that
+    the map does not have get the first free id of the map, plus their id in the drive.
     """
     assert where.positions is not None
     assert where.covariance is not None
@@ -155,9 +193,13 @@ def with_map(objects: ObjectMap, where: Localization, known: PriorMap) -> Object
     moved = []
     for j, item in enumerate(objects.objects):
         number = ids.get(j, free + item.id)
-        covariance = where.covariance[j] if item.covariance is not None else None
-        position = where.positions[j] if item.covariance is not None else item.position
-        moved.append(replace(item, id=number, position=position, covariance=covariance))
+        if item.covariance is None:
+            moved.append(replace(item, id=number))
+            continue
+        point = where.positions[j]  # Where its rays meet.
+        position = point if item.ray_point is None else point + item.position - item.ray_point
+        ray_point = None if item.ray_point is None else point
+        moved.append(replace(item, id=number, position=position, covariance=where.covariance[j], ray_point=ray_point))
     return ObjectMap(tuple(moved), known.objects.frame)
 
 
@@ -170,11 +212,15 @@ def moved_object(item: MapObject, map_T_drive: Floats) -> MapObject:
         covariance=None if item.covariance is None else turn @ item.covariance @ turn.T,
         ray=None if item.ray is None else (turn @ item.ray[0] + shift, turn @ item.ray[1]),
         seen_from=None if item.seen_from is None else replace(item.seen_from, sides=item.seen_from.sides @ turn.T),
+        body=None if item.body is None else turned(item.body, turn),
+        ray_point=None if item.ray_point is None else turn @ item.ray_point + shift,
+        tag=None if item.tag is None else item.tag.turned(turn, 0.0),
     )
 
 
 def moved_log(log: Log, map_T_drive: Floats) -> Log:
-    """Return the log with its poses in the frame of the map. The ground truth stays, because nobody says where it lies."""
+    """Return the log with its poses in the frame of the map. The ground truth stays, because its place in the map is
+    unknown."""
     odometry, localization = (
         None if path is None else Trajectory(path.stamps, map_T_drive @ path.poses)
         for path in (log.odometry, log.localization)

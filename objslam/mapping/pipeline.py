@@ -21,6 +21,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
@@ -29,7 +30,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
+from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.localization_noise import with_pose_noise
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
@@ -52,8 +53,8 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
-    LogError if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong
-    or does not fit the log.
+    LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
+    SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     log = chosen_poses(log, settings)
     settings = with_mode_of(log, settings)
@@ -102,6 +103,7 @@ def run(
         if settings.checks.use and solution.estimate.calibration is not None:
             diagnosis = diagnosis.with_findings(uncorrected(solution.estimate.calibration, errors.bounds))
             say(diagnosis, ledger)
+    solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     trusted = not diagnosis.spoilt
@@ -119,12 +121,11 @@ def run(
         with _stage("localize", seconds, progress):
             where = localize(solution, objects, known, errors, settings, ledger)
             if where.solution is not None and where.map_T_drive is not None:
-                solution, log = where.solution, moved_log(log, where.map_T_drive)
+                solution, objects, residual = describe_in_map(where, known, cameras, settings, trusted=trusted)
+                log = moved_log(log, where.map_T_drive)
                 keyframes, estimate = solution.keyframes, solution.estimate
-                described, residual = describe(solution, cameras, settings, trusted=trusted)
-                objects = with_map(described, where, known)
     path = log.robot_path
-    assert path is not None  # Otherwise build_keyframes has raised LogError.
+    assert path is not None  # Without a path, build_keyframes raises LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
@@ -132,7 +133,7 @@ def run(
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # The second call counts the drops.
+                before = reconstruct(log, path, settings, Ledger(), progress)  # The first call counted the drops.
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),

@@ -45,7 +45,7 @@ step wrongly drops images as out of reach."""
 
 @dataclass(frozen=True)
 class Shot:
-    """A depth image to fuse, its colour image (None without colour), and the camera pose (4, 4)."""
+    """A depth image to fuse, its colour image (None without colour), and the camera pose (4, 4). camera: its index."""
 
     camera: int
     depth: Path

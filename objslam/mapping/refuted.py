@@ -42,8 +42,10 @@ two recordings have at most 0.23, even if the solve explains the rays of both.""
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: of the unchanged log. If it explains the boxes, they are right. Otherwise, the log is corrected as a finding
-    says, and solved again. If the corrected log explains the boxes no better, the finding is wrong.
+    solution: of the unchanged log. It explains boxes only if its noise is near the settings. The test depends on the basis
+    of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
+    fault explains them no better. "halves": the finding is wrong if the solution explains the boxes of both halves, or if
+    both halves agree on the objects. "frames": the finding is wrong if the rays of the solution do not fit by whole frames.
     """
     kept = tuple(
         one
@@ -61,7 +63,7 @@ def _refuted(
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
-        # If labels do not name the objects, two copies of one object could explain the boxes of both halves.
+        # Without rounds, each label is one object. With rounds, two copies of an object could explain both halves.
         return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
     if explained:
         return True

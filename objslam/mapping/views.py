@@ -12,7 +12,7 @@ from objslam.frontend.keyframes import build_keyframes
 
 
 def solved_views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
-    """Return all camera frames of a log without errors, at the poses of the solved path."""
+    """Return all camera frames of a log, at the poses of the solved path. log: without its shared errors."""
     frames = build_keyframes(log, settings, Ledger())
     at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
     return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])

@@ -39,6 +39,20 @@ class Room:
     ambient: Floats
 
 
+def object_sizes(room: Room) -> tuple[Floats, Floats]:
+    """Return length, width and height (N, 3), m, and yaws (N,), rad, of the smallest upright boxes around the objects."""
+    yaws = np.radians(np.arange(180))
+    turns = np.stack([np.stack([np.cos(yaws), np.sin(yaws)]), np.stack([-np.sin(yaws), np.cos(yaws)])])  # (side, axis, yaw)
+    sizes, best = np.zeros((len(room.labels), 3)), np.zeros(len(room.labels))
+    for number in range(len(room.labels)):
+        points = np.concatenate([part.vertices for part, of in zip(room.parts, room.owner, strict=True) if of == number])
+        sides = np.ptp(np.einsum("va,say->vsy", points[:, :2], turns), axis=0)  # (side, yaw)
+        sides[:, sides[0] < sides[1]] = np.inf  # The length is the longer side.
+        at = int(sides.prod(axis=0).argmin())
+        sizes[number], best[number] = [*sides[:, at], np.ptp(points[:, 2])], yaws[at]
+    return sizes, best
+
+
 def furnish_room(size: tuple[float, float], labels: Sequence[str], rng: np.random.Generator) -> Room:
     """Make a furnished room with one object for each label. size: the size of the room along x and y, m.
 

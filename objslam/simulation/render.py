@@ -17,7 +17,7 @@ from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, widest_angle
 from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth, TruthObject, label_table
 from objslam.errors import ConfigError
-from objslam.simulation.furniture import Room, furnish_room
+from objslam.simulation.furniture import Room, furnish_room, object_sizes
 from objslam.simulation.raycast import Cast, Caster
 from objslam.simulation.sensor import Sensor, expose, exposures, measure_depth
 from objslam.simulation.settings import CourseSettings, DriveSettings, PoseNoise, Probability, make_camera
@@ -123,7 +123,8 @@ def render_drive(
     """Render a drive and write it as a log folder with images, odometry, localisation and ground truth. Returns `out`.
 
     The same settings and seed give the same log for any number of workers (threads, by default one per core and at most 4).
-    groundtruth/ holds the path, the centres of the objects' bounding boxes, and the true boxes (`TRUTH_BOXES`).
+    groundtruth/ holds the path, the centres of the objects' bounding boxes, the objects' sizes and yaws, and the true boxes
+    (`TRUTH_BOXES`).
     progress: a function that is called with the number of images rendered so far and the number of all images.
     Raises ConfigError if no room shows every object well enough, and OutputError if `check_target` refuses `out`.
     """
@@ -172,7 +173,8 @@ def render_drive(
                     progress(len(boxes), settings.frames)
         finally:
             pool.shutdown(cancel_futures=True)  # After an error, no further frame is rendered.
-        objects = tuple(TruthObject(i, label, room.middle[i]) for i, label in enumerate(room.labels))
+        size, yaw = object_sizes(room)
+        objects = tuple(TruthObject(i, label, room.middle[i], size[i], float(yaw[i])) for i, label in enumerate(room.labels))
         log = Log(
             name=settings.name,
             cameras=(CameraLog(settings.camera, None, Images(stamps, rgb_files), Images(stamps, depth_files)),),

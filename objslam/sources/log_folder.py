@@ -24,7 +24,7 @@ from objslam.sources.no_camera import NoCamera
 
 CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
-MOUNTS = "mounts.yaml"  # The poses of cameras on the robot, if a recording has no camera but tf knows the poses.
+MOUNTS = "mounts.yaml"  # The file of mounts from tf, of a recording whose cameras are unknown.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 

@@ -183,7 +183,7 @@ def test_the_innovation_is_what_sampling_says():
     turn[:, :3, :3] = turn[:, 3:, 3:] = frames.map_T_camera[:, :3, :3]
     in_map = (turn @ pose @ np.swapaxes(turn, 1, 2))[scene.rays.keyframe[ray]]
     deviations = []
-    for _ in range(40):  # one draw of the landmark serves all boxes: draw it anew some times
+    for _ in range(40):  # all boxes share one draw of the landmark, so it is drawn 40 times
         place = scene.points[0] + rng.multivariate_normal(np.zeros(3), covariance)
         landmark = Landmarks(place[None], covariance[None], np.ones(1), np.ones((1, 1), dtype=bool))
         deviations.append(gated_edges(obs, landmark, 1e6, in_map).deviation)

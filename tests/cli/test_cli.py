@@ -910,7 +910,7 @@ def test_a_wrong_calibration_file_fails_before_the_log_is_read(objslam, tmp_path
 
 
 def test_a_calibration_of_before_is_no_news(objslam, tmp_path, late_camera):
-    """Calibrating a log anew from its own file tightens it like a second log, and combining keeps the file's prior once."""
+    """A log calibrated again from its own file tightens it like a second log. Combining keeps the prior of the file once."""
     first, twice, settings = tmp_path / "first.yaml", tmp_path / "twice.yaml", ("--set", "association.method=by_label")
     assert objslam("calibrate", str(late_camera), "-o", str(first), *settings).code == 0
     one = load_calibration(first)

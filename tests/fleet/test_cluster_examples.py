@@ -1,4 +1,4 @@
-"""The files of examples/fleet can be read, and run commands that there are."""
+"""The files of examples/fleet can be read, and they run commands that exist."""
 
 import re
 import shlex

@@ -20,7 +20,7 @@ def worker():
 def test_a_process_does_one_task_after_another(worker):
     first, _ = worker.call(WORK + "process", 1, Limits())
     again, argument = worker.call(WORK + "process", 2, Limits())
-    assert first == again  # What it imported is imported once.
+    assert first == again  # One process did both tasks, so it imports a library once.
     assert argument == 2
 
 

@@ -60,7 +60,7 @@ def fleet(logs, tmp_path_factory):
 
 
 def content(out, leave=("records", "sessions.parquet", "fleet.html", "summary.json", "fleet.json")):
-    """The hash of each file that does not tell of times."""
+    """The hash of each file whose content does not depend on the time of the run."""
     found = (file for file in sorted(out.rglob("*")) if file.is_file() and not set(leave) & set(file.parts))
     return {str(file.relative_to(out)): sha256(file.read_bytes()).hexdigest() for file in found}
 

@@ -20,7 +20,7 @@ from objslam.sources import SourceOptions
 from objslam.sources.log_folder import write_log_folder
 
 STEP = 10
-"""Every so many frames have an image."""
+"""The step from one frame with an image to the next."""
 
 
 def with_images(folder, path):

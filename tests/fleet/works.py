@@ -28,7 +28,7 @@ def crash(_: object) -> None:
 
 
 def fill(size: int) -> int:
-    """Take as many bytes of memory."""
+    """Take `size` bytes of memory."""
     return len(b"1" * size)
 
 

@@ -93,7 +93,7 @@ def test_the_corrected_log_has_the_same_keyframes(clean):
 
 
 def test_noise_is_scaled_with_what_it_belongs_to(clean):
-    """Otherwise a smaller world would fit the odometry better, and the scale would run away."""
+    """If the noise were not scaled, a smaller world would fit the odometry better, and the estimated scale would diverge."""
     log = replace(clean, cameras=tuple(replace(c, camera=replace(c.camera, base_T_camera=np.eye(4))) for c in clean.cameras))
     _, _, errors = measured(log)
     scaled, _, settings = errors.at(vector(errors, {"odometry.scale": 0.2}))

@@ -63,7 +63,7 @@ class Drive:
 
 
 def make_drive(seed: int, *overrides: str, stretch: float = 1.0, **changes: Any) -> Drive:
-    """A drive of the demo's room with overrides of the settings; stretch: odometry that takes so many metres for one."""
+    """A drive of the demo's room with overrides of the settings; stretch: the scale of its odometry."""
     settings = load_settings(None, ("rays.pixel_sigma=2", *overrides))
     log = simulate(preset("demo", **{"objects": 12, "classes": 12, "frames": 200, **changes}), seed)
     return drive_of(_stretched(log, stretch), settings)

@@ -41,7 +41,7 @@ def make_tag_drive(
 ) -> TagDrive:
     """A drive on a circle of 1 m, around which tags hang, with odometry noise of `drift` times the settings.
 
-    reach: m, the least distance from the circle to the tags. stretch: odometry that takes so many metres for one.
+    reach: m, the least distance from the circle to the tags. stretch: the scale of the odometry.
     """
     rng, noise = np.random.default_rng(seed), (settings or load_settings()).odometry
     turn = np.linspace(0, 2.4 * np.pi, frames)

@@ -193,7 +193,7 @@ ODO = ODOMETRY_ALONE["odometry"]
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_a_coarse_localisation_costs_no_object(seed):
-    """The poses that were solved are better than the localisation: objects that it could not place enter then."""
+    """The solved poses are better than the localisation, so they place objects that the localisation could not place."""
     told = ("localization.xy=0.2", "localization.yaw=0.05")
     drive = make_drive(seed, "mode=joint", *told, localization=PoseNoise(xy=0.2, yaw=0.05))
     estimate = drive.joint()

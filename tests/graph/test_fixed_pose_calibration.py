@@ -59,7 +59,7 @@ def test_without_noise_the_errors_are_exact():
 
 
 def test_the_points_follow_the_errors_as_a_whole_fit_does():
-    """The sensitivity against points that scipy fits anew to the rays of the errors on both sides."""
+    """The sensitivity of the points, against points that scipy fits to the rays at a slightly smaller and a larger error."""
     errors, association, start = parts(exact())
     theta = np.zeros(len(errors.names))
     found = calibrate_at_poses(errors, association, start, theta, noise(errors))

@@ -204,7 +204,7 @@ def test_what_came_while_built_in_turns_is_there_once(drive, monkeypatch):
 
 
 class Counting:
-    """An iSAM2 that tells how many variables an update eliminated anew."""
+    """An iSAM2 that counts the variables that an update eliminated again."""
 
     def __init__(self, isam):
         self._isam, self.count = isam, 0.0

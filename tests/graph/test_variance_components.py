@@ -46,7 +46,7 @@ def test_the_noise_of_a_drive_is_found(drift, pixels):
 
 
 def test_the_noise_of_ranges_is_found():
-    """The simulated noise is a root of squares, that of the settings a sum; so the ratio of two drives is compared."""
+    """The simulated sigma is a root of squares, and that of the settings a sum. So the ratio of two drives is compared."""
     more, usual = (solved(1.0, ranges=of)[0].noise.ranges for of in (3.0, 1.0))
     assert more / usual == pytest.approx(3.0, rel=0.2)
 

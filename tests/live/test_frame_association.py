@@ -41,7 +41,7 @@ def rays(targets, label=0):
 
 
 def uncertainty(heading, place=np.nan):
-    """Drift of so much in heading (rad) since what is known was seen; `place`: m and rad, of the place in the map."""
+    """heading: the sigma (rad) of the drift since the landmarks were seen. place: that (m, rad) of the pose in the map."""
     drift = np.diag([1e-8, 1e-8, heading**2, 1e-6, 1e-6, 1e-8])
     return PoseUncertainty(drift, adjoint(inverse(AHEAD)), np.eye(6) * place**2)
 
@@ -67,10 +67,10 @@ def test_after_a_long_way_only_where_nothing_unknown_could_be_meant():
     many, few = landmarks(HALL, [0] * len(HALL)), landmarks(HALL, [0] + [1] * (len(HALL) - 1))
     off = turned(HALL[0], 0.05)
     assert found(many, off, 0.15) == [-1]
-    assert found(many, off, 0.15, place=0.01) == [-1]  # it is known better where the camera is, and this is too far off
+    assert found(many, off, 0.15, place=0.01) == [-1]  # the pose is certain, and this is too far off
     assert found(many, HALL[0], 0.15, place=0.01) == [0]
     assert found(few, off, 0.15) == [0]
-    assert found(few, off, 1.5) == [-1]  # a drift that large leaves room for the few that may be unknown, too
+    assert found(few, off, 1.5) == [-1]  # so large a drift may also hide unknown objects
 
 
 def test_several_that_one_drift_explains_are_trusted_together():
@@ -105,7 +105,7 @@ class Still:
 
 @pytest.mark.parametrize(("width", "count", "born"), [(45, 45, True), (15, 15, False), (45, 4, False), (100, 20, True)])
 def test_a_track_becomes_a_landmark_as_soon_as_it_is_sure(width, count, born):
-    """5 m away, 1 cm are 0.11 degrees: 45 of them are 5, less than half of joint.min_parallax_deg."""
+    """At 5 m, a baseline of 1 cm gives 0.11 degrees. 45 cm give 5 degrees, which is less than joint.min_parallax_deg."""
     graph, rng = Still(), np.random.default_rng(0)
     one = Track(0, 0, False, 0.0, 0.0, np.zeros((6, 6)))
     for number, k in enumerate(np.linspace(0, width, count).astype(int).tolist()):
@@ -148,7 +148,7 @@ def test_a_label_has_two_objects_where_what_disagrees_makes_another_one():
     in_turns = np.arange(40) // 5 % 2 == 0
     turns = [one if here else other for here in in_turns]
     assert two(lines(turns), in_turns)
-    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20)  # at one stretch: the path may have drifted
+    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20)  # not in turns: the path may have drifted
     assert not two(lines(turns, reach=0.1), in_turns)  # from one place it has no distance: the one of the label may be wrong
     strays = np.random.default_rng(1).uniform([1, -8, -8], [17, 8, 8], (40, 3))
     assert not two(lines(np.where(in_turns[:, None], one, strays)), in_turns)

@@ -61,7 +61,7 @@ def odometry(stamp, x=0.0):
 
 
 def boxes(count):
-    """A message that says it has so many boxes, all of them the same bytes."""
+    """A message with `count` boxes, all of them the same bytes."""
     one, two = (serialize(MAKER, MAKER.detections(S, [(1, 2, 30, 40, "cup", 0.9, "7")] * n)) for n in (1, 2))
     at = next(i for i in range(4, len(one), 4) if one[i : i + 4] == b"\1\0\0\0" and two[i : i + 4] == b"\2\0\0\0")
     body = two[at + 4 + (len(two) - len(one)) :]
@@ -73,7 +73,7 @@ def test_a_million_boxes_are_refused_before_they_are_decoded(robot):
     data = boxes(10**6)
     assert len(data) > 10**8
     send("/boxes", DETECTIONS, data)
-    send("/boxes", DETECTIONS, data[:400])  # It only says that it has so many.
+    send("/boxes", DETECTIONS, data[:400])  # It says that it has a million boxes, but ends early.
     assert messages.ledger.dropped == {"message that cannot be decoded": 2}
     assert "more than 10000 detections" in messages.ledger.lines()[0]
     assert not taken
@@ -97,7 +97,7 @@ def test_numbers_that_are_none_and_stamps_that_cannot_be(robot):
 
 
 def test_one_message_moves_no_clock(robot):
-    """Far ahead, or back by little or much, among poses at 200 Hz."""
+    """Single stamps that are far ahead, or back by little or much, among poses at 200 Hz."""
     send, entry, _, taken = robot
     for i in range(400):
         send("/odom", ODOMETRY, odometry(10 + 0.005 * i, 0.001 * i))

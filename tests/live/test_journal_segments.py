@@ -60,7 +60,7 @@ def test_an_old_journal_is_read_and_continued(tmp_path):
 
 
 def segmented(file, count=40, each=10):
-    """A journal of so many messages, in segments of `each`."""
+    """A journal of `count` messages, in segments of `each` messages."""
     for first in range(0, count, each):
         journal = Journal(file, resume=first > 0, segment=100)
         for i in range(first, first + each):

@@ -36,7 +36,7 @@ def exact():
 
 
 def heard(log, odometry, localization, frames=FRAMES):
-    """What a robot says as (stamp, push), where each path is there from begin to end (s) only, whatever else there is."""
+    """What a robot pushes, as (stamp, push). Each path has poses only in its intervals from begin to end, s."""
     begin = log.odometry.stamps[0]
     camera, detections = log.cameras[0].camera, log.cameras[0].detections
     said = []
@@ -184,13 +184,13 @@ def test_one_stamp_of_the_localisation_far_ahead_does_not_stop_the_odometry(log)
     pushes = heard(log, WHOLE, WHOLE)
     stamp, pose = float(log.localization.stamps[50]) + 500.0, log.localization.poses[50]
     pushes.insert(600, lambda s: s.push_localization(stamp, pose))
-    session = drive(log, pushes, refused=300)  # what comes of it later is late
+    session = drive(log, pushes, refused=300)  # later localisations are late
     assert session.snapshot().keyframes >= 75
     session.abort()
 
 
 def test_the_odometry_may_be_away_for_longer_than_a_frame_may_be_ahead(log):
-    """Frames are not from the future while the localisation goes on."""
+    """Frames do not count as too far ahead of the path while the localisation goes on."""
     detections, slow = log.cameras[0].detections, 10.0
 
     def later(stamps):
@@ -209,7 +209,7 @@ def test_the_odometry_may_be_away_for_longer_than_a_frame_may_be_ahead(log):
 
 
 def test_a_clock_set_back_while_the_odometry_is_away(log):
-    """The localisation leads then, and frames go with it."""
+    """Meanwhile the localisation sets the clock, and the stamps of frames follow it."""
     pushes, stamps = heard(log, ((0, 8), (22, 999)), WHOLE), log.localization.stamps
     back = 5.0
 

@@ -94,7 +94,7 @@ def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
 
 @pytest.mark.parametrize("classes", [12, 3])
 def test_an_object_keeps_its_id_to_the_end(classes):
-    """An id of the last snapshot is in the result the id of the same thing. The end associates the 3 labels once more."""
+    """An object has the same id in the last snapshot and in the result. With 3 labels, the end associates once more."""
     log = make_log(classes=classes)
     session = drive(log)
     shown = {o.id: o for o in session.snapshot().map.resolved()}
@@ -102,7 +102,7 @@ def test_an_object_keeps_its_id_to_the_end(classes):
     assert len({o.id for o in end}) == len(end)
     kept = [(shown[o.id], o) for o in end if o.id in shown]
     assert len(kept) >= 10
-    if classes == 3:  # counted anew, they would have other ids
+    if classes == 3:  # if the end numbered them again, they would have other ids
         assert [o.id for o in end] != list(range(len(end)))
     for before, after in kept:
         others = [o for o in end if o.label == before.label]
@@ -120,7 +120,7 @@ def test_poses_that_the_settings_leave_unused_are_no_loss(log):
 
 @pytest.mark.parametrize("share", [0.5, 0.01, 1e-4])
 def test_the_status_is_asked_as_in_the_end(log, share):
-    """An object that the end calls too uncertain for its distance, no snapshot called sure."""
+    """If an object is too uncertain for its distance at the end, no snapshot called it resolved."""
     settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", f"triangulation.max_rel_sigma={share}"))
     session = drive(log, settings)
     shown = {o.label: o for o in Describer().map(session._mapper.state, whole=True).objects}
@@ -150,7 +150,7 @@ def test_a_snapshot_shows_what_each_camera_saw_last(log):
     boxes, places = np.array([box for box, _ in held]), np.array([p for _, p in held])
     local = (places - frame.map_T_camera[:3, 3]) @ frame.map_T_camera[:3, :3]
     off = project(frame.camera, local) - (boxes[:, :2] + boxes[:, 2:]) / 2
-    assert np.median(np.linalg.norm(off, axis=1)) < 12  # of 2 px noise, and a place known to a few centimetres
+    assert np.median(np.linalg.norm(off, axis=1)) < 12  # px, from 2 px of noise and a position known to a few centimetres
     session.abort()
 
 
@@ -216,7 +216,7 @@ def test_a_crowd_of_one_label_does_no_harm():
     session = drive(crowded(log, np.arange(0, 150, 10), 9_900))
     found = [o for o in session.stop().map.resolved() if o.label != "leaf"]
     assert session.counters.dropped()["boxes beyond the 1000 surest of their label in a frame"] == 15 * 8900
-    assert session.counters.accepted()["tracks given up"] > 10 * 800  # a landmark is not made of everything
+    assert session.counters.accepted()["tracks given up"] > 10 * 800  # most tracks do not become landmarks
     true = [(o.label, o.position) for o in log.truth.objects]
     near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]
     assert len(found) >= 11
@@ -351,7 +351,7 @@ def test_growth_is_bounded_and_the_map_stays(log):
 
 
 def test_growth_is_bounded_where_objects_are_too_many_for_it():
-    """120 keyframes hold some ten rays of each of 60 objects: fewer than each would rather keep."""
+    """120 keyframes have about ten rays of each of 60 objects, which is fewer than the culling would keep."""
     settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=120"))
     session = drive(hall(), settings)
     snapshot = session.snapshot()
@@ -359,7 +359,7 @@ def test_growth_is_bounded_where_objects_are_too_many_for_it():
     assert len(snapshot.path) <= 1.35 * 120
     assert snapshot.keyframes > 1000
     assert 55 <= len(snapshot.map.resolved()) <= 65
-    assert snapshot.counters["merged objects"] > 0  # other things got their turn
+    assert snapshot.counters["merged objects"] > 0  # the maintenance had time for other tasks
 
 
 def test_what_was_pushed_in_disorder(log):
@@ -427,7 +427,7 @@ def test_rubbish_is_refused_and_counted(log):
 
 
 def test_too_many_frames_are_dropped_by_age_and_counted(log):
-    """The first one takes for as long as it takes all others to come, and to be too old."""
+    """The first frame takes until all other frames have come and are too old."""
     settings = load_settings(None, ("mode=joint", "live.max_frames_waiting=2", "live.max_lag=0.05"))
     session, come = Session(settings), threading.Event()
     take = session._mapper.take

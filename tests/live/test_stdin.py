@@ -148,7 +148,7 @@ def test_boxes_that_no_edge_cuts_off_are_used_from_stdin_as_from_a_file(tmp_path
         (b'{"type": "odometry", "stamp": 1, "translation": [1, 2], "rotation_xyzw": [0, 0, 0, 1]}', "translation"),
         (b'{"type": "odometry", "stamp": 1, "translation": [1, 2, 3], "rotation_xyzw": [0, 0, 0, 2]}', "length 1"),
         (b'{"type": "odometry", "stamp": 1, "x": 1, "y": 2, "yaw": 3, "covariance": [1]}', "36"),
-        (b'{"type": "camera", "image_width": 640}', "not a camera"),
+        (b'{"type": "camera", "image_width": 640}', "not a valid camera"),
         (b'{"type": "detections", "stamp": 1, "boxes": [[1, 2, 3]], "labels": ["a"], "scores": [1]}', "4 numbers"),
         (b'{"type": "detections", "camera": 5, "stamp": 1, "boxes": [], "labels": [], "scores": []}', "not a name"),
     ],

@@ -1,4 +1,4 @@
-"""Which topics are taken of those that there are."""
+"""Which of the topics that exist are taken."""
 
 import sys
 from pathlib import Path

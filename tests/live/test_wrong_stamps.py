@@ -1,4 +1,4 @@
-"""A single wrong stamp, of any publisher, costs that message and no other, and no view of the map ends by it."""
+"""A single wrong stamp, of any publisher, costs that message and no other, and ends no view of the map."""
 
 import numpy as np
 import pytest

@@ -33,7 +33,7 @@ def test_a_usual_result_is_good() -> None:
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
         ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
-        ({"fixed": True, "odometry_frame": True}, "check", "The poses are the odometry's as they are, so its drift is in"),
+        ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so its drift is in"),
         ({"rays": 20, "unexplained": 0}, "check", "Only 20 boxes were used, which is too few to notice wrong input."),
     ],
 )

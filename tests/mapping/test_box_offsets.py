@@ -71,7 +71,7 @@ def squares(result, places):
 
 @pytest.mark.parametrize("share", [0.02, 0.05, 0.1])
 def test_the_share_is_found_and_the_covariance_is_honest(share):
-    """Over 72 objects. If each ray counted by itself, hardly one would be inside."""
+    """Over 72 objects. If the errors of rays were independent, hardly one object would be inside."""
     found, off, naive = [], [], []
     for seed in range(12):
         log, places = drive(share, seed)

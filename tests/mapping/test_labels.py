@@ -17,6 +17,7 @@ from objslam.simulation import preset, simulate
 THIRD = (
     "rays.pixel_sigma=1",
     "rays.box_sigma=0",
+    "bodies.use=false",  # The centres of simulated boxes are where the objects are seen, as with no real body.
     *(
         f"odometry.{n}={getattr(Odometry(), n) / 3}"
         for n in ("x_per_m", "y_per_m", "xy_per_rad", "yaw_per_m", "yaw_per_rad")

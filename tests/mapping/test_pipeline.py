@@ -56,7 +56,8 @@ def test_what_a_result_holds_fits_together(mode):
     np.testing.assert_allclose(result.directions, directions, atol=1e-12)
     owner = result.association.object
     assert owner.max() < len(result.map)
-    positions = np.array([o.position for o in result.map.objects])
+    # Rays meet at the ray point, which is the position unless the object has a body.
+    positions = np.array([o.position if o.ray_point is None else o.ray_point for o in result.map.objects])
     held = owner >= 0
     to = positions[owner[held]] - origins[held]
     angle = np.arccos(np.clip((to * directions[held]).sum(axis=1) / np.linalg.norm(to, axis=1), -1, 1))

@@ -24,7 +24,7 @@ ROWS = 10  # of the file, a second
 
 
 def read_lost_in_the_woods(folder: Path, seconds: float = np.inf, every: int = 1, with_range: bool = True) -> Log:
-    """Read the first seconds of the drive, with observations every so many seconds.
+    """Read the first `seconds` of the drive, with observations every `every` seconds.
 
     Depths are z in the camera that sees the post.
     """

@@ -197,7 +197,7 @@ def test_an_answer_depends_on_neither_order_nor_frame_nor_the_other_objects():
 
 
 def test_more_rays_than_fit_into_one_chunk():
-    """A single object with so many rays that its hypotheses are scored in slices."""
+    """The hypotheses of a single object with 3,000 rays are scored in slices."""
     rng = np.random.default_rng(8)
     m, n = with_wrong(*view_of(np.zeros(3), rng, 1200, 0.004), 1800, rng)
     result = triangulate(m, n, np.zeros(3000, dtype=int), 1, 0.004, config.Triangulation(hypotheses=200))

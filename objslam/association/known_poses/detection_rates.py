@@ -8,8 +8,8 @@ from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
-_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger ones mean more similar rates.
-_CLEAR_LEAD = 5.0  # A concentration is excluded if its ln likelihood is this far below the best. More drops fewer objects.
+_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
+_CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead drops fewer.
 _POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
 
@@ -40,9 +40,9 @@ class Rates:
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
-    """Estimate the rate of each class as the median over its boxes. If a class has few boxes, its rate is near the rate of
-    all classes. The concentration is the lowest one whose likelihood is not clearly below the best. The likelihoods allow
-    any object to be a phantom."""
+    """Estimate the rate of each class (L,) as the median over its boxes. If a class has few boxes, its rate is near the rate
+    of all classes. The concentration is the lowest one whose likelihood is not clearly below the best. The likelihoods allow
+    any object to be a phantom. label: (N,) of the objects. labels: the number L of all labels."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)

@@ -1,5 +1,5 @@
 """Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
-landmark without an object: rays of different things meet there."""
+landmark without an object: rays of different things meet there. A stray ray belongs to no landmark."""
 
 import numpy as np
 

@@ -125,7 +125,8 @@ def associate_globally(
 
 
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
-    """Add landmarks where unassigned rays of one label agree."""
+    """Add landmarks where unassigned rays of one label agree. turn: the number of the search, which changes the random
+    pairs. parallax: as in `Search`."""
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))
@@ -254,7 +255,7 @@ def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
     If two neighbours of one label both fail, the one with more rays is kept in this call. It may get boxes back from the
-    other one, and is then judged again.
+    other one, and the next call judges it again.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():

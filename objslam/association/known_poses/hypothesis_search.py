@@ -12,7 +12,9 @@ _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together,
 _LARGE = 1 << 26  # The number of pairs of a ray and a point from which on torch is used. It can use CUDA, numpy cannot.
 _DRAWS_EACH = 8  # The number of ray pairs drawn for each hypothesis. Most pairs of rays do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
-_MIN_LEFT = 0.6  # Without the rays of better points, a point must keep this share of its support, or it waits.
+_MIN_LEFT = 0.6
+"""The share of its support that a point must keep without the rays of better points. With less, it is left to a later
+search. A larger share leaves more points."""
 _SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. Beyond it, millimetres would be lost.
 _RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
 _RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
@@ -21,9 +23,10 @@ _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried a
 
 @dataclass(frozen=True)
 class Search:
-    """The settings of a search. hypotheses: the number of tried points. support: least support of a point. gate: largest
-    squared deviation of a ray that supports a point. parallax: least angle (rad) between the rays of a pair. With 0,
-    distances along single rays are tried too. device: the setting `triangulation.device`."""
+    """The settings of a search. hypotheses: the most tried points where two rays meet. The ends of ranges and points along
+    single rays come in addition. support: least support of a point. gate: largest squared deviation of a ray that supports a
+    point. parallax: least angle (rad) between the rays of a pair. With 0, distances along single rays are tried too. device:
+    the setting `triangulation.device`."""
 
     hypotheses: int
     support: float
@@ -90,8 +93,8 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
 def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[Ints, Ints]:
     """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices.
 
-    If the first ray has a track, the second ray comes from it with probability 0.5. Otherwise it comes from any frame. Then
-    the logarithm of the number of rays in between is uniform, because near frames more often show the same object.
+    If the first ray has a track, the second ray has the same track with probability 0.5. In all other cases, the logarithm
+    of the number of rays between the two is uniform, because near frames more often show the same object.
     """
     n, count = len(obs), _DRAWS_EACH * search.hypotheses
     first = rng.integers(n, size=count)
@@ -109,9 +112,9 @@ def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[
 class _Scorer:
     """Scores points by the rays of one label.
 
-    The rays are sorted into slices. Slice k, from 0, holds the (k + 1)-th ray of every frame with more than k rays. Frames
-    with more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices gives
-    the best support in each frame.
+    The rays are sorted into slices. Slice k, from 0, contains the (k + 1)-th ray of every frame with more than k rays.
+    Frames with more rays come first, so place i of every slice belongs to the same frame. A running maximum over the slices
+    gives the best support in each frame.
     """
 
     def __init__(self, obs: Observations, search: Search, backend: Backend) -> None:
@@ -167,7 +170,7 @@ class _Scorer:
         return out
 
     def per_frame(self, support: Tensor) -> Tensor:
-        """Return the best support (H, R) in each frame, summed over the frames (H,)."""
+        """Return the sum over the frames (H,) of the best support in each frame. support: (H, R)."""
         xp = module_of(support)
         best, at = 1 * support[:, : self.slices[0]], self.slices[0]
         for width in self.slices[1:]:
@@ -176,7 +179,8 @@ class _Scorer:
         return best.sum(axis=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
-        """Move points (H, 3) to the least-squares solution of their rays. Directions that the rays do not fix stay."""
+        """Move points (H, 3) to the least-squares solution of the rays, with the weights `support` (H, R). A point stays in
+        directions that its rays do not fix."""
         xp = module_of(points)
         information = (support @ self.across).reshape(-1, 3, 3)
         trace = information[:, 0, 0] + information[:, 1, 1] + information[:, 2, 2]

@@ -13,7 +13,7 @@ from objslam.core.statistics import grouped_median, poisson_tail
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object."""
 _MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
-_MOST_BY_CHANCE = 1e-3  # The expected number of labels accepted by chance in a whole log. With more, more labels fuse.
+_MOST_BY_CHANCE = 1e-3  # The most labels accepted by chance in a log, on average. A larger value fuses more labels.
 
 
 def fused_labels(state: State, gate: float) -> Bools:

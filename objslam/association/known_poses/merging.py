@@ -18,14 +18,17 @@ from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 _OBJECT_COST = 10.0
 """The cost of one more object in squared deviations. BIC's cost is added: for each coordinate, ln of the number of rays."""
 _SHARED_SPACE = (0.35, 0.5)
-"""Two objects fill one space within this share of the smaller size, or within the second share of the larger size."""
+"""Two landmarks fill one space if their distance is below the first share of the smaller size, or below the second share of
+the larger size. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
-"""The largest share of frames in which one object may look like two. The frames show the rarer landmark, or should show both
-landmarks."""
+"""The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
+frames that should show both landmarks. A larger share merges more landmarks."""
 _MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is assumed to be at least this.
 _DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
-_REACH_GATES = 2.0  # Landmarks within this many gates are compared. With little parallax, one object has two distances.
+_REACH_GATES = 2.0
+"""The distance up to which two landmarks are compared, in gates of the noise of their rays. It is large because one object
+with little parallax may get landmarks at two distances. A larger value takes longer."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,8 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 
 def _on_one_line(state: State, gate: float) -> Ints:
-    """Return the pairs (P, 2) in which half of the first landmark's rays also pass the second landmark. This happens with
-    little parallax, or if one of them is a phantom."""
+    """Return the pairs (P, 2) in which at least half of the first landmark's rays also pass the second landmark. This
+    happens with little parallax, or if one of them is a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -111,7 +114,11 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 
 
 def _gains(state: State, gate: float, strays: Strays, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
-    """Return the decrease (P,) of -2 ln likelihood by one object instead of two, from fit, boxes, misses and number."""
+    """Return the decrease (P,) of -2 ln likelihood by one object instead of two.
+
+    It counts the fit of the rays, second boxes in one frame, missed detections, and the number of objects. both_seen,
+    both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be.
+    """
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]
@@ -142,7 +149,8 @@ def _gains(state: State, gate: float, strays: Strays, pairs: _Pairs, both_seen: 
 
 
 def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) -> Floats:
-    """Return -2 ln likelihood of each ray (R,) for its point, up to a constant. It is at most `gate`, as for a stray ray."""
+    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, as without a
+    landmark."""
     off2, distance = squared_offsets(r, position)
     return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 

@@ -48,18 +48,20 @@ class Problem:
 
 
 def centred(whole: Constellation, keep: Ints, centre: Floats) -> Constellation:
+    """Return the objects `keep` (N,) of a map, relative to a centre (3,) m, with `_FLOOR` added to their covariances."""
     return Constellation(whole.position[keep] - centre, whole.covariance[keep] + _FLOOR**2 * np.eye(3), whole.label[keep])
 
 
 def move(x: Floats, points: Floats) -> Floats:
-    """Return points (..., P, 3) under transforms (..., 4)."""
+    """Return points (..., P, 3) under transforms (..., 4), each of x, y, z (m) and yaw (rad)."""
     cos, sin = np.cos(x[..., 3, None]), np.sin(x[..., 3, None])
     turned = (cos * points[..., 0] - sin * points[..., 1], sin * points[..., 0] + cos * points[..., 1])
     return np.stack([*turned, np.broadcast_to(points[..., 2], turned[0].shape)], axis=-1) + x[..., None, :3]
 
 
 def covariances(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
-    """Return the covariances (H, P, 3, 3) of the differences of objects `a` under transforms x (H, 4) from objects `b`."""
+    """Return the covariances (H, P, 3, 3) of the offsets from objects `a` (H, P), under transforms x (H, 4), to objects
+    `b`."""
     rotation = lift_se2(np.stack([x[:, 0], x[:, 1], x[:, 3]], axis=1))[:, None, :3, :3]
     return rotation @ problem.a.covariance[a] @ np.swapaxes(rotation, -1, -2) + problem.b.covariance[b]
 
@@ -95,14 +97,17 @@ def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Int
 def fit(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Floats, Floats]:
     """Return transforms (H, 4) after one robust Gauss-Newton step on the matches of objects (H, P), and their information.
 
-    A transform with fewer than two matches stays unchanged, and its information is NaN.
+    A transform that its matches do not fix stays unchanged, and its information is NaN. Fewer than two never fix it.
     """
     _, miss, covariance, jacobian, good = gate(problem, index, x, hessian)
     return robust_step(x, miss, covariance, jacobian, good)
 
 
 def robust_step(x: Floats, miss: Floats, covariance: Floats, jacobian: Floats, good: Bools) -> tuple[Floats, Floats]:
-    """Return transforms (H, 4) after one Gauss-Newton step with Huber's weights, and their information (H, 4, 4)."""
+    """Return transforms (H, 4) after one Gauss-Newton step with Huber's weights, and their information (H, 4, 4).
+
+    miss, covariance, jacobian: (H, P, 3), (H, P, 3, 3) and (H, P, 3, 4) of the pairs. good: (H, P) which pairs match.
+    """
     information = np.linalg.inv(covariance)
     deviation = np.sqrt(np.einsum("hpi,hpij,hpj->hp", miss, information, miss))
     weight = good * np.minimum(1.0, HUBER_K / np.maximum(deviation, 1e-12))

@@ -1,9 +1,9 @@
 """Solve the frames of many maps and the positions of their objects together.
 
 Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
-frame is the frame of the result. Gauss-Newton steps eliminate the objects first, each of which is a block of its own (Schur
-complement), so that a step costs as much as the measurements and the cube of the few frames. Cauchy's weights limit the
-influence of an object that a map has at another place.
+frame is the frame of the result. Each Gauss-Newton step eliminates the objects first, because each object is a block of its
+own (Schur complement). So its time grows with the number of measurements, and with the cube of the number of frames, which
+are few. Cauchy's weights limit the influence of an object that a map has at another place.
 
 A map may be worse than it says. Where at least three maps overlap, the residuals tell: the noise of each map is estimated
 against that of the others (variance components; Helmert 1907, Foerstner 1979), and a worse map counts less.
@@ -20,13 +20,13 @@ from objslam.core.statistics import HALF_RAY
 _STEPS = 30
 """The most Gauss-Newton steps. More are slower. Fewer than ten are usual from a registration."""
 _ROUNDS = 10
-"""How often the noise of the maps is estimated, each time followed by a solve. More are slower, and change it less."""
+"""The most estimates of the maps' noise, each followed by a solve. More are slower, and hardly change the noise."""
 _SAME_NOISE = 0.02
 """The relative change of the noise below which it is not estimated again. A larger change ends sooner."""
 _FEWEST_MAPS = 3
-"""The least number of maps whose residuals tell which of them is worse. Two maps miss each other alike."""
+"""The least number of maps whose residuals tell which of them is worse. The residuals of two maps are alike."""
 _POOLED = 10.0
-"""How many numbers of a map its claimed covariances count for, against its residuals. A larger value trusts the claims
+"""The claimed covariances of a map count as this number of coordinates of residuals. A larger number trusts the claims
 longer. At 10, a map of a few objects keeps its claims, and one of a few dozen is judged by its residuals."""
 _STILL = 1e-9
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
@@ -48,7 +48,7 @@ class JointFrames:
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
     (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1]. noise: (S,) the factor on
-    the variance of each map against that of all maps, 1 where the residuals do not tell.
+    the variance of each map against that of all maps, 1 for fewer than three maps.
     """
 
     site_T_map: Floats
@@ -60,10 +60,11 @@ class JointFrames:
 
 
 def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFrames:
-    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object is measured.
+    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has a
+    measurement.
 
-    Each frame must share at least two objects with the others, directly or through other frames. Else its covariance is not
-    finite.
+    Each frame must share at least two objects with the others, directly or through other frames. If one does not, the
+    covariances of all frames after the first are NaN.
     """
     noise = np.ones(len(site_T_map))
     found = _solve(measured, site_T_map, count, noise)
@@ -89,7 +90,7 @@ def _noise(measured: Measured, found: JointFrames) -> Floats:
     squares = found.weight * np.einsum("ri,rij,rj->r", miss, claimed, miss)
     maps = len(found.noise)
     free, own = np.bincount(measured.map, 3 - share, maps), np.bincount(measured.map, squares, maps)
-    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # What all maps claim too much or too little.
+    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # The factor by which all maps claim too small variances.
     return np.asarray((own / level + _POOLED) / (free + _POOLED))
 
 
@@ -146,7 +147,8 @@ def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:
 def _reduced(
     measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, frames: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the system and the right side for the frames after the first, and what ties the objects to all (N, S, 3, 4)."""
+    """Return the system and the right side for the frames after the first, and the information (N, S, 3, 4) that ties each
+    object to each frame."""
     count = len(total)
     pull = information @ lever
     half = np.zeros((count, frames, 3, 4))

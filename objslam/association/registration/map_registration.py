@@ -35,8 +35,8 @@ MIN_LOG_ODDS = 9.2
 """The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
 refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""For each stage of growth, the number of objects around its pair to which a proposal is fitted, and the number of proposals
-that enter. Larger numbers find smaller overlaps and take longer."""
+"""For each stage of growth, the number of objects around its pair to which a proposal is fitted, and the number of the best
+proposals that are fitted. Larger numbers find smaller overlaps and take longer."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
@@ -67,7 +67,8 @@ class Registration:
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the log odds are enough for the transform, and if so, whether its lead over another place is enough."""
+        """Whether the log odds are enough for the transform, and if so, whether the lead over the best other place is enough
+        too."""
         if self.log_odds < MIN_LOG_ODDS:
             return "too little evidence"
         return "accepted" if self.lead >= MIN_LOG_ODDS else "ambiguous"
@@ -128,7 +129,8 @@ def _nothing() -> Registration:
 
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
-    """Return the best transforms (H, 4). Each is fitted first to the objects around its pair, then to more, then to all."""
+    """Return the best transforms (H, 4). Each is fitted first to the objects around its pair, then to more, then to all.
+    first: the object of a in the pair of each transform."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)

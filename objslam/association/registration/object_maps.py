@@ -1,4 +1,4 @@
-"""Register the map of one drive to that of another, where nobody knows how their frames lie to each other."""
+"""Register the map of one drive to the map of another, if the transform between their frames is unknown."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from objslam.core.object_map import ObjectMap
 
 
 def register(a: ObjectMap, b: ObjectMap) -> Registration:
-    """Find the transform b_T_a from the frame of map a to that of map b, by how their objects lie to each other.
+    """Find the transform b_T_a from the frame of map a to the frame of map b, from the relative positions of their objects.
 
     Both frames have z up. The transform turns about z and shifts along x, y and z. Only resolved objects count. `matches`
-    are indices into the objects of a and b. Use the transform only if `accepted` is true: `verdict` says why it is not.
+    are indices into the objects of a and b. Use the transform only if `accepted` is true. If not, `verdict` says why.
     """
     names = sorted({o.label for m in (a, b) for o in m})
     number = {name: k for k, name in enumerate(names)}
@@ -37,12 +37,12 @@ def placed(objects: ObjectMap) -> list[int]:
 
 
 def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
-    """Return in a few words why the registration of a to b was accepted or refused. names: of a and b."""
+    """Return in a few words why the registration of a to b was accepted or refused. names: how the reason calls a and b."""
     for name, objects in zip(names, (a, b), strict=True):
         if len(placed(objects)) < 2:
             return f"too little evidence, because {name} has {len(placed(objects))} resolved objects"
     if not len(found.matches):
-        return "too little evidence, because no two objects lie to each other alike in both maps"
+        return "too little evidence, because no two objects have the same offset in both maps"
     odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"
     return {"accepted": odds, "ambiguous": f"ambiguous, because another place fits as well ({odds})"}.get(
         found.verdict, f"too little evidence ({odds}, and {MIN_LOG_ODDS:.1f} are needed)"

@@ -26,7 +26,10 @@ _AT_ONCE = 1 << 20
 
 
 def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
-    """Return the ordered pairs (P,), (P,) of each object and its nearest partners that give a heading."""
+    """Return the ordered pairs (P,), (P,) of each object and its nearest partners that give a heading.
+
+    spread: (N,) m^2, as in `Problem`.
+    """
     count = len(m.label)
     partners = min(count - 1, max(_MIN_PARTNERS, _PAIRS // count))
     distance, index = KDTree(m.position[:, :2]).query(m.position[:, :2], k=min(count, 3 * partners + 1))
@@ -36,7 +39,7 @@ def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
 
 
 def propose(problem: Problem) -> tuple[Ints, Floats, int]:
-    """Return the proposals: the first object (H,) of its pair in a, the transform (H, 4), and the number of tried proposals.
+    """Return H proposals: the first object (H,) of each pair in a, the transforms (H, 4), and the number of tried proposals.
 
     A transform is the position of the centre of a in b: x, y, z (m), and yaw (rad). If there are too many proposals, the
     most distinctive ones remain. Their pairs have the fewest similar pairs.
@@ -76,7 +79,10 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
-    """Return the number (H,) of neighbours of object i (H,) of a that fall on a neighbour of object k (H,) of b."""
+    """Return the number (H,) of neighbours of object i (H,) of a that fall on a neighbour of object k (H,) of b.
+
+    yaw, turn_variance: (H,) rad and rad^2, the heading of each proposal and its variance.
+    """
     (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))
     support = np.zeros(len(i))
     spread = float(np.median(problem.spread_b))
@@ -100,7 +106,7 @@ def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Flo
 
 
 def _offsets(m: Constellation) -> tuple[Ints, Array]:
-    """Return the neighbours (N, K) of each object and their offsets (N, K), as complex numbers."""
+    """Return the neighbours (N, K) of each object and their horizontal offsets (N, K), m, as complex numbers."""
     plane = m.position[:, 0] + 1j * m.position[:, 1]
     near = around(m, np.arange(len(plane)), _NEIGHBOURS + 1)[:, 1:]
     return near, plane[near] - plane[:, None]

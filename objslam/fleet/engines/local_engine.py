@@ -38,11 +38,12 @@ Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
 """A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
 
 _QUEUED = 2
-"""How many arguments are prepared for each process. A larger number hides a slow source of arguments."""
+"""The most tasks of each process that are submitted and not answered yet. A larger number hides a slow source of
+arguments."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
-    """Run one task in a worker, and return its answer or its failure. Any engine calls this function beside its worker."""
+    """Run one task in a worker, and return its answer or its failure. The process that owns the worker calls this."""
     try:
         return Answer(argument, worker.call(work, argument, limits))
     except LimitError as error:
@@ -58,9 +59,9 @@ def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
 
 
 def local_engine(jobs: int, limits: Limits) -> Engine:
-    """Return the engine of this machine, with one process for each of `jobs` tasks at a time.
+    """Return the engine of this machine, with `jobs` processes. Each does one task at a time.
 
-    A thread waits for each process, and computes nothing.
+    Each process has a thread that waits for its answers, and computes nothing.
     """
 
     def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:
@@ -85,7 +86,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
 
 
 def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], most: int) -> Iterator[Answer]:
-    """Yield the answers of tasks, of which at most so many are submitted and not yet answered."""
+    """Yield the answer of each task. most: the most tasks that are submitted and not answered yet."""
     left = iter(arguments)
     running = {submit(argument) for argument in islice(left, most)}
     while running:

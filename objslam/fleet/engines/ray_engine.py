@@ -6,6 +6,7 @@ Ray places the tasks and runs them again when a node is lost. Results go to the 
 from __future__ import annotations
 
 import atexit
+import logging
 import socket
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,13 +18,13 @@ from objslam.fleet.engines.local_engine import Answer, Engine, attempt
 from objslam.fleet.engines.worker import Limits, Worker
 
 _QUEUED = 2
-"""How many tasks are submitted for each CPU of the cluster. A larger number keeps more tasks ready, and loses none."""
+"""The tasks that are submitted for each CPU of the cluster. A larger number keeps more tasks ready for a free CPU."""
 _PATIENT = 10.0
 """How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
 _GB = 1e9
 
 _worker = Worker()
-"""The process that does the tasks of one process of Ray. It is kept, so that libraries are imported once."""
+"""The process that does the tasks of this process of Ray. It is kept, so that libraries are imported once."""
 atexit.register(_worker.close)
 
 
@@ -37,7 +38,7 @@ class Cluster:
 
 
 def join_cluster(address: str) -> Cluster:
-    """Join the Ray cluster at an address, or with `auto` the one that runs here. It is never started.
+    """Join the Ray cluster at an address, or with `auto` the one that runs here. No cluster is ever started.
 
     ObjslamError if Ray is not installed, or if no cluster answers.
     """
@@ -50,7 +51,7 @@ def join_cluster(address: str) -> Cluster:
     try:
         if mark and port.isdigit():  # Ray itself waits for minutes where nobody listens.
             socket.create_connection((host.strip("[]"), int(port)), _PATIENT).close()
-        context = ray.init(address, log_to_driver=False, logging_level="ERROR")
+        context = ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         raise ObjslamError(f"no Ray cluster answers: {first_line(error)}", where=address, hint=hint) from error
     found = ray.cluster_resources()
@@ -58,7 +59,7 @@ def join_cluster(address: str) -> Cluster:
 
 
 def leave_cluster() -> None:
-    """Leave the cluster that `join_cluster` joined. It goes on."""
+    """Leave the cluster that `join_cluster` joined. The cluster goes on."""
     import ray
 
     ray.shutdown()
@@ -68,7 +69,7 @@ def ray_engine(limits: Limits, *, most: int, memory: int, gpus: float) -> Engine
     """Return the engine of the cluster that was joined. Each task takes one CPU.
 
     most: the most tasks in flight, 0 for twice the CPUs of the cluster. memory: the bytes that each task reserves on its
-    node, 0 for none. gpus: the share of a GPU that each task takes. ConfigError if no node has as much.
+    node, 0 for none. gpus: the share of a GPU that each task takes. ConfigError if no node has enough for one task.
     """
     import ray
 
@@ -105,7 +106,7 @@ def ray_engine(limits: Limits, *, most: int, memory: int, gpus: float) -> Engine
 
 
 def _answer(reference: Any, argument: Any) -> Answer:
-    """Return the answer of a task of Ray, or that the cluster lost it in every try."""
+    """Return the answer of a task of Ray. Its kind is `lost` if the cluster lost the task in every try."""
     import ray
 
     try:
@@ -116,6 +117,6 @@ def _answer(reference: Any, argument: Any) -> Answer:
 
 
 def _task(work: str, argument: Any, limits: Limits) -> tuple[Any, str, str]:
-    """Run on a node: do one task in the process that belongs to this process of Ray."""
+    """Do one task on a node, in the worker of this process of Ray. Return value, kind and message of its `Answer`."""
     answer = attempt(_worker, work, argument, limits)
     return answer.value, answer.kind, answer.message

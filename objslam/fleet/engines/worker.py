@@ -2,7 +2,7 @@
 
 A task is a function, named as "module:function", and one argument. The limits are watched from outside, because native code
 neither returns to Python nor lets another thread of its process run. The memory is what the process has in RAM. RLIMIT_AS
-and RLIMIT_DATA count what libraries reserve: 2.0 and 1.35 GB for a process that uses 0.28 GB.
+and RLIMIT_DATA do not limit it, because they count what libraries reserve: 2.0 and 1.35 GB for a process that uses 0.28 GB.
 """
 
 from __future__ import annotations
@@ -25,18 +25,20 @@ from typing import Any
 from objslam.errors import ObjslamError
 
 _WATCH = 0.05
-"""How often memory and time are looked at, s. A larger value costs less, and lets a task take more before it is ended."""
+"""The pause between two looks at memory and time, s. A larger value costs less, and ends a task later."""
 _TIRED = 0.5
 """The share of the memory limit that a process may still have after a task. A process that has more is replaced, so that the
 next task has its memory. A larger share replaces processes less often."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""The environment variables that give numerical libraries one thread, because each core has a process of its own."""
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux.
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of a task. memory: bytes, 0 for none. seconds: 0 for none. retries: after a process that died."""
+    """The limits of a task. memory: bytes of RAM, 0 for no limit. seconds: its longest duration, s, 0 for no limit. retries:
+    how often the task begins again after its process died."""
 
     memory: int = 0
     seconds: float = 0.0
@@ -143,7 +145,7 @@ class Worker:
             return 0
 
     def _last_words(self) -> str:
-        """Close a process that died, and say why it did."""
+        """Clean up after a process that died, and return why it died."""
         process = self._process
         assert process is not None
         self._end()
@@ -156,9 +158,12 @@ class Worker:
 
 
 def serve(handle: int, parent: int) -> None:
-    """Do the tasks that come over a socket, until it closes. The process dies with its parent."""
+    """Do the tasks that come over a socket, until the socket closes. The process dies with its parent.
+
+    handle: the file descriptor of the socket. parent: the process id of the parent.
+    """
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
-    if os.getppid() != parent:  # The parent died before the line above.
+    if os.getppid() != parent:  # The parent died before prctl was called.
         return
     logging.getLogger("objslam").setLevel(logging.ERROR)  # The warnings of a run are in its result.
     pipe = Connection(handle)
@@ -169,13 +174,13 @@ def serve(handle: int, parent: int) -> None:
             return
         try:
             answer = True, resolve_name(work)(argument)
-        except Exception as error:  # noqa: BLE001 - It is raised where the task was given.
+        except Exception as error:  # noqa: BLE001 - The parent raises it.
             answer = False, error if isinstance(error, ObjslamError | MemoryError) else _told(error)
         pipe.send(answer)
 
 
 def _told(error: Exception) -> ObjslamError:
-    """Return an error that another process can raise, with the text of one that it may not know."""
+    """Return an error that the parent can raise, with the text of an error whose class the parent may not know."""
     return ObjslamError(f"internal error, {type(error).__name__}: {error}", hint="please report it")
 
 

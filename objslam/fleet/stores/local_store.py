@@ -13,7 +13,7 @@ from objslam.io.atomic_files import write_file
 
 
 def local_path(url: str) -> Path:
-    """Return the path of a `file://` URL, or of a path."""
+    """Return the path that a `file://` URL or a text names."""
     return Path(unquote(url.removeprefix("file://")) if url.startswith("file://") else url)
 
 
@@ -25,7 +25,10 @@ class LocalStore:
         self.url = str(self._folder)
 
     def names(self, prefix: str) -> list[str]:
-        """Return the names of the files directly in the folder `prefix`, without the folder, in order."""
+        """Return the names of the files directly in the folder `prefix`, without the folder, in order.
+
+        Names with a dot in front are left out: they are parts of files that are being written.
+        """
         try:
             with os.scandir(self._folder / prefix) as entries:
                 return sorted(entry.name for entry in entries if not entry.name.startswith(".") and entry.is_file())
@@ -54,7 +57,7 @@ class LocalStore:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. OutputError if the disk refuses."""
+        """Write a file, and replace an older one. OutputError or StoreError if the disk refuses."""
         file = self._folder / name
         self._make(file.parent)
         write_file(file, data)
@@ -106,7 +109,7 @@ class LocalSource:
             below = PurePosixPath(Path(folder).relative_to(root).as_posix())
             for name in sorted(names):
                 file = Path(folder, name)
-                if file.is_file():  # Not a link to nothing.
+                if file.is_file():  # A link to nothing is left out.
                     found[str(below / name)] = _state(file)
         return found
 

@@ -29,7 +29,7 @@ _T = TypeVar("_T")
 def open_filesystem(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and the path of the URL in it.
 
-    ObjslamError if fsspec, or the package of the protocol, is not installed.
+    ObjslamError if fsspec, or the package of the protocol, is not installed, or if nobody knows the protocol.
     """
     try:
         import fsspec
@@ -47,7 +47,8 @@ def open_filesystem(url: str) -> tuple[Any, str]:
 def persistent(call: Callable[[], _T], where: str) -> _T:
     """Return what a call to a store returns, after up to `_TRIES` tries.
 
-    FileNotFoundError at once, StoreError in the end.
+    where: the file, for messages. A FileNotFoundError is raised at once, and so is a StoreError if access is denied. After
+    the last try, any other OSError becomes a StoreError.
     """
     pause = _PAUSE
     for left in range(_TRIES - 1, -1, -1):
@@ -137,7 +138,7 @@ class RemoteSource:
         self._fs = open_filesystem(url)[0]
 
     def expand(self, pattern: str) -> list[str]:
-        """Return the URLs that a URL or a glob pattern names, in order; none if nothing is there."""
+        """Return the URLs that a URL or a glob pattern names, in order; none if nothing is there. ConfigError for `**`."""
         path = self._path(pattern)
         if "**" in path:
             raise ConfigError(f"** is not known in URLs: {pattern}", hint="name a folder, which is searched for logs")
@@ -158,7 +159,7 @@ class RemoteSource:
         return {str(name)[len(root) :].lstrip("/"): _state(info) for name, info in sorted(found.items())}
 
     def fetch(self, path: str, to: Path) -> Path:
-        """Copy a log into the folder `to`, and return the path of the copy."""
+        """Copy a log into the folder `to`, and return the path of the copy. StoreError if a name leads out of the log."""
         root = self._path(path)
         copy = to / root.rpartition("/")[2]
         names = list(self.files(path))
@@ -174,7 +175,8 @@ class RemoteSource:
     def _is_flat(self) -> bool:
         """Return whether the file system lists all below a path in few calls, as object stores do.
 
-        It then has a `find` of its own. That of fsspec goes from folder to folder, and leaves out a folder that fails.
+        Such a file system has a `find` of its own. The `find` of fsspec goes from folder to folder, and leaves out a folder
+        that fails.
         """
         from fsspec.asyn import AsyncFileSystem
 
@@ -192,7 +194,7 @@ class RemoteSource:
         return found
 
     def _inside(self, folder: str) -> dict[str, Any]:
-        """Return what is directly in a folder, by its path, and a file itself. Nothing if the folder is not there."""
+        """Return the entries directly in a folder, by path. A file gives itself, and a missing path nothing."""
         try:
             entries = self._try(folder, lambda: self._fs.ls(folder, detail=True))
         except FileNotFoundError:
@@ -201,7 +203,7 @@ class RemoteSource:
         return {name: one for name, one in named.items() if name != folder or one["type"] == "file"}
 
     def _exists(self, path: str) -> bool:
-        """Return whether something is at a path. The store's own `exists` also says no when it does not answer."""
+        """Return whether something is at a path. The `exists` of fsspec also returns False if the store does not answer."""
         try:
             self._try(path, lambda: self._fs.info(path))
         except FileNotFoundError:

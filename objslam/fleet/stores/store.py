@@ -38,7 +38,7 @@ class Store(Protocol):
         """Return the contents of files by name. Files that do not exist are left out."""
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError if the store refuses."""
+        """Write a file, and replace an older one. StoreError or OutputError if the store refuses."""
 
     def upload(self, folder: Path, name: str) -> list[str]:
         """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""
@@ -48,7 +48,7 @@ class Store(Protocol):
 
 
 class Source(Protocol):
-    """A tree of files that holds logs. A path is written as the user writes it."""
+    """A tree of files that has logs. Its paths are those of this machine, or whole URLs."""
 
     def expand(self, pattern: str) -> list[str]:
         """Return the paths that a path or a glob pattern names, in order; none if nothing is there."""

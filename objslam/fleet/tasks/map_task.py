@@ -1,7 +1,7 @@
 """The task of one log: read it, map it, and put its result into the store, whole or not at all.
 
-The files of a result lie below its key, and the key is of the content. So a task that is run twice writes the same files,
-and nobody reads them before the record is there.
+The files of a result lie below its key, which is a hash of the log's content and the job. So a task that is run twice writes
+the same files. Nobody reads them before the record is there.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ WORK = "objslam.fleet.tasks.map_task:map_one"
 class Job:
     """What all logs of a fleet have in common.
 
-    store: the URL of the output. digest: of the settings and of all files that they name. files: for each of these, by the
-    dotted key of its setting, its path, or its name in the store. report: whether to write the report of each log.
+    store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
+    log. files: the dotted key of each setting that names a file, or `detector`, with the path of the file, or with its name
+    in a remote store. report: whether to write the report of each log.
     """
 
     store: str
@@ -52,8 +53,8 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class MapTask:
-    """One log of a job. task: the key under which the log is known as seen. again: whether to map it although a run of the
-    same content failed."""
+    """One log of a job. task: the key of the log's fingerprint and the job (`seen_name`). again: whether to map the log
+    although an earlier run of the same content failed."""
 
     job: Job
     path: str
@@ -64,8 +65,8 @@ class MapTask:
 def map_one(given: MapTask) -> Record:
     """Map one log, and return its record. A log that cannot be mapped gives a record with its error.
 
-    A result that is in the store already, of a log with the same content, is not made again. StoreError if the store or the
-    source does not answer.
+    If the store already has the record of a log with the same content, this record is returned. It is made again only if it
+    has an error and `again` is set. StoreError if the store or the source does not answer.
     """
     begin, cpu = time.monotonic(), time.process_time()
     store = open_store(given.job.store)
@@ -111,7 +112,7 @@ def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
     path = found.robot_path
     mapped, found = map_log(found, settings, ledger, None, lambda stage, done, total: None)
     result = Result.of(mapped, found, detected=detector is not None)
-    result.summary["log_path"] = given.path  # The copy of a log of a store is deleted.
+    result.summary["log_path"] = given.path  # The log may be a copy, which is deleted.
     result.save(out)
     if given.job.report:
         from objslam.output.report.page import write_report
@@ -161,7 +162,7 @@ def _settings(job: Job) -> tuple[Settings, Path | None]:
 
 @lru_cache(maxsize=16)
 def _local_file(store: str, name: str) -> Path:
-    """Return a file of a job on this machine. A process copies a file of a store once."""
+    """Return a file of a job on this machine. A file of a remote store is copied once by each process."""
     if not is_remote(store):
         return Path(name)
     from objslam.detection import default_cache

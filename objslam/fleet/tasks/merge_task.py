@@ -1,4 +1,4 @@
-"""The task of one node of the tree of a site: join the sessions or the two sites below it with the merge of sessions."""
+"""The task of one node of the tree of a site: merge the sessions, or the two parts, below the node."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ class MergeTask:
 class Placed:
     """A session in the frame of its island.
 
-    covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: of what tied it to the others, NaN for the first. common: how
-    many of its objects other sessions have, as far as the first merge of the session says.
+    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence that tied the session, or the
+    part of the site that begins with it, to those before, NaN for the first. common: how many of its objects other sessions
+    had in the first merge that found any.
     """
 
     key: str
@@ -66,7 +67,7 @@ class SiteMap:
 def merge_one(given: MergeTask) -> int:
     """Merge the node of a task, and write it into the store. Return the number of its islands.
 
-    OutputError if a result or a node below it is damaged, StoreError if the store does not answer.
+    OutputError or StoreError if a result or a node below it is damaged, StoreError if the store does not answer.
     """
     from objslam.mapping.sites.merge import merge_sessions
 
@@ -86,7 +87,7 @@ def merge_one(given: MergeTask) -> int:
 
 
 def load_node(store: Store, key: str) -> list[SiteMap]:
-    """Return the islands of a node. StoreError if its file is missing or damaged."""
+    """Return the islands of a node. StoreError if its file is missing or damaged, OutputError if an object is invalid."""
     from objslam.io.objects_json import parse_objects
 
     try:
@@ -101,7 +102,7 @@ def load_node(store: Store, key: str) -> list[SiteMap]:
 
 
 def load_session(store: Store, folder: Path, key: str) -> Session:
-    """Return the session of a key. `folder` gets the files of a remote store."""
+    """Return the session of a key. folder: gets the files, if the store is remote."""
     from objslam.mapping.sites.session import Session
 
     with _result_folder(store, folder, key) as at:
@@ -110,7 +111,7 @@ def load_session(store: Store, folder: Path, key: str) -> Session:
 
 @contextmanager
 def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
-    """Yield the folder of a result on this machine, with what a merge needs of it."""
+    """Yield a folder of this machine with the files of a result that a merge reads."""
     if isinstance(store, LocalStore):
         yield Path(store.url, result_name(key))
         return
@@ -133,14 +134,17 @@ def _session(part: SiteMap, load: Any) -> Session:
 
 
 def _alone(key: str) -> SiteMap:
-    """Return a session that no merge placed yet, in its own frame. Its objects come from its result."""
+    """Return a session that no merge placed yet, in its own frame. It has no objects: a merge reads them from the result."""
     from objslam.core.object_map import ObjectMap
 
     return SiteMap(ObjectMap(()), (Placed(key, np.eye(4), np.zeros((4, 4)), np.nan, 0),))
 
 
 def _joined(island: Island, parts: Sequence[SiteMap], order: Sequence[str]) -> SiteMap:
-    """Return an island of a merge with all sessions below it. order: the keys of the sessions, in the order of time."""
+    """Return an island of a merge with all sessions below it.
+
+    parts: what was merged, by the numbers in `island.sessions`. order: the keys of the sessions, in the order of time.
+    """
     rank = {key: number for number, key in enumerate(order)}
     placed = []
     for row, number in enumerate(island.sessions):
@@ -159,9 +163,10 @@ def _joined(island: Island, parts: Sequence[SiteMap], order: Sequence[str]) -> S
 
 
 def _compound(site_T_part: Floats, covariance: Floats, one: Placed) -> Floats:
-    """Return the covariance (4, 4) of a pose that is known in a part, whose own pose is known in the site.
+    """Return the covariance (4, 4), of x, y, z (m) and yaw (rad), of the pose of a session in the site.
 
-    x, y, z, yaw: an error of the yaw of the part turns the session around the origin of the part.
+    site_T_part (4, 4), covariance (4, 4): the pose of its part in the site. one: the session in the part. An error of the
+    part's yaw turns the session around the origin of the part.
     """
     turn = np.eye(4)
     turn[:3, :3] = site_T_part[:3, :3]

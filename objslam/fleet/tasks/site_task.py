@@ -31,12 +31,12 @@ _STATE = "fleet.json"
 """The file of a site that says what its folder and its tables were made of."""
 _OBJECTS, _SESSIONS = "objects.parquet", "sessions.parquet"
 """The folders of the tables, with one file for each site and day."""
-_FILE = "part-0.parquet"
+_FILE = "part-0.parquet"  # The name of this file.
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A session of a site. path: of its log. begin: of the log, s. digest: of the job that mapped it."""
+    """A session of a site. key: of its result. path: of its log. begin: its first stamp, s. digest: of its job."""
 
     key: str
     path: str
@@ -59,7 +59,8 @@ class SiteTask:
 
 @dataclass(frozen=True, slots=True)
 class SiteResult:
-    """What a site is: the sessions and objects of its largest island, and of all. changed: whether this run wrote it."""
+    """The counts of a site. islands, sessions: all of them. objects, gone: the present and the gone objects of the largest
+    island. changed: whether this run wrote the site."""
 
     site: str
     islands: int
@@ -76,7 +77,7 @@ def folder_of(name: str) -> str:
 
 
 def finish_site(given: SiteTask) -> SiteResult:
-    """Write the folder and the tables of a site, as far as they changed. The errors are those of the store."""
+    """Write the folder of a site, and the tables of its days that changed. Errors are those of `load_node` and the store."""
     store = open_store(given.store)
     islands = load_node(store, given.root)
     at = f"{SITES}/{folder_of(given.site)}"
@@ -95,7 +96,7 @@ def finish_site(given: SiteTask) -> SiteResult:
 
 
 def state_name(site: str) -> str:
-    """Return the name of the file that says what a site was made of."""
+    """Return the name of the file (`_STATE`) that says what a site was made of."""
     return f"{SITES}/{folder_of(site)}/{_STATE}"
 
 
@@ -109,7 +110,10 @@ def earlier_members(state: bytes | None, digest: str) -> list[Member]:
 
 
 def as_before(given: SiteTask, state: bytes | None) -> SiteResult | None:
-    """Return the site if it was made of the same before, by the content of its `state_name`. None if its task must run."""
+    """Return the site as an earlier run wrote it, if that run had the same sessions and price. None if its task must run.
+
+    state: the content of its `state_name`, None if there is none.
+    """
     said = _parse_state(state)
     return _result(given.site, said, changed=False) if said.get("made_of") == _made_of(given) else None
 
@@ -134,7 +138,7 @@ def _parse_state(data: bytes | None) -> dict[str, Any]:
 
 
 def _write_folder(store: Store, given: SiteTask, islands: Sequence[SiteMap], at: str, before: int) -> None:
-    """Write the site as `objslam merge` does, and the map as a table. before: how many islands were there."""
+    """Write the site as `objslam merge` does, and the map as a table. before: the islands of the earlier run."""
     from objslam.fleet.tables import dump_objects, object_rows
     from objslam.output.site_folder import write_site
 
@@ -177,7 +181,10 @@ def _island(found: SiteMap, order: Mapping[str, int]) -> Island:
 
 
 def _write_tables(store: Store, given: SiteTask, islands: Sequence[SiteMap], before: Mapping[str, str]) -> dict[str, str]:
-    """Write the tables of the days that changed. Return for each day what its files are made of."""
+    """Write the tables of the days that changed, and remove those of days that are gone.
+
+    Return for each day the hash of what its files are made of. before: the same of the earlier run.
+    """
     placed = {one.key: (number + 1, one) for number, island in enumerate(islands) for one in island.sessions}
     days: dict[str, list[Member]] = {}
     for one in given.members:

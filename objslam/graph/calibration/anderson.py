@@ -7,13 +7,14 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 MEMORY = 3
-"""The steps that Anderson's acceleration looks back on; more extrapolates farther, and less safely."""
+"""The number of earlier steps that Anderson's acceleration uses. A larger number extrapolates farther, and less safely."""
 
 
 def accelerated(history: Sequence[tuple[Floats, Floats]], scale: Floats | float) -> Floats:
     """Return the next parameters (P,) by Anderson's acceleration (Walker and Ni 2011, eq. 2.2).
 
-    history: parameters and the step from them, the newest last. scale: (P,) in what unit each parameter is compared.
+    history: pairs of parameters (P,) and the step (P,) from them, the newest last. scale: (P,) a typical size of each
+    parameter. Steps are compared in these units.
     """
     theta, step = history[-1]
     if len(history) < 2:

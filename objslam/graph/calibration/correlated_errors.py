@@ -15,7 +15,7 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
     A factor is the standard deviation by sums over windows of `TOGETHER` seconds, divided by the one for white noise.
-    system: of the graph.
+    system: the linear system of the graph `of`.
     """
     jacobian = system.jacobian
     told = np.column_stack([system.residual, system.instruments, system.sides])
@@ -30,7 +30,7 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
 
 
 def _seconds(of: Linearised, system: LinearSystem) -> Floats:
-    """Return the time (M,) of each row after the first keyframe, s. The priors of landmarks and poses have the time 0."""
+    """Return the time (M,) of each row after the first keyframe, s. It is 0 for landmark priors, absolute poses and tags."""
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     stamps = np.maximum.accumulate(keyframes.stamps) - keyframes.stamps[0]
     seen, ranged = stamps[rays.keyframe], np.isfinite(rays.range)

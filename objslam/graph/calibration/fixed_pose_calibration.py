@@ -21,8 +21,8 @@ _CONVERGED = 0.01
 _CAUCHY = 3.0
 """The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
 _STRETCHES = 50
-"""The number of stretches of the drive that count as independent. With fewer, longer stretches, errors may last longer, but
-the size of these errors is less exact."""
+"""The number of stretches of the drive that count as independent. With fewer and longer stretches, errors that last longer
+are found, but their size is less exact."""
 _FREE = 1e-6
 """The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
 objects."""
@@ -65,10 +65,10 @@ def calibrate_at_poses(
 ) -> FixedCalibration:
     """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
 
-    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: with the noise of
-    the poses. SolveError if the linear system has no single solution.
+    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the rays, with
+    the noise of the poses. SolveError if the linear system has no single solution.
     """
-    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # The index -1 (no object) takes the last.
+    held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
     points = positions[number]
     if not held.any():
@@ -104,7 +104,7 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the angles (R,), rad, by which ray directions in map turn if shared errors (P,) change to others (P,)."""
+    """Return the small angles (R,), rad, by which rays in map turn between two values (P,) of the shared errors."""
     ends = []
     for values in (before, after):
         keyframes, rays, _ = errors.at(values, drift=False)
@@ -117,7 +117,8 @@ def linearise_points(
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    held: (R,) the rays that count. owner: (n,) the point of each of them. noise: with the noise of the poses.
+    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the rays, with the noise of the
+    poses.
     """
     angle, place = noise
     target = points[owner]
@@ -153,7 +154,7 @@ def linearise_points(
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
-    """Return the factor (at least 1) by which the vector varies more than with independent errors of all rays.
+    """Return the factor (at least 1) on the variance of `system.vector` because the errors of rays are not independent.
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
     detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
@@ -174,7 +175,7 @@ def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: F
 
 
 def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the angles (n, 2) between rays and points, the axes across the rays (n, 2, 3), and the distances (n,)."""
+    """Return the angles (n, 2), rad, between rays and points, the axes (n, 2, 3) across the rays, and distances (n,), m."""
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)

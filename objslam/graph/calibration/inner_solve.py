@@ -36,7 +36,7 @@ class InnerSolve(Linearised):
 
     @property
     def decrease(self) -> float:
-        """The decrease of the cost by this step, in the linear system."""
+        """The decrease of the cost by `step`, in the linear system."""
         return float(-(self.rows.jacobian.T @ self.rows.residual) @ self.step / 2)
 
     def ordered(self) -> Self:
@@ -59,7 +59,7 @@ class InnerSolve(Linearised):
         return replace(self.moved(system.sensitivity @ step + system.newton), measured=measured)
 
     def solved(self) -> Self:
-        """Return the state after an inner solve. One more step would hardly change it."""
+        """Return the state after at most `_INNER` Gauss-Newton steps, or `_damped` if a step does not lower the cost."""
         state = self
         for _ in range(_INNER):
             if state.decrease <= _TOLERANCE * state.rows.cost:
@@ -71,7 +71,7 @@ class InnerSolve(Linearised):
         return state
 
     def _damped(self) -> Self:
-        """Return the state after iterations of Levenberg-Marquardt. Steps of Gauss-Newton do not lower the cost."""
+        """Return the state after iterations of Levenberg-Marquardt."""
         landmarks = self.landmarks
         graph, values = self.measured.whole(self.association.object, self.used, self.map_T_camera, self.positions)
         found = levenberg_marquardt(graph, values, _INNER, _TOLERANCE).values

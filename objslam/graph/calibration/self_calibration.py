@@ -29,9 +29,10 @@ _ROUNDS = 8
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _HALVINGS = 3
-"""The most times that a step is halved if it does not lower the cost. After that, the parameters stay as they are."""
+"""The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
+the cost, the parameters stay as they are."""
 _LEAST_SIGNAL = 0.05
-"""The least share of signal in the information about a clock. With a smaller share, a noisy clock takes larger steps."""
+"""The least share of signal in the information about a clock or odometry scale. A smaller share takes larger steps."""
 _RIDGE = 1e-9
 """The share of the information about the clocks that is added to its diagonal. It prevents a division by zero if a log
 cannot tell two clocks apart. A larger share mixes such clocks more."""
@@ -46,8 +47,8 @@ _SAME_SHARES = 0.5
 slowly with the noise, and take two inner solves for each clock. A larger value measures them less often."""
 
 _LEAST_GROWTH = 0.5
-"""If all scales grow by 1, the linearised map must grow at least by this, or the projection is not used. An exact map would
-grow by 1. With a larger value, the projection is used more rarely."""
+"""The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
+1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
 _FAR = 3.0
 """Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
 determined landmarks count too."""
@@ -62,7 +63,8 @@ Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 class CalibratedSolution:
     """A joint solution at the shared errors and the noise that fit best.
 
-    errors: the measurements with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter.
+    errors: the measurements with this noise. sensitivity: (N, 3, P) of the landmarks, m per unit of each parameter, NaN for
+    a landmark outside the graph.
     """
 
     calibration: Calibration
@@ -119,8 +121,7 @@ def calibrate(
 class _Found:
     """The parameters theta (P,) that fit best, and the solution at them.
 
-    system: of the solution. noisy: (P, P) the shares of noise in the information that the search took. steps: how many it
-    took.
+    system: the linear system at the solution. noisy: (P, P) from `noise_shares`. steps: the number of outer steps.
     """
 
     theta: Floats
@@ -140,11 +141,11 @@ class _Fit:
 
     @property
     def prior_residuals(self) -> float:
-        """The number of residuals for which the nominal noise counts."""
+        """The weight of the nominal noise: it counts like this number of residuals."""
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: InnerSolve, theta: Floats, noisy: Floats | None = None) -> _Found:
-        """Return the parameters that fit best, from theta (P,) on. noisy: (P, P) the shares of noise, if they are known."""
+        """Return the parameters that fit best. The search starts at theta (P,). noisy: from `noise_shares`, if known."""
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         sigma = np.sqrt(np.diagonal(errors.prior))
@@ -191,11 +192,11 @@ class _Fit:
         return _Found(theta, state, linear, noisy, steps)
 
     def noise_shares(self, state: InnerSolve, system: ReducedSystem, theta: Floats) -> Floats:
-        """Return the part of the information (P, P) that comes from noise, as shares of its diagonal.
+        """Return the part (P, P) of the information that comes from noise. Entry i, j is divided by sqrt(I_ii I_jj).
 
         Only clocks and odometry scales have such a part. The derivative of a motion by a clock is a difference of measured
-        velocities. Their noise enters the Jacobian, and makes its square too large. But the noise does not affect the change
-        of the gradient between two values of the clock. The clocks of several cameras share this noise.
+        velocities. The noise of the velocities is in the Jacobian, and makes its square too large. But the noise does not
+        affect the change of the gradient between two values of the clock. The clocks of several cameras share this noise.
         """
         noisy = np.diag(1 - np.maximum(system.signal, _LEAST_SIGNAL))
         clocks = np.flatnonzero([kind(name) == "clock" for name in self.errors.names])
@@ -217,7 +218,7 @@ class _Fit:
         return noisy
 
     def gradient(self, state: InnerSolve, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
-        """Return the gradient by some parameters at the optimum after a step (P,) of the parameters."""
+        """Return the gradient by the parameters `which` (indices) at the optimum after a step (P,) of all parameters."""
         side = state.predicted(system, step, self.measure(*self.errors.at(theta + step))).solved()
         return linearise(side, self.errors, theta + step, which).reduce().gradient
 
@@ -229,7 +230,7 @@ class _Fit:
 def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
     """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
 
-    noisy: (P, P) the noise in the information, as shares of its diagonal. The curvature comes from the signal alone, but the
+    noisy: (P, P) from `_Fit.noise_shares`, the noise in the information. The curvature comes from the signal alone, but the
     variance of the gradient is the whole information. So the covariance is a sandwich (Huber 1967). It never exceeds the
     covariance of the prior in any direction. wider: (P,) factors on the standard deviations of the gradient, for noise that
     is not white.
@@ -261,8 +262,9 @@ def _without_shrinking(
     """Return the system without the force that makes a solution too small, because this force would move the parameters.
 
     The force acts on a parameter as far as the size of the map depends on the parameter. If all lengths have an unknown
-    scale, everything can grow in proportion at no cost. Then only this force seems to determine a common scale. So it is
-    projected out (the gauge of a free network; Meissl 1969). Otherwise, the force is computed and subtracted.
+    scale, everything can grow in proportion at no cost. In this case, only the force seems to determine the common scale. So
+    the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
+    computed and subtracted.
     """
     landmarks = state.positions[state.landmarks]
     if not len(landmarks):

@@ -22,9 +22,9 @@ from objslam.graph.least_squares.normal_equations import NormalEquations, elimin
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
 _ALIKE = 10.0
-"""The prediction of a motion by its neighbours is used if its covariance and theirs differ at most by this factor. The noise
-of a motion changes its covariance by far less. With 3 or 5, one of twelve clean drives was pulled by 7 sigma, because the
-choice itself then depends on the noise. With 30, a stereo rig that often stands lost its scale."""
+"""The neighbours of a motion predict its covariance if the prediction and the motion's own covariance differ at most by this
+factor. The noise of a motion changes its covariance by far less. With 3 or 5, one of twelve clean drives was pulled by 7
+sigma, because the choice itself then depends on the noise. With 30, a stereo rig that often stands lost its scale."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Linearised:
 
     @cached_property
     def graph(self) -> JointGraph:
-        """The graph. The means of the weak priors of landmarks are these positions."""
+        """The graph. The means of the weak priors of landmarks are `positions`."""
         return JointGraph.of(self.measured, self.association, self.used, self.positions)
 
     @cached_property
     def rows(self) -> JointRows:
-        """The rows of the graph at these values."""
+        """The rows of the graph at the values."""
         return self.graph.rows(self.map_T_camera, self.positions[self.landmarks])
 
     @cached_property
     def normal(self) -> NormalEquations:
-        """The normal equations of these rows. SolveError if they are singular."""
+        """The normal equations of `rows`. SolveError if they are singular."""
         jacobian = self.rows.jacobian
         order = elimination_order(jacobian, self.graph.blocks) if self.order is None else self.order
         return NormalEquations.of(jacobian, order)
@@ -74,11 +74,12 @@ class Linearised:
 class LinearSystem:
     """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
 
-    The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses.
-    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. normal: its normal
-    equations. sides: (M, P) by the shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges
-    and of the motions. instruments: (M, P). At the optimum, the residuals do not correlate with these columns. They equal
-    the sides, except for the scales of the odometry: their sides contain the noise of the odometry, and so do the residuals.
+    The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses. The
+    corners of fiducials are last. jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns
+    each. normal: the normal equations of the Jacobian. sides: (M, P) by the shared errors. residual: (M,). first_range,
+    first_motion: the first rows of the ranges and of the motions. instruments: (M, P). At the optimum, the residuals do not
+    correlate with the instruments. The instruments equal the sides, except for the scales of the odometry: the sides of the
+    scales contain the noise of the odometry, and so do the residuals.
     """
 
     jacobian: sparse.csr_matrix
@@ -104,10 +105,10 @@ class LinearSystem:
 class ReducedSystem:
     """The normal equations of the parameters with poses and landmarks eliminated.
 
-    information: (P, P). gradient: (P,) the residuals against the instruments, zero at the optimum. descent: (P,) the
-    negative gradient of the cost. signal: (P,) the share of the information's diagonal that is not noise. sensitivity: (D,
-    P) the derivatives of all variables at their optimum by the parameters: first the landmarks, three rows each, then the
-    poses, six rows each. newton: (D,) the remaining Newton step of the variables.
+    information: (P, P). gradient: (P,) minus the product of the instruments and the residuals, zero at the optimum. descent:
+    (P,) the negative gradient of the cost. signal: (P,) the share of the information's diagonal that is not noise.
+    sensitivity: (D, P) the derivatives of all variables at their optimum by the parameters: first the landmarks, three rows
+    each, then the poses, six rows each. newton: (D,) the remaining Newton step of the variables.
     """
 
     information: Floats
@@ -135,7 +136,7 @@ def linearise(
 
 
 def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int]) -> Floats:
-    """Return derivatives (M, p) of the whitened residuals by some parameters: central differences.
+    """Return derivatives (M, p) of the whitened residuals by some parameters, as central differences.
 
     The robust weights are kept fixed.
     """
@@ -160,8 +161,8 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
 class _Part:
     """The rows of one kind of measurement, from the row `first` on.
 
-    measured: the measured values in these rows, of keyframes and rays. Parameters that do not change them have no derivative
-    here, and most parameters change only one kind. residuals: the whitened residuals of these values.
+    measured: returns the measured values of these rows. Parameters that do not change the values have no derivative here,
+    and most parameters change only one kind of measurement. residuals: returns the whitened residuals of measured values.
     """
 
     first: int
@@ -221,13 +222,14 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
 
 
 def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: slice) -> Floats:
-    """Return the sides (M, p) of parameters. In the rows of the odometry's scales, neighbours predict the motions.
+    """Return the instruments (M, p): the sides, but in the columns of odometry scales, neighbours predict the motions.
 
     The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
     (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more noise. So
     motions that were measured too short would weigh more. Hence the neighbours also predict the covariance, unless they move
-    differently. Examples are a long way between two places where the robot stood, and neighbours of no duration.
+    differently. Examples of such motions are a long way between two places where the robot stood, and a motion whose
+    neighbours have no duration.
     """
     which = [k for k, name in enumerate(names) if name in _ODOMETRY_SCALES]
     if not which or motions.start == motions.stop:
@@ -252,7 +254,7 @@ def _instruments(of: Linearised, names: Sequence[str], sides: Floats, motions: s
 
 
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
-    """Predict motions (n, D) at the rate of the two motions before and the two after each. seconds: (n,) their durations."""
+    """Predict motions (n, D) at the rate of the two motions before and the two after each. seconds: (n,) the durations."""
 
     def near(values: Floats) -> Floats:
         padded = np.pad(values, ((2, 2), (0, 0)))

@@ -25,21 +25,22 @@ _PROBES = 12
 """The number of random probes. With n residuals, the relative error of the redundancy is sqrt(2 / (n * probes)). More probes
 are slower."""
 _ITERATIONS = 20
-"""The most iterations. Each takes one factorisation of the linear system. MRCLAM takes 12 to 17."""
+"""The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 12 to 17."""
 _CONVERGED = 0.02
 """The iteration ends if all factors change by less than this share. A larger share ends it sooner."""
 _LIMITS = (0.05, 20.0)
-"""The smallest and the largest factor. Outside these limits, the settings do not describe the sensor at all."""
+"""The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
 TOGETHER = 3.0
 """The time (s) over which errors may be correlated: wheels lag behind a command, and a detector's box is off for a while. A
 longer time finds slower errors, from fewer independent sums."""
 _MOST_SHRINKAGE = 0.3
-"""The largest shrinkage that is corrected. A map that is smaller than this has another cause."""
+"""The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
 _LEAST_TOLD = 0.3
-"""The prediction by neighbours is used if it explains at least this share of the squared motions. A larger share uses it
-more rarely."""
+"""`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
+motions. A larger share uses it more rarely."""
 _PRIOR_OBJECTS = 4
-"""The range bias in the settings counts like this number of objects. With a larger number, the bias changes less."""
+"""The range bias in the settings counts like this number of objects at the most. With a larger number, the bias changes
+less."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
 
@@ -49,10 +50,10 @@ class _Rows:
     """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m. parts: (3, s, 6, 6) covariances of the
-    motions by the noise along, across and in turning. rest: (s, 6, 6) covariances without this noise. motion_axes: (3, s, 6)
-    these directions in the frame of the motion. motion_window: (s,), ray_window: (n,) the rows of one window may have
-    correlated errors.
+    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. parts: (3,
+    s, 6, 6) covariances of the motions by the noise along, across and in turning. rest: (s, 6, 6) covariances without this
+    noise. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion. motion_window:
+    (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
     """
 
     bearing_axes: Floats
@@ -96,12 +97,12 @@ def estimate_noise(
 
 
 def _logarithms(noise: NoiseFactors) -> Floats:
-    """The logarithms of the factors on noise, in which the iteration is close to linear."""
+    """Return the logarithms of the factors on noise. The iteration is close to linear in them."""
     return np.log([factor for name, factor in noise.to_dict(None).items() if name != "shrinkage"])
 
 
 def _from_logarithms(logarithms: Floats, other: NoiseFactors) -> NoiseFactors:
-    """The noise with these logarithms of its factors, and the shrinkage of another."""
+    """Return the noise with these logarithms of its factors, within `_LIMITS`, and with the shrinkage of `other`."""
     names = [name for name in other.to_dict(None) if name != "shrinkage"]
     factors = np.clip(np.exp(logarithms), *_LIMITS)
     return replace(other, **dict(zip(names, factors.tolist(), strict=True)))
@@ -178,8 +179,11 @@ def _updated(
     left: Floats,
     prior: float,
 ) -> NoiseFactors:
-    """Return the noise after one step of the iteration. left: (M, probes + 1) the probes and residuals after the
-    solution."""
+    """Return the noise after one step of the iteration.
+
+    kinds: the kinds of noise to estimate. left: (M, probes + 1) the probes and residuals after the solution. prior: the
+    nominal noise counts like this number of residuals.
+    """
     found = noise.to_dict(None)
     residual, kept = left[:, -1], left[:, :-1]
     if "rays" in kinds and len(rows.bearing_weight):
@@ -257,12 +261,14 @@ def _range_noise(
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:
-    """Return the force that makes a joint solution too small, and the curvature against it, both per share of the size.
+    """Return the force that makes a joint solution too small, and the curvature against it, both per logarithm of the size.
 
     Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
-    them shorter again, at the least cost (errors in variables; Neyman and Scott 1948). The force is a difference between two
-    effects of the motion residuals on the size: with measured motions, and with motions as their neighbours predict them,
-    without their noise. The curvature is the information of all measured lengths about the size.
+    them shorter again, at the least cost (errors in variables; Neyman and Scott 1948). The motion
+    residuals pull on the size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that
+    are predicted from their neighbours do not have this noise, and show the real part. The force is the total pull less the
+    real part, at least 0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a
+    localisation, there is no force. The curvature is the information of all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     steps = np.flatnonzero(keyframes.measured)
@@ -291,7 +297,7 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
 def _of_tags(of: Linearised) -> float:
     """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
 
-    A view of angular diagonal d (rad) tells the distance by its four corners, half a diagonal from the centre each.
+    A view tells the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
     """
     tags = of.measured.tags
     if tags is None:
@@ -303,7 +309,7 @@ def _of_tags(of: Linearised) -> float:
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `batch_solver`."""
+    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `batch_solver.share_bias`."""
     number = np.bincount(rows.owner)[rows.owner] if len(rows.owner) else np.zeros(0)
     return np.sqrt((rows.range_sigma * noise.ranges) ** 2 + number * (rows.bias * noise.range_bias) ** 2)
 
@@ -315,7 +321,7 @@ def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
 
 
 def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:
-    """Return the (n, 2, 2) that turn a bearing's residual in GTSAM's basis into azimuth and elevation in the base frame."""
+    """Return matrices (n, 2, 2) from bearing residuals in GTSAM's basis to azimuth and elevation in the base frame."""
     basis = tangent_basis(directions)
     up = base_T_camera[:, 2, :3]
     elevation = up - (up * directions).sum(axis=1, keepdims=True) * directions

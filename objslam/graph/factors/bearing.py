@@ -16,7 +16,7 @@ STANDOFF = 1e7
 more coarsely. The relative error by perspective is the range divided by this distance. The rounding error is 1 nm."""
 L1_RADIANS = 1e-4
 """The angle (rad) below which the loss `l1` on bearings is quadratic, so that it has a derivative at 0. A larger angle is
-smoother and less like a norm. This angle is far below the noise of a box (a twentieth of a pixel)."""
+smoother and less like a norm. This angle is about a twentieth of a pixel, far below the noise of a box."""
 EQ1_SIGMA = 0.05
 """The standard deviation (m) of the point-to-line distance in the joint solve. Eq. 1 has no noise model, so this value
 weighs its distances against the odometry. A larger value trusts the odometry more."""
@@ -31,8 +31,8 @@ def bearings(
     """Return a factor per ray on the angle (rad) from its direction (R, 3) to L(landmark), in the frame of X(keyframe).
 
     offset: (R, 3) m, the origin of each ray in this frame. None means the origin of the frame. GTSAM has no bearing factor
-    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. The
-    distance of the landmark from the image's centre is then the angle. Behind this camera the error is constant, and larger
+    with an offset. So a ray with an offset has an equidistant camera of focal length 1 px that looks along the ray. In its
+    image, the distance of the landmark from the centre is the angle. Behind this camera the error is constant, and larger
     than in front of it.
     """
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
@@ -53,8 +53,8 @@ def point_to_line(
 ) -> list[gtsam.NonlinearFactor]:
     """Return a factor for each ray on the distance (m, Eq. 1) of L(landmark) from the ray.
 
-    The directions (R, 3) and the ray origins `offset` (R, 3), m, are in the frame of X(keyframe), which is a variable. None
-    means that all rays begin at the origin of the frame.
+    The directions (R, 3) and the ray origins `offset` (R, 3), m, are in the frame of X(keyframe), which is a variable. If
+    `offset` is None, all rays begin at the origin of this frame.
     """
     origins = np.zeros_like(directions) if offset is None else offset
     make, bodies = gtsam.GenericProjectionFactorCal3DS2, virtual_cameras(origins, directions)
@@ -79,7 +79,7 @@ def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noi
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
     """Return a distant camera for each ray. It looks along the ray, which has an origin (R, 3) and a direction (R, 3).
 
-    The camera images a point at the point's offset (m) across the ray.
+    The coordinates of a point in its image are the offset (m) of the point across the ray.
     """
     n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     return _poses(origins - STANDOFF * n, n)
@@ -88,7 +88,7 @@ def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
 def tangent_basis(directions: Floats) -> Floats:
     """Return two unit vectors (R, 3, 2) across unit directions (R, 3), as GTSAM chooses them (`Unit3::basis`).
 
-    The first one is the cross product with the axis along which the direction has its smallest component.
+    The first one is the cross product of the direction and the axis along which its component is smallest in absolute value.
     """
     first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -99,7 +99,7 @@ def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None
     """Return the axes (R, 3, 2) along which the factors of rays measure their residuals, for `ray_residuals`.
 
     The axes of GTSAM's bearing factor are perpendicular to the way to the landmark. The axes of the other factors are
-    perpendicular to the ray.
+    perpendicular to the ray. The parameters are those of `bearings` and `ray_residuals`.
     """
     if metric:
         return tangent_basis(directions)
@@ -111,7 +111,7 @@ def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric:
     """Return the residuals (R, 2) of the factors of rays, along axes (R, 3, 2).
 
     directions: (R, 3) unit. to_landmark: (R, 3) m, from the origin of the ray, in the same frame. metric: whether residuals
-    are distances from the ray (m, Eq. 1), or angles (rad) below pi / 2.
+    are distances from the ray (m, Eq. 1), or angles (rad). Below pi / 2, the angles agree with GTSAM's factors.
     """
     along = np.einsum("ri,ri->r", directions, to_landmark)
     across = to_landmark - along[:, None] * directions
@@ -133,7 +133,7 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
     length = np.linalg.norm(to_landmark, axis=1)
     by_position = across / length[:, None, None]
     away = np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
-    if away.any():  # The equidistant camera of `bearings`, at depth z and at distance r from its axis.
+    if away.any():  # In the camera of `bearings`, the landmark has depth z and distance r from the axis.
         flat = (across[away] @ to_landmark[away, :, None])[..., 0]
         r, z = np.linalg.norm(flat, axis=1), np.einsum("ri,ri->r", directions[away], to_landmark[away])
         outward = flat / np.maximum(r, 1e-300)[:, None]

@@ -15,18 +15,18 @@ _UPRIGHT = 1e-5
 """The standard deviation (rad) of roll and pitch between two frames with z up. A larger value lets frames tilt. It was
 chosen far below what a map can tell, and large enough to keep the linear system well conditioned."""
 _FREE = 100.0
-"""The standard deviation (m, rad) of a frame about its registration, before any object counts. A larger value holds it
-less, and conditions the linear system worse."""
+"""The standard deviation (rad, m) of the yaw and the shift of a frame in its prior. A larger value leaves more freedom, and
+conditions the linear system worse."""
 
 
 def frame_prior(map_T_drive: Floats) -> gtsam.NonlinearFactor:
-    """Return the factor that holds only roll and pitch of the frame at map_T_drive (4, 4)."""
+    """Return the prior on F at map_T_drive (4, 4). It fixes roll and pitch, and leaves yaw and shift nearly free."""
     sigmas = np.array([_UPRIGHT, _UPRIGHT, _FREE, _FREE, _FREE, _FREE])
     return gtsam.PriorFactorPose3(F0, gtsam.Pose3(map_T_drive), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]:
-    """Return for each of the objects (n,) the factor F * L(j) = P(j) with a covariance (n, 3, 3) m^2 in the map."""
+    """Return the factors F * L(j) = P(j) of objects (n,), with covariances (n, 3, 3) m^2 in the axes of the map."""
     make = gtsam.noiseModel.Gaussian.Covariance
     return [
         gtsam.ReferenceFrameFactorPoint3Pose3(L0 + j, F0, P0 + j, make(c))
@@ -37,9 +37,9 @@ def own_errors(objects: Ints, covariance: Floats) -> list[gtsam.NonlinearFactor]
 def object_priors(
     first: int, objects: Ints, position: Floats, covariance: Floats, *, robust: bool
 ) -> list[gtsam.NonlinearFactor]:
-    """Return a prior with mean (n, 3) m and covariance (n, 3, 3) m^2 on the points first + j of objects (n,).
+    """Return a prior with mean (n, 3) m and covariance (n, 3, 3) m^2 on the points of objects (n,).
 
-    robust: whether the priors have Huber's loss.
+    first: the key of the point of object 0. robust: whether the priors have Huber's loss.
     """
     make = gtsam.noiseModel.Gaussian.Covariance
     return [

@@ -27,7 +27,10 @@ def localizations(
 
 
 def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> Floats:
-    """Return the covariances (K, 6, 6) of the keyframes' absolute poses, in their camera frames, rotation first."""
+    """Return the covariances (K, 6, 6) of the keyframes' absolute poses, in their camera frames, rotation first.
+
+    on_plane: as in `localizations`.
+    """
     of, planar = settings.localization, settings.planar
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
     tilt, z = (planar.tilt, planar.z) if on_plane else (of.yaw, of.xy)

@@ -17,7 +17,7 @@ and less like a norm. This distance is far below the resolution of a map."""
 
 
 def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
-    """Return one noise model for each of the sigmas (R,). Sigmas that agree to three digits share a model.
+    """Return one noise model for each of the sigmas (R,). They are rounded to three digits, so that many share a model.
 
     The loss acts on the norm of the whitened residual. The loss `l1` is a Huber loss with slope 1 / sigma and its kink at
     l1_kink (in the residual's unit). The loss `gnc` gives a plain model, because its optimiser applies the loss.

@@ -15,16 +15,16 @@ values tie the two keyframes less."""
 
 JUMP = 4.74
 """The deviation that scales Cauchy's loss of a motion that fiducials measure too. 99.9 % of all motions are below it
-(chi-squared, 6 degrees of freedom). Visual odometry jumps when it corrects itself: one step of 0.27 m at 0.9 m/s was seen.
-With a larger value, a jump bends the map more. A smaller value uses less of the odometry."""
+(chi-squared, 6 degrees of freedom). Visual odometry jumps when it corrects itself: a jump of 0.27 m at a speed of 0.9 m/s
+was seen. With a larger value, a jump bends the map more. A smaller value uses less of the odometry."""
 
 
 def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:
     """Return the camera motions (K-1, 4, 4) between consecutive keyframes, and their covariances (K-1, 6, 6).
 
     A motion is E_prev^-1 * odo * E_next. E is base_T_camera, and odo is the motion of base. The covariance is
-    Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation first. S is the covariance in base that the odometry
-    accumulated between the two keyframes. Rows that are not `Keyframes.measured` have no meaning.
+    Ad(E_next^-1) S Ad(E_next^-1)^T plus a floor, with the rotation first. S is the covariance that the odometry accumulated
+    between the two keyframes, in the base frame at the second one. Rows that are not `Keyframes.measured` have no meaning.
     on_plane: whether the path is planar. If it is None, the poses decide. ValueError if the keyframes have no odometry.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift

@@ -30,7 +30,8 @@ def along_ray(
 ) -> list[gtsam.NonlinearFactor]:
     """Return one factor with Huber's loss for each range: the measured (R,) distance, m, of a landmark along a fixed ray.
 
-    Origins (R, 3) and directions (R, 3) are in map. A factor does not restrict the landmark across its ray.
+    Origins (R, 3), m, and unit directions (R, 3) are in map. sigmas: (R,) m, of the distances. A factor does not restrict
+    the landmark across its ray.
     """
     points = origins + directions * measured[:, None]
     roots = np.zeros((len(points), 3, 3))

@@ -15,7 +15,7 @@ from objslam.graph.factors.range import ranges
 
 @dataclass(frozen=True)
 class Bearings:
-    """Rays of a live session, in the form that its graph takes.
+    """Rays of a live session, in the form that the live graph takes.
 
     number: (n,) the number of each ray. keyframe: (n,) the k of X(k). landmark: (n,) the j of L(j). direction: (n, 3) in the
     camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. offset: as in `Rays`.
@@ -36,8 +36,8 @@ def ray_factors(
 ) -> list[tuple[Ints, list[gtsam.NonlinearFactor]]]:
     """Return for each kind of factor the indices (m,) of the rays that have it, and one factor for each of these rays.
 
-    The first kind is the bearing, which every ray has. If joint.factor asks for it, the point-to-line distance takes its
-    place. The second kind is the range, which only rays with a measured range have.
+    The first kind is the bearing, which every ray has. If joint.factor is `point_to_line`, the distance of Eq. 1 takes the
+    place of the bearing. The second kind is the range, which only rays with a measured range have.
 
     Args:
         landmark: (n,) the landmark of each ray.

@@ -18,14 +18,14 @@ def tag_ties(
     """Return the factors that make four landmarks the corners of one square, for each of the tags.
 
     In the frame of the tag's pose, each corner is in a known direction, at half the diagonal of the tag. If the side is not
-    known, one variable of the tag is the difference between this distance and the one at its first value.
+    known, this distance is a variable too: Z(t) is its first value minus its present value.
 
     Args:
         tags: (n,) the numbers of the tags.
         landmarks: (n, 4) the landmark of each corner.
         shapes: (n, 4, 3) the corners of a tag of side 1 in its frame.
         sides: (n,) m, NaN if unknown. first_sides: (n,) m, the first value of an unknown side.
-        prior_sigma: m, the standard deviation of an unknown side.
+        prior_sigma: m, the standard deviation of half the diagonal of a tag with an unknown side.
     """
     made: list[gtsam.NonlinearFactor] = []
     level, one = gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma

@@ -1,4 +1,4 @@
 """The joint solve as sparse least squares on arrays.
 
-It is for code that solves a graph many times with other measurements.
+It is for code that solves one graph many times, with changed measurements.
 """

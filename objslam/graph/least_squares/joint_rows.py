@@ -127,7 +127,7 @@ class JointGraph:
         return columns.astype(np.int32), np.append(0, np.cumsum(lengths)).astype(np.int32)
 
     def seen(self, map_T_camera: Floats, landmarks: Floats) -> Floats:
-        """Return the landmark of each ray (n, 3), m, in the frame of its pose."""
+        """Return the landmark (n, 3), m, of each ray, in the camera frame of the ray's pose."""
         poses = map_T_camera[self.rays.keyframe]
         return np.asarray(np.einsum("nji,nj->ni", poses[:, :3, :3], landmarks[self.landmark] - poses[:, :3, 3]))
 
@@ -154,7 +154,7 @@ class JointGraph:
     def absolute_roots(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the residuals (a, 6) of absolute poses, the matrices (a, 6, 6) that whiten them, and their costs (a,).
 
-        The anchor has no loss. The others have Huber's, whose weights are in the matrices.
+        The anchor has no loss. With a localisation, all poses have Huber's loss, whose weights are in the matrices.
         """
         keyframes, roots = self.measured.keyframes, self._absolute_roots
         off = log_se3(inverse(keyframes.map_T_camera[: len(roots)]) @ map_T_camera[: len(roots)])
@@ -200,7 +200,7 @@ class JointGraph:
     def motion_weights(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
         """Return the roots (s,) of the weights of motions, and their costs (s,).
 
-        A motion that fiducials measure too has Cauchy's loss. The others have none.
+        A motion that fiducials measure too has Cauchy's loss. Other motions have none.
         """
         if not len(self.steps):
             return np.zeros(0), np.zeros(0)

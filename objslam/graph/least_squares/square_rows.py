@@ -1,7 +1,7 @@
 """The rows that hold the corners of fiducials together as squares, without variables of their own.
 
-The pose of a square is that nearest to its corners. What the corners lack to it is the residual, so a step of the corners
-changes the residual by its part that moves no square.
+The square nearest to four corners is computed from the corners. The residual is the corners minus those of this square. So a
+step that only moves or turns the square does not change the residual.
 """
 
 from dataclasses import dataclass

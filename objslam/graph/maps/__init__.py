@@ -1,1 +1,1 @@
-"""Graphs over several maps. A drive is solved in an older map, and the frames of many maps are solved together."""
+"""Graphs with an older map. A drive is solved in the map, offline or live."""

@@ -18,7 +18,7 @@ _FRAME, _OBJECT = "map frame", "map object"  # The kinds of these factors in the
 
 
 def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
-    """Put the frame of the graph at map_T_graph (4, 4). It may turn about z, and shift."""
+    """Add F at map_T_graph (4, 4), with a prior. The solve may turn the frame about z, and shift it."""
     graph.add_variable(F0, gtsam.Pose3(map_T_graph))
     graph.add(_FRAME, [0], [[frame_prior(map_T_graph)]])
 
@@ -26,7 +26,7 @@ def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
 def tie_objects(graph: IncrementalGraph, landmarks: Ints, own: Floats, position: Floats, covariance: Floats) -> None:
     """Tie landmarks (n,) to objects of the map with positions (n, 3) m and covariances (n, 3, 3) m^2.
 
-    F must be in the graph. own: (n, 3, 3) m^2, by how much the landmarks may be off beyond the errors in the graph, in the
+    F must be in the graph. own: (n, 3, 3) m^2, the covariance of the landmarks' errors that the graph does not know, in the
     frame of the graph.
     """
     frame = map_T_graph(graph)

@@ -1,13 +1,13 @@
 """Solve a drive once more, with objects of an older map as priors: its poses, its objects, and its frame in the map.
 
 The drive keeps its graph in its own frame. One more variable is that frame in the map, F. Each object has two points: L(j),
-to which the rays of the drive point, and P(j) = F * L(j) + e(j), where it is in the map. The error e(j) holds what the graph
-of the drive does not know, such as the offsets of boxes. An object that the map has gets the map's estimate as prior on
-P(j).
+to which the rays of the drive point, and P(j) = F * L(j) + e(j), where it is in the map. The error e(j) is what the graph of
+the drive does not know, such as the offsets of boxes. An object that the map has gets the map's estimate as prior on P(j).
 
-The registration gives the start and the matches, and no factor, so that the map counts once. Its objects may share errors,
-and its file does not say which. The priors count as independent in the estimate. The covariance of the frame also holds the
-largest error that all of them can share, so that many objects of a drifted map do not make the frame look sure.
+The registration gives the start and the matches, and no factor, so that the map counts once. The objects of the map may
+share errors, and the file of the map does not say which. The priors count as independent in the estimate. The covariance of
+the frame also contains the largest error that all objects can share, so that many objects of a drifted map do not make the
+frame look sure.
 """
 
 from dataclasses import dataclass
@@ -72,9 +72,9 @@ def solve_in_map(
 ) -> MappedDrive:
     """Solve a drive in an older map, from the drive's own solution and its registration map_T_drive (4, 4).
 
-    there: (n,) the resolved objects of the drive. The others go over into the frame of the map without a covariance.
-    measured: the measurements of the joint solve, None where the poses of the drive are fixed in its own frame. SolveError
-    if the linear system is indeterminate.
+    there: (n,) the resolved objects of the drive. The other objects are moved into the frame of the map, without a
+    covariance. measured: the measurements of the joint solve, None where the poses of the drive are fixed in its own frame.
+    SolveError if the linear system is indeterminate.
     """
     solved = there if measured is None else np.flatnonzero(estimate.solved & np.isfinite(estimate.positions[:, 0]))
     keep = np.isin(known.index, there)
@@ -124,7 +124,10 @@ def _poses(estimate: Estimate, measured: Measurements | None) -> Floats:
 def _drive_factors(
     estimate: Estimate, association: Association, solved: Ints, measured: Measurements | None, *, robust: bool
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of the drive alone. robust: whether its rays have the loss of the settings."""
+    """Return the factors of the drive alone. At fixed poses, they are priors with half the covariance of each object.
+
+    robust: whether the rays have the loss of the settings. The loss `gnc` counts as none.
+    """
     if measured is None:
         return object_priors(L0, solved, estimate.positions[solved], estimate.covariance[solved] / 2, robust=False)
     used = (estimate.weight > 0) & np.isin(association.object, solved)
@@ -135,9 +138,9 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return what the covariance of each object (n, 3, 3) holds beyond that of the graph. `LEAST` is its floor."""
+    """Return the part (n, 3, 3), m^2, of the objects' covariances that the graph does not contain, as in `beyond`."""
     floor = LEAST**2 * np.eye(3)
-    if measured is None:  # Half on each side of a factor conditions the linear system best.
+    if measured is None:  # The graph has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor
     try:
         marginals = gtsam.Marginals(graph, values)
@@ -148,7 +151,7 @@ def _unknown_to(
 
 
 def beyond(covariance: Floats, alone: Floats) -> Floats:
-    """Return what covariances (n, 3, 3), m^2, hold beyond the covariances `alone` (n, 3, 3). `LEAST` is its floor."""
+    """Return the part of covariances (n, 3, 3), m^2, beyond `alone` (n, 3, 3): at least `LEAST`^2 along each axis."""
     size, axes = np.linalg.eigh(covariance - alone)
     return np.asarray((axes * np.maximum(size, LEAST**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))
 
@@ -156,14 +159,14 @@ def beyond(covariance: Floats, alone: Floats) -> Floats:
 def _covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, there: Ints, frame: Floats, pivot: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the covariance (4, 4) of the frame at a pivot (3,) m, and that of the points P (n, 3, 3)."""
+    """Return the covariance (4, 4) of the frame (4, 4) at a pivot (3,) m, and those (n, 3, 3), m^2, of the points P."""
     try:
         marginals = gtsam.Marginals(graph, values)
         spread = np.array([marginals.marginalCovariance(P0 + j) for j in there.tolist()]).reshape(-1, 3, 3)
         tangent = marginals.marginalCovariance(F0)
     except RuntimeError as error:
         raise indeterminate(error) from error
-    to_pivot = np.zeros((4, 6))  # From the tangent of F, rotation first, to a shift of the pivot and a yaw.
+    to_pivot = np.zeros((4, 6))  # The Jacobian from the tangent of the frame (rotation first) to the shift and the yaw.
     to_pivot[:3, 3:], to_pivot[3, 2] = values.atPose3(F0).rotation().matrix(), 1.0
     to_pivot[:3, 2] = _turned(pivot - frame[:3, 3])
     return to_pivot @ tangent @ to_pivot.T, spread
@@ -172,9 +175,9 @@ def _covariances(
 def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floats:
     """Return the covariance (4, 4) of the largest error that all objects of a map can share: a shift (m) and a yaw (rad).
 
-    A shared error is part of the error of each object, so that no object can be known better. The shift has the covariance
-    of the object that is known best. The yaw turns about the pivot (3,) m, and moves no object by more than its deviation.
-    positions: (M, 3) m. covariance: (M, 3, 3) m^2.
+    A shared error is part of the error of each object. So no object can be known better than the shared error. The shift has
+    the covariance of the object that is known best. The yaw turns about the pivot (3,) m, and moves no object by more than
+    the object's standard deviation. positions: (M, 3) m. covariance: (M, 3, 3) m^2.
     """
     level = np.trace(covariance[:, :2, :2], axis1=1, axis2=2) / 2
     lever = ((positions - pivot)[:, :2] ** 2).sum(axis=1)
@@ -187,10 +190,11 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, with the error that all can share.
+    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, plus an error that all objects share.
 
-    doubt: (4, 4) the covariance of this error, as from `shared_at_most`. The points `index` of the objects `there` have
-    priors with covariances `prior`. The better a prior determines a point, the less the shared error moves it.
+    doubt: (4, 4) the covariance of this error, as from `shared_at_most`. there: (n,) the objects of the points. index: (M,)
+    those of them that have priors, with covariances `prior` (M, 3, 3). The better a prior determines a point, the less the
+    shared error moves it.
     """
     move = np.zeros((len(there), 3, 4))
     move[:, :, :3] = np.eye(3)

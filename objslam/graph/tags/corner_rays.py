@@ -17,10 +17,11 @@ from objslam.graph.tags.square_fit import Corners
 class TagCorners:
     """The T fiducials among N objects, as four landmarks each: the corners. M = N + 3 T landmarks in all.
 
-    source: (n,) the ray of each new ray, non-decreasing. corner: (n,) 0 to 3, -1 for a ray that is as before. association:
-    of the new rays with the landmarks. The first corner of a fiducial has the number of its object. count: N. object: (T,)
-    of each fiducial. landmarks: (T, 4). shape: (T, 4, 3) the corners at side 1. side: (T,) m, NaN if unknown. first: (V,)
-    the new ray to the first corner of each view of a fiducial; the rays to the other corners follow. tag: (V,) its fiducial.
+    source: (n,) the original ray of each new ray, non-decreasing. corner: (n,) the corner, 0 to 3, of each new ray, -1 for a
+    ray that is not to a corner. association: of the new rays with the landmarks. The first corner of a fiducial has the
+    number of its object. count: N. object: (T,) the object of each fiducial. landmarks: (T, 4) its corners. shape: (T, 4, 3)
+    the corners at side 1. side: (T,) m, NaN if unknown. first: (V,) the new ray to the first corner of each view of a
+    fiducial; the rays to the other corners follow. tag: (V,) the fiducial of each view.
     """
 
     source: Ints
@@ -97,13 +98,13 @@ class TagCorners:
         return placed(self.seen(rays, map_T_camera), self.shape, self.side, self.landmarks, positions)
 
     def measured_motions(self, rays: Rays, count: int) -> Bools:
-        """Return which of the motions (count - 1,) between consecutive of `count` poses have one fiducial in both views."""
+        """Return for each motion (count - 1,) between consecutive poses whether both poses see the same fiducial."""
         seen = np.unique(rays.keyframe[self.first] * len(self.object) + self.tag)
         again = np.intersect1d(seen + len(self.object), seen) // len(self.object) - 1
         return np.isin(np.arange(count - 1), again)
 
     def tied(self, landmarks: Ints) -> Ints:
-        """Return the fiducials (t,) all of whose corners are among the landmarks."""
+        """Return the fiducials (t,) all of whose corners are among the landmarks (m,)."""
         return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
 
     def is_corner(self) -> Bools:

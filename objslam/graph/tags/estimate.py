@@ -1,4 +1,4 @@
-"""From four corners a fiducial back to one object: position, rotation and size, each with its covariance."""
+"""Turn the four corners of each fiducial back into one object: position, rotation and size, each with its covariance."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from objslam.graph.tags.shapes import squares_of, turned_by_squares
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 LEAST_PROBABILITY = 0.01
-"""The least probability of the second rotation of a flat square at which it is told. With a larger value, fewer are told."""
+"""The least probability at which the second rotation of a flat square is reported. With more, fewer are reported."""
 
 
 def with_objects(
@@ -31,16 +31,16 @@ def with_objects(
     sensitivity: Floats | None,
     ledger: Ledger,
 ) -> Estimate:
-    """Return the estimate of N objects and R rays, from one of their M landmarks and n rays with corners.
+    """Return the estimate of N objects and R rays, from an estimate of the M landmarks and n new rays of `TagCorners`.
 
-    The weight of a ray is the mean of its corners. A second pose that the views leave open widens the covariances by the
-    distance between the two poses, weighted by their probabilities.
+    The weight of a ray is the mean weight of its new rays. A second pose that the views leave open widens the covariances by
+    the distance between the two poses, weighted by their probabilities.
 
     Args:
-        rays: (n,). map_T_camera: (P, 4, 4) their camera poses.
+        rays: (n,) the new rays. map_T_camera: (P, 4, 4) the solved camera poses.
         marginals: the graph and its solved values.
         wider: (M,) the factor on the covariance of each landmark.
-        sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without.
+        sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
         ledger: for a warning if the graph has no covariances.
     """
     which = tags.tied(np.flatnonzero(estimate.solved))
@@ -94,7 +94,7 @@ def _marginals(
     graph_values: tuple[gtsam.NonlinearFactorGraph, gtsam.Values], tags: TagCorners, which: Ints, ledger: Ledger
 ) -> Floats | None:
     """Return the covariances (t, 7, 7) of the rotation (rad) and position (m) of fiducials in their own frames, and of the
-    logarithm of their side. None if the linear system is indeterminate, which is a warning in the ledger."""
+    logarithm of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
     graph, values = graph_values
     covariance = np.zeros((len(which), 7, 7))
     try:
@@ -113,16 +113,19 @@ def _marginals(
 
 
 def _of_squares(local: Floats, rotation: Floats) -> Floats:
-    """Return the derivatives (t, 7, 12) of squares by their corners in map, in least squares, as `turned_by_squares`."""
+    """Return the derivatives (t, 7, 12) of fitted squares by their corners in map: the pseudoinverse of
+    `turned_by_squares`."""
     return np.asarray(np.linalg.pinv(turned_by_squares(local, rotation)), dtype=np.float64)
 
 
 def _second(
     tags: TagCorners, rays: Rays, map_T_camera: Floats, which: Ints, rotation: Floats, wider: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the way (t, 3) m to their positions.
+    """Return the second rotations (t, 3, 3) of fiducials, their probabilities (t,), and the shifts (t, 3) m to their
+    positions.
 
-    rotation: (t, 3, 3) the solved ones. Both poses are compared at the solved camera poses, as if one were the truth.
+    which: (t,) the fiducials. rotation: (t, 3, 3) the solved rotations. wider: (M,) as in `with_objects`. Both poses are
+    compared at the solved camera poses, as if one of the two were the truth.
     """
     found = place(tags.seen(rays, map_T_camera), tags.shape, tags.side)
     best, other = found.best.take(which), found.other.take(which)

@@ -1,4 +1,4 @@
-"""The rotation and size of fiducials at given camera poses. Their positions are those of other objects."""
+"""The rotation and size of fiducials at given camera poses. Their positions are triangulated like those of other objects."""
 
 import numpy as np
 
@@ -13,17 +13,17 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.square_fit import Corners, fit, scatter
 
 _NOMINAL = 4.0
-"""The number of views at which the scatter of the views and the nominal noise have equal weight in the covariance. A larger
-number leaves more to the nominal noise."""
+"""The number of views at which the scatter of the views and the nominal noise have equal weight in the covariance. From this
+number on, a fit to all views leaves a known size free. A larger number leaves more to the nominal noise."""
 _STEPS = 5
-"""The iterations of a fit to all views, from one to some of them. More iterations are slower."""
+"""The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
 
 
 def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> dict[int, TagPose]:
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
-    The error of a pose is common to the four corners of a view, so the covariance comes from the scatter of whole views. A
-    fiducial whose views do not tell its size has no entry.
+    The error of a pose is common to the four corners of a view, so the covariance comes from the scatter of whole views, and
+    for few views also from the nominal noise. A fiducial whose views do not tell its size has no entry.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:
@@ -35,7 +35,7 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
     away = np.linalg.norm(found.best.pose[seen.square, :3, 3] - seen.origin, axis=1)
     of_pose = np.maximum(angle[source] ** 2 - rays.sigma[source] ** 2, 0.0) + (shift / away) ** 2
     seen = Corners(seen.square, seen.origin, seen.direction, np.sqrt(seen.sigma**2 + of_pose))
-    # Between views whose poses err, a known size would turn a tag to explain distances that do not agree.
+    # If the poses of views err, a fixed size would turn the tag to explain distances that do not agree.
     number = np.bincount(seen.square, minlength=len(tags.side))
     known = np.isfinite(tags.side)
     free = ~known | (number >= _NOMINAL)

@@ -11,25 +11,25 @@ from objslam.graph.tags.shapes import squares_of
 from objslam.graph.tags.square_fit import Corners, Squares, costs, fit, mirrored, poses_of_views, stacked
 
 _CANDIDATES = 8
-"""The number of views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over
-time. A larger number is slower, and finds the pose more often if many views are false."""
+"""The most views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over time. A
+larger number is slower, and finds the pose more often if many views are false."""
 _VIEWS = 64
-"""The most views of a fiducial that judge a pose, spread over time. A larger number is slower and judges better."""
+"""The most views of a fiducial on which a pose is judged, spread over time. A larger number is slower and judges better."""
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
-"""The least information about the logarithm of an unknown side: a standard deviation of one half. With more, fewer fiducials
-of unknown size have a pose."""
+"""The least information about the logarithm of an unknown side: 1 / 0.5^2. With more, fewer fiducials of unknown size have a
+pose."""
 _SAME = np.radians(3.0)
-"""The angle (rad) between two poses below which they are one. A larger angle calls more poses unique."""
+"""The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0
-"""The decrease of the cost from which a fiducial is moved to a new pose, the logarithm of an odds of e^(1/2). A larger value
-leaves more fiducials where they are."""
+"""A fiducial is moved to a new pose if this decreases its cost (a robust sum of squared deviations) by more than this value.
+A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials where they are."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """T fiducials at given camera poses, with their second poses.
+    """T fiducials at given camera poses, each with a second pose.
 
     best, other: the square of each. cost, other_cost: (T,), Cauchy's loss. The cost of a fiducial without a pose, or without
     a second one, is infinite. information: (T, 7, 7) of the best, as in `square_fit.fit`.
@@ -45,8 +45,9 @@ class Placement:
 def place(seen: Corners, shapes: Floats, sides: Floats) -> Placement:
     """Return the best pose of each of T fiducials, and its second one.
 
-    A single view gives two poses. All of some views are tried in all views, and the best is fitted to them. Its mirror image
-    is fitted too: where the views have little parallax, both fit. An unknown side comes from the parallax of the views.
+    A single view gives two poses. The two poses of each of `_CANDIDATES` views are tried in `_VIEWS` views. The best pose is
+    fitted to the `_VIEWS` views. The mirror image of the best is fitted too, because both fit if the views have little
+    parallax. An unknown side comes from the parallax of the views.
 
     seen: views of the fiducials. shapes: (T, 4, 3). sides: (T,) m, NaN if unknown.
     """
@@ -107,7 +108,7 @@ def placed(seen: Corners, shapes: Floats, sides: Floats, landmarks: Ints, positi
 
 
 def _spread(seen: Corners, most: int) -> Ints:
-    """Return at most `most` views of each square, spread evenly over them."""
+    """Return at most `most` views of each square, spread evenly over all views of the square."""
     number = np.bincount(seen.square)[seen.square]
     order = np.argsort(seen.square, kind="stable")
     begin = np.searchsorted(seen.square[order], seen.square[order])
@@ -126,7 +127,7 @@ def _nearest(seen: Corners, most: int) -> Ints:
 
 
 def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
-    """Return for each candidate the views of its fiducial. owner: (C,) the fiducial of each candidate, of `count`."""
+    """Return for each candidate the `judges` of its fiducial. owner: (C,) the fiducial of each candidate, of `count`."""
     judges = judges.take(np.argsort(judges.square, kind="stable"))
     begin, number = np.searchsorted(judges.square, np.arange(count)), np.bincount(judges.square, minlength=count)
     candidate = np.repeat(np.arange(len(owner)), number[owner])
@@ -136,7 +137,7 @@ def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
 
 
 def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Floats:
-    """Return the side (H,) m at which squares of side 1, scaled from their origins (H, 3), fit the other views best.
+    """Return the side (H,) m at which squares of side 1, scaled about `origins` (H, 3) m, fit the views best.
 
     Least squares of the distances from the rays. NaN where the views do not tell it.
     """
@@ -151,14 +152,14 @@ def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Float
 
 
 def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
-    """Return squares of side 1 with other sides (H,), scaled from points (H, 3)."""
+    """Return squares of side 1 after a scaling to sides (H,) m. The points `origins` (H, 3) m are the fixed points."""
     pose = squares.pose.copy()
     pose[:, :3, 3] = origins + side[:, None] * (pose[:, :3, 3] - origins)
     return Squares(squares.shape, pose, side)
 
 
 def _finite(squares: Squares) -> Squares:
-    """Return the squares, with side 1 at the identity in place of one without a side."""
+    """Return the squares. A square without a side is replaced by one with side 1 at the identity."""
     known = np.isfinite(squares.side)
     pose = np.where(known[:, None, None], squares.pose, np.eye(4))
     return Squares(squares.shape, pose, np.where(known, squares.side, 1.0))

@@ -9,7 +9,7 @@ COUNTER_CLOCKWISE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.
 """(4, 3) the corners of a tag of side 1 in its own frame, if they go round counter-clockwise in the image, as AprilTag's do.
 x goes from the first corner to the second, and z from the tag to the viewer."""
 CLOCKWISE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""(4, 3) the same, if they go round clockwise, as ArUco's do. The axes are the same too."""
+"""(4, 3) the same for corners that go round clockwise, as ArUco's do. The axes are defined in the same way."""
 
 
 def goes_clockwise(directions: Floats) -> Bools:

@@ -12,10 +12,10 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.graph.factors.bearing import tangent_basis
 
 _BEHIND = 1e-3
-"""The least share of a corner's distance that must be ahead along its ray. A corner further back costs `_BEHIND_COST` and
-pulls at nothing. A larger share calls more corners behind."""
+"""The least share of a corner's distance that must be ahead along its ray. A corner with a smaller share costs
+`_BEHIND_COST` and has no gradient. A larger share counts more corners as behind."""
 _BEHIND_COST = 1e6
-"""The squared deviation of a corner behind its camera. A larger value is a surer no."""
+"""The squared deviation of a corner behind its camera. A larger value excludes such poses more surely."""
 _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
@@ -102,7 +102,7 @@ def _moved(squares: Squares, step: Floats) -> Squares:
 
 
 def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return whitened residuals (V, 4, 2), their derivatives (V, 4, 2, 3) by the corners in map, and which are ahead."""
+    """Return whitened residuals (V, 4, 2), derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4) are ahead."""
     to = corners[seen.square] - seen.origin[:, None]
     along = np.einsum("vci,vci->vc", seen.direction, to)
     ahead = along > _BEHIND * np.linalg.norm(to, axis=2)
@@ -121,7 +121,7 @@ def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
 
 
 def scatter(seen: Corners, squares: Squares, free: Bools) -> Floats:
-    """Return the sums (H, 7, 7) of the squared gradients of the views of each square: the errors of one view may be common.
+    """Return the sums (H, 7, 7) of the squared gradients of each square's views. The corners of a view may share errors.
 
     Between two inverses of the information, this is the covariance of a fit (cluster-robust; Liang and Zeger 1986).
     """
@@ -160,7 +160,7 @@ def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Fl
 
 
 def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
-    """Return the two poses of each view of a square of side 1, as 2 V squares: first one pose a view, then the other.
+    """Return the two poses of each view of a square of side 1: 2 V squares, the first pose of every view, then the second.
 
     A flat square that is far off, or seen from the front, looks nearly alike in two poses (Schweighofer and Pinz 2006). The
     first pose is that of the homography between the square and its image. The second one has the normal on the other side

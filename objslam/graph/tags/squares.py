@@ -1,4 +1,4 @@
-"""The squares of fiducials in a graph: their ties, and what the solved graph says of them."""
+"""Add the squares of fiducials to a graph: the ties of their corners, their poses and their sizes."""
 
 import gtsam
 import numpy as np
@@ -16,7 +16,7 @@ def add_squares(
 ) -> list[gtsam.NonlinearFactor]:
     """Return the ties of the fiducials whose corners are all in the graph. Their poses and sizes are added to the values.
 
-    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, of an unknown side.
+    landmarks: (m,) in the graph. positions: (M, 3) m of all landmarks. prior_sigma: m, as in `tag_ties`.
     """
     which = tags.tied(landmarks)
     rotation, centre, side = squares_of(positions[tags.landmarks[which]], tags.shape[which])

@@ -77,7 +77,7 @@ class StdinAdapter:
         except Malformed as malformed:
             self.ledger.drop(f"line malformed: {malformed}", where=place)
         except LogError as error:
-            self.ledger.drop("line malformed: not a camera", where=str(error))
+            self.ledger.drop("line malformed: not a valid camera", where=str(error))
 
     def _push(self, message: dict[str, Any], place: str) -> None:
         kind = message.get("type")

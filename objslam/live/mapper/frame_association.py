@@ -17,7 +17,7 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, as a multiple of the largest observed distance. More costs time.
+_BEYOND = 1.5  # The largest distance to a candidate, per largest distance from which it was seen. More costs time.
 _NEAR = 10.0  # Up to this distance (m), a landmark is never too far to be a candidate. A larger distance costs time.
 _ROUGH = 3.0  # A prediction is rough if its image area is this many times that of a ray's noise. More removes fewer matches.
 _CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.

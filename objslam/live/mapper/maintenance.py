@@ -21,7 +21,7 @@ from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
-_GROWING = 3  # The keyframe of each period after which growth is bounded. It differs from _CLOSING to spread the delay.
+_GROWING = 3  # The keyframe of each period at which tracks and keyframes are dropped. Not _CLOSING, to spread the delay.
 _CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed.
 _BREATH = 2  # The period of early relinearisations, in keyframes. With a larger period, the map settles later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
@@ -70,7 +70,10 @@ def _coming(m: MapState) -> Ints:
 
 
 def _polish_if_grown(m: MapState) -> None:
-    """If the graph has grown, solve it and test all rays again. A large graph is linearised again in slices instead."""
+    """If the graph has grown by `_GROWTH`, solve it and test all rays again.
+
+    A large graph is not solved. It is rebuilt in slices, as a small one is if its rays changed.
+    """
     if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
         return
     m.schedule.solved = m.next_id.keyframe

@@ -20,8 +20,8 @@ from objslam.core.validity import (
 )
 from objslam.sources.journal.records import FrameMessage
 
-_LONGEST_NAME = 1000  # The most letters of a camera's name. A larger number accepts longer names.
-_LETTERS = 80  # The most letters of a message's text in a report. A larger number makes longer lines.
+_LONGEST_NAME = 1000  # The most characters of a camera's name. A larger number accepts longer names.
+_LETTERS = 80  # The most characters that a report shows of a text in a message. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
 _EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
@@ -150,7 +150,7 @@ def sound_frame(
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array. None if they form no array of numbers. Truth values are not numbers here."""
+    """Copy values into an array. None if they are too many or form no array of numbers. Truth values are no numbers here."""
     if not _is_short(values, scalar=True):
         return None
     try:

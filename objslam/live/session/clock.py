@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The number of older poses in a row that shows that the clock was set back. A larger one is surer, but slower.
-_BACK = 0.5  # The least step back of a clock that is set back, s. A pose that is back by less counts as late.
+_SURE = 5  # The older poses in a row that show that the clock was set back. A larger number is surer, but slower.
+_BACK = 0.5  # The least step back, s, that shows a clock set back. A pose that is back by less counts as late.
 _LEAP = 60.0  # The least step ahead that a second pose must confirm, s. With a larger one, a wrong stamp does more harm.
 _KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
@@ -22,15 +22,15 @@ class Clock:
 
     shift: float = 0.0
     newest: float = -float("inf")
-    _older: list[float] = field(default_factory=list)
-    _ahead: float | None = None
-    _shifts: list[float] = field(default_factory=list)
+    _older: list[float] = field(default_factory=list)  # The stamps of the last poses in a row that were older than the path.
+    _ahead: float | None = None  # The stamp of the last pose, if it leapt ahead.
+    _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
         """Return a new pose's stamp in session time, or None, and whether the clock was set back.
 
-        The stamp is None for a pose that is late or repeated. It is also None for a pose that leaps ahead, unless the
-        previous pose leapt to about the same time.
+        The stamp is None for a pose that is late or repeated, and for the first poses after the clock was set back, which
+        look late. It is also None for a pose that leaps ahead, unless the previous pose leapt to about the same time.
         """
         time = stamp + self.shift
         if self.newest + _LEAP < time and math.isfinite(self.newest):
@@ -58,7 +58,7 @@ class Clock:
     def place(self, stamp: float, oldest: float, latest: float) -> float:
         """Return a stamp that does not set the clock, in session time. oldest, latest: session time, s.
 
-        The newest shift that puts the stamp between the two is used. If no shift does, the newest is used.
+        The newest shift that puts the stamp between `oldest` and `latest` is used. If none does, the present one is used.
         """
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:

@@ -12,7 +12,6 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
-from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Association, Log, Trajectory
@@ -21,20 +20,22 @@ from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.localization import PriorMap, localize, moved_log, with_map
+from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
 
 
 def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
-    known: a prior map. If the whole drive is found in it, the result is in its frame, as in an offline run.
+    If every label is one object, or if there are more rays than live.reassociate, the session's association is kept, and
+    only the solve is done.
 
-    The session's association is kept if every label is one object, or if there are more rays than live.reassociate.
-    SolveError when no box could be mapped.
+    name: of the log. path: of the journal, None without one. known: a prior map. If the whole drive is found in it, the
+    result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
     """
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
@@ -60,19 +61,19 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
+    solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
     ids = _kept_ids(found.association, found.ids, solution.association)
-    objects = _with_ids(objects, ids)
+    objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     where = None
     if known is not None:
         where = localize(solution, objects, known, errors, settings, ledger)
         if where.solution is not None and where.map_T_drive is not None:
-            solution, log = where.solution, moved_log(log, where.map_T_drive)
+            solution, objects, residual = describe_in_map(where, known, cameras, settings, ids)
+            log = moved_log(log, where.map_T_drive)
             keyframes, estimate = solution.keyframes, solution.estimate
-            described, residual = describe(solution, cameras, settings)
-            objects = with_map(_with_ids(described, ids), where, known)
     accepted = m.counters.accepted()
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
@@ -96,14 +97,10 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     )
 
 
-def _with_ids(objects: ObjectMap, ids: list[int]) -> ObjectMap:
-    return replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
-
-
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,) with map_T_base (K, 4, 4).
 
-    It follows the odometry, if there is one, because the localisation jitters.
+    The path between keyframes is that of the odometry, if there is one, because the localisation jitters.
     """
     way = log.odometry or log.localization
     assert way is not None  # There is no keyframe without a path.
@@ -112,7 +109,7 @@ def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
 
 
 def _kept_ids(before: Association, ids: Ints, now: Association) -> list[int]:
-    """Return an id for each object of `now`, so that an object of the session has one id from its first snapshot to its end.
+    """Return an id for each object of `now`, so that an object has the same id in the snapshots and in the result.
 
     The objects are paired one to one so that the pairs share the most rays. An object without a partner gets a new id.
     before: the association of the same rays in the session. ids: (N,) the ids of its objects.
@@ -127,9 +124,10 @@ def _kept_ids(before: Association, ids: Ints, now: Association) -> list[int]:
 
 
 def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Solution:
-    """Return the joint solve that starts from the session's poses. The shared errors start as in a run.
+    """Return the joint solve that starts from the session's poses. The shared errors start as in an offline run.
 
-    With few rays and without localisation, also solve from the odometry. Return the solve with the smaller residuals.
+    With at most live.reassociate rays, with odometry and without localisation, also solve from the odometry, because the
+    session may have rejected rays early and for good. Return the solve with the lower cost.
     """
     from objslam.graph import batch_solver
     from objslam.graph.assembly import Measurements
@@ -155,7 +153,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
     few = association.count and len(rays) <= settings.live.reassociate
     if not few or keyframes.odom_T_base is None or keyframes.localized_every:
         return first
-    other_ledger = Ledger()  # For a second solve, because the session may have rejected rays early and for good.
+    other_ledger = Ledger()  # Its entries count only if the second solve is returned.
     try:
         other = solved(other_ledger, None)
     except SolveError:

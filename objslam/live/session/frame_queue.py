@@ -1,4 +1,4 @@
-"""The queue of frames. Frames wait until the path covers them, and then enter the map in the order of their stamps."""
+"""The queue of frames. Frames wait until the path covers them, and are then mapped in the order of their stamps."""
 
 import bisect
 import time
@@ -36,7 +36,7 @@ class FrameQueue:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
         self._counters, self._mapper, self._patient = counters, mapper, patient
         self._calibrator, self._locator = calibrator, locator
-        # corrected stamp, order of arrival, frame, time of arrival
+        # Of each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
         self.lag = 0.0
@@ -45,7 +45,7 @@ class FrameQueue:
     def take(self, message: Message, arrival: float, measured: bool = True) -> bool:
         """Take a message, and return whether any frame left the queue. arrival: `time.perf_counter` at its arrival, s.
 
-        measured: whether the time until the map contains a frame is limited and counted. It is False for a journal.
+        measured: whether the time until the map contains a frame is limited and counted. False for a journal.
         """
         if isinstance(message, FrameMessage):
             self._frames += 1
@@ -58,7 +58,8 @@ class FrameQueue:
         while self._waiting and self._mapper.is_ready(self._waiting[0][0]):
             worked = True
             stamp, _, frame, came = self._waiting.pop(0)
-            limit = self._limit + max(0.0, stamp - frame.stamp)  # A camera whose clock is behind waits for its poses.
+            # If the clock of a camera is behind, its frames wait longer for their poses.
+            limit = self._limit + max(0.0, stamp - frame.stamp)
             if measured and not self._patient and time.perf_counter() - came > limit:
                 self._counters.drop_frame(frame, _RARE_POSES if arrival - came > limit else TOO_SLOW)
                 continue

@@ -30,12 +30,14 @@ from objslam.sources.journal.records import (
 _JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
 _TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # A pose smaller than this, m and rad, after a gap means a restart. A larger value detects more restarts.
+_ZERO = 0.05  # After a gap, an odometry pose below this size, m and rad, is a restart. A larger value detects more restarts.
 _FAR = 0.1  # The least size of the pose before the gap, m or rad, for _ZERO. A larger value takes more restarts for motion.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
-_WAIT = 2.0  # If a stamp leads the path by more than this, s, earlier shifts are tried. More takes old stamps for new ones.
+_WAIT = 2.0
+"""If a stamp leads the path by more than this, s, earlier shifts of the clock are tried. A larger value takes more stamps
+from before a change of the clock for new ones."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next one did not confirm yet"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
@@ -57,7 +59,7 @@ class Intake:
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
-        self._start_T_odom = np.eye(4)
+        self._start_T_odom = np.eye(4)  # The present frame of the robot's odometry in that of its first odometry.
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
 

@@ -20,10 +20,11 @@ _FEW = 60  # The most rays that give the parallax of an object, as the widest an
 
 
 def describe_landmark(m: MapState, row: int, position: Floats, covariance: Floats, *, from_graph: bool = False) -> MapObject:
-    """Describe the landmark in a row, at a position (3,) m with a covariance (3, 3) m^2.
+    """Describe the landmark in a row of `m.landmarks`, at a position (3,) m with a covariance (3, 3) m^2.
 
-    from_graph: whether the covariance includes the drift of the map. Then the landmark counts as resolved by its covariance
-    relative to the last keyframe that saw it.
+    If its residuals are larger than their sigmas, the covariance grows with their mean square. The box offsets are added.
+    from_graph: whether the covariance includes the drift of the map. If it is too large, the covariance relative to the last
+    keyframe that saw the landmark then decides whether the landmark is resolved.
     """
     landmarks, rays, j = m.landmarks, m.rays, int(m.landmarks.id[row])
     mine = np.flatnonzero((rays.owner == j) & rays.used)

@@ -1,7 +1,7 @@
 """Find a session in the map of another day, and tie it to that map.
 
-The search runs after keyframes, in the thread of the session. It depends on the map of the session only, so a resumed
-session finds the same.
+The search runs after keyframes, in the thread of the session. It depends only on the map of the session, so a resumed
+session finds the same place.
 """
 
 from dataclasses import dataclass, replace
@@ -21,25 +21,25 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import update_positions
 from objslam.live.session.landmark_description import describe_landmark
-from objslam.mapping.localization import PriorMap, moved_object
+from objslam.mapping.localization import PriorMap, at_ray_points, moved_object
 
 _EVERY, _AT = 10, 9
 """The period of the search in keyframes, and the keyframe in each period. A longer period finds the map later. The keyframe
 differs from those of the maintenance, to spread the delay."""
 _MOST = 40
-"""The most landmarks of a search, the last seen ones. A larger number needs a smaller share of common objects, and delays a
-frame longer. A search of 40 in a map of 1,000 objects takes 0.1 s."""
+"""The most landmarks of a search, the last seen ones. With more, a smaller share of them must be in the prior map,
+and a frame waits longer. A search of 40 in a map of 1,000 objects takes 0.1 s."""
 _GROWTH = 1.2
-"""The growth factor of keyframes between two searches with the same landmarks, which become more exact. A larger factor
-searches more rarely."""
+"""A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks
+are more exact by then. A larger factor searches more rarely."""
 _SAME_PLACE = 0.5
-"""The distance (m) between the places that two registrations give the same landmarks, up to which they agree. A larger value
-keeps a wrong place for longer."""
+"""Two registrations agree if they move the middle of the same landmarks to places that are at most this far apart, m. A
+larger value keeps a wrong place for longer."""
 
 
 @dataclass(frozen=True)
 class _Search:
-    """A search that has been made: its landmarks, and the number of keyframes then."""
+    """A search: the ids of its landmarks, and the number of keyframes at its time."""
 
     landmarks: tuple[int, ...]
     keyframes: int
@@ -53,12 +53,14 @@ class MapLocator:
 
     def __init__(self, known: PriorMap | None, mapper: Mapper, counters: Counters) -> None:
         self._known, self._mapper, self._counters = known, mapper, counters
+        if known is not None:  # The landmarks of a session are where rays meet, and not the centres of bodies.
+            self._known = replace(known, objects=at_ray_points(known.objects))
         self._last: _Search | None = None
         self._matched: dict[int, int] = {}  # By id of a landmark: the index of its object in the prior map.
         self.told: InPriorMap | None = None
 
     def after_keyframe(self) -> bool:
-        """Search if it is due, and return whether the map of the session was tied to the prior map."""
+        """Search if a search is due, and return whether it tied landmarks to the prior map."""
         m = self._mapper.state
         if self._known is None or m.next_id.keyframe % _EVERY != _AT or m.graph.is_rebuilding:
             return False
@@ -78,9 +80,9 @@ class MapLocator:
         return self._tie(found, objects, in_graph)
 
     def in_map(self, snapshot: Snapshot) -> Snapshot:
-        """Return a snapshot in the frame of the prior map, or unchanged if the session is not tied to one.
+        """Return a snapshot with `told`, and in the frame of the prior map if the session is tied to one.
 
-        Objects that the prior map has get their ids there. The ids of all others are counted on from its last id.
+        Objects that the prior map has get their ids there. The ids of the other objects are raised by its first free id.
         """
         frame = map_T_graph(self._mapper.state.graph)
         snapshot = replace(snapshot, in_map=self.told)
@@ -116,7 +118,10 @@ class MapLocator:
         return last is None or last.landmarks != search.landmarks or search.keyframes >= _GROWTH * last.keyframes
 
     def _tie(self, found: Registration, objects: ObjectMap, in_graph: Floats) -> bool:
-        """Tie the matched objects to the map. in_graph: (n, 3, 3) as `_recent_objects` returns it."""
+        """Tie the matched objects to the prior map, and return whether anything new was tied.
+
+        objects, in_graph: as `_recent_objects` returns them.
+        """
         m, known = self._mapper.state, self._known
         assert known is not None
         frame, ids = map_T_graph(m.graph), np.array([o.id for o in objects], dtype=np.int64)
@@ -154,7 +159,7 @@ class MapLocator:
 def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
     """Return the resolved landmarks in these rows, and their covariances (n, 3, 3), m^2, in the graph.
 
-    The covariances are those relative to the newest keyframe. The drift until then is no error between the landmarks.
+    The covariances are relative to the newest keyframe, because the drift until then is the same error for all landmarks.
     """
     newest = int(m.keyframes.id[m.keyframes.stamp.argmax()])
     m.graph.refresh()
@@ -170,6 +175,6 @@ def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
 
 
 def _apart(a: Floats, b: Floats, points: Floats) -> float:
-    """Return the distance (m) between the places that two transforms (4, 4) give the middle of points (n, 3)."""
+    """Return the distance (m) between the two places to which transforms (4, 4) move the middle of points (n, 3)."""
     middle = np.append(points.mean(axis=0), 1.0)
     return float(np.linalg.norm((a @ middle - b @ middle)[:3]))

@@ -29,9 +29,11 @@ from objslam.sources.journal.reader import calibrations, messages
 from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Message, NoteMessage
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
-_IDLE = 0.05  # The longest sleep of the idle thread, and wait of a snapshot for a frame, s. A larger value answers later.
-_SHORT = 0.015  # The processing time, s, up to which a snapshot follows at once. A larger value delays more frames.
-_LONG = 0.5  # The wait, s, after which a snapshot follows a frame of any processing time. A larger value answers later.
+_IDLE = 0.05
+"""The longest sleep of the idle thread, s. A snapshot is also made if no frame came for this time. A larger value makes
+snapshots later."""
+_SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
+_LONG = 0.5  # If a caller waits longer than this, s, a snapshot follows any frame. A larger value makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
@@ -71,14 +73,14 @@ class Session(Intake):
             self.counters.drop("torn record at the end of the journal", f"{journal}, {self._journal.torn} bytes")
         self._queue: deque[tuple[Message, float]] = deque()
         self._taken: deque[tuple[Message, float]] = deque()
-        self._frames = self._others = 0
+        self._frames = self._others = 0  # How many frames and how many other messages are in the queue.
         self._changed = threading.Condition()
-        self._wanted = self._given = 0
+        self._wanted = self._given = 0  # How many snapshots were asked for, and how many of these requests were answered.
         self._busy = self._running = self._stopping = False
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
         self._describer = Describer()
-        self._asked = -np.inf
+        self._asked = -np.inf  # When the oldest request without an answer came, s (`time.perf_counter`).
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
     def start(self) -> Self:
@@ -153,7 +155,7 @@ class Session(Intake):
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into journal and queue, or into neither. A note enters the journal only. Return whether accepted."""
+        """Put a message into journal and queue, or into neither. A note is only journalled. Return whether accepted."""
         with self._changed:
             if self._stopping:
                 self.counters.drop("messages after the end of the session")
@@ -165,7 +167,7 @@ class Session(Intake):
             if self._journal is not None:
                 try:
                     self._journal.write(message)
-                except OutputError as error:  # It is too long. An error of the disk only ends the journal.
+                except OutputError as error:  # The message is too long. Disk errors only end the journal.
                     self.counters.drop(f"messages that could not be written to the journal: {error.message}")
                     return False
             if not note:
@@ -253,9 +255,9 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now: no frame came for a while, the last one was quick, or the wait is long.
+        """Return whether to make a snapshot now: no frame came for a while, the last ones were quick, or the wait is long.
 
-        worked: whether a frame was just processed. begin: when this began, s (`time.perf_counter`).
+        worked: whether a frame was just processed. begin: when the last messages were taken, s (`time.perf_counter`).
         """
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))

@@ -23,7 +23,9 @@ class Describer:
     """Describes the objects of a map, and keeps each description until its object is seen again."""
 
     def __init__(self) -> None:
+        # Of each landmark by id: its rays and its last stamp, s, when it was described, and the description.
         self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
+        # Of each track by id: its number of rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.
 
@@ -63,12 +65,16 @@ class Describer:
         return ObjectMap(tuple(objects))
 
     def _covariance(self, m: MapState, j: int) -> Floats:
-        """Return the covariance (3, 3), m^2, of a landmark in the frame of the session or of its prior map."""
+        """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
+
+        It is relative to the prior map, if the session is tied to one. If it is not, or if that covariance is unknown, it is
+        relative to the frame of the session.
+        """
         covariance = covariance_in_map(m.graph, j) if self._tied else np.full((3, 3), np.nan)
         return covariance if np.isfinite(covariance).all() else m.graph.point_covariance(j)
 
     def _wait(self, m: MapState, track: Track, whole: bool, end: float) -> tuple[int, MapObject] | None:
-        """Return the number of rays and the description of a track; None for a new track after time `end`, s."""
+        """Return the number of rays and the description of a track; None for a new track after `end`, s."""
         before = self._waiting.get(track.id)
         if not whole and ((before is not None and before[0] == len(track.rays)) or time.perf_counter() > end):
             return before

@@ -124,7 +124,7 @@ def bounded_part(log: Log, settings: Settings) -> Part:
 def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None = None) -> Agreement | None:
     """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose.
 
-    window: for each camera, other windows of its frames.
+    window: for each camera, the windows of its frames, if they are not those of the part.
     """
     free = settings.model_copy(update={"mode": "fixed"})
     try:
@@ -155,7 +155,8 @@ def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:
 
 
 def _window_length(log: Log, settings: Settings) -> float:
-    """Return the time (s) in which the odometry moves or turns as far as a window covers."""
+    """Return the time (s), 10 to 120, in which the odometry moves or turns as far as a window covers. It is infinite without
+    odometry."""
     path = log.odometry
     if path is None or len(path) < 2:
         return np.inf
@@ -177,7 +178,10 @@ def _take_frames(one: CameraLog, kept: Bools) -> Detections:
 def _fit_points(
     origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int
 ) -> tuple[Ints, Floats, Floats]:
-    """Fit points to the rays of each label. Return each ray's point (R,), the points, and each ray's fit (R,)."""
+    """Fit points to the rays of each label. Return each ray's point (R,), the points (N, 3), and each ray's fit (R,).
+
+    tolerance: (R,) rad. place: m. A ray fits up to its tolerance times the distance, plus place, added in quadrature.
+    """
     rng = np.random.default_rng(seed)
     point, gain = np.full(len(label), -1), np.zeros(len(label))
     points: list[Floats] = []
@@ -249,7 +253,8 @@ def _fit(origins: Floats, directions: Floats, tolerance: Floats, place: float, p
 
 
 def nearest_point(origins: Floats, directions: Floats, start: Floats) -> Floats:
-    """Return the point (3,) that is nearest to rays in least squares of angles."""
+    """Return the point (3,) that is nearest to rays in least squares of angles. start: (3,) a point near it, whose distances
+    turn offsets into angles."""
     weight = 1 / np.maximum(((start - origins) ** 2).sum(axis=1), _NEAREST**2)
     across = weight[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None, :])
     matrix, vector = across.sum(axis=0), np.einsum("rij,rj->i", across, origins)

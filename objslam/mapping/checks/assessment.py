@@ -104,8 +104,8 @@ def _bad(e: Evidence) -> list[str]:
 def _check(e: Evidence) -> list[str]:
     found = []
     if e.fixed and e.odometry_frame:
-        # Objects that drift smears fall into parts, each of which its rays fit well: the residuals do not tell.
-        found.append("The poses are the odometry's as they are, so its drift is in the map: --mode joint takes it out.")
+        # Drift splits an object into parts, and the rays of each part fit it well. So the residuals do not show drift.
+        found.append("The poses are those of the odometry, so its drift is in the map: --mode joint takes it out.")
     if e.findings:
         found.append(f"The input has an error that the warnings explain ({', '.join(e.findings)}).")
     elif e.misses > _MISSES:

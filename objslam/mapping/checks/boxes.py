@@ -11,11 +11,12 @@ from objslam.mapping.checks.finding import Finding
 _OVERLAP = 0.5
 """The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
 _UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
-"""The name of each unit of time, by its number in a second."""
+"""The name of each unit of time, by the number of units in a second."""
 _FEWEST = 20
 """The fewest boxes that are judged. The test for boxes between 0 and 1 needs fewer. A few boxes may lie anywhere."""
 _PART = 0.9
-"""The share of boxes that must look wrong. A smaller share also reports logs with a few wrong boxes."""
+"""If more than this share of the boxes has no coordinate above 1.5, the boxes are probably shares of the image, not px. A
+smaller share also reports logs with a few wrong boxes."""
 _WITHOUT_AREA = 0.2
 """If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes."""
 _OUTSIDE = 0.1

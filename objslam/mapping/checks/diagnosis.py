@@ -29,7 +29,7 @@ _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9. A
 larger value costs more runs a few seconds."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
-"""The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of these offsets."""
+"""The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of the offsets."""
 _CROWD = 5.0
 """The crowd (`Part.crowd`) above which rays meet anywhere and show nothing. A larger value takes longer."""
 _FEWEST = 60
@@ -40,13 +40,16 @@ less often."""
 _MOVED_BY_ODOMETRY = 0.1
 """`_MOVED` for poses by odometry. Their drift looks like a rotation."""
 _MOVED_SIGMAS = 6.0
-"""The least size of this rotation in standard deviations. A larger number warns less often."""
+"""The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
+often."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
-"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the best one. More take longer."""
+"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the one that fits best. More
+offsets take longer."""
 _GAIN_MOVED = 0.03
 """The least growth of the score if each half has its own camera rotation. A larger value reports fewer moved cameras."""
 _GAIN = 0.02
-"""The least growth of the score if the errors that the run does not estimate are removed. A larger value reports fewer."""
+"""The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
+estimate. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible fault of the input. what: a description of the corrected log. cause: the probable mistake."""
+    """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
+    mistake. put_right: returns the corrected log."""
 
     name: str
     what: str
@@ -92,7 +93,8 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
 
 
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Some hypotheses change its meaning."""
+    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Without it, the hypotheses about width and
+    height are left out."""
 
     def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
         def put_right(log: Log) -> Log:
@@ -168,7 +170,7 @@ def _mounted(pose: Floats, turn: Floats) -> Floats:
 
 
 def w_last(poses: Floats) -> Floats:
-    """Return poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
+    """Correct poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
     read = quaternion_from_rotation(poses[..., :3, :3])
     return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
@@ -185,7 +187,7 @@ def _yaw_times(poses: Floats, factor: float) -> Floats:
 
 
 def _from_degrees(poses: Floats) -> Floats:
-    """Return poses whose headings (degrees) were taken for radians.
+    """Correct poses whose headings (degrees) were taken for radians.
 
     A rotation matrix keeps a heading modulo 2 pi, so multiples of 6.3 degrees are lost here. Two assumptions restore them: a
     robot turns evenly, and it drives in the direction of its heading.
@@ -193,7 +195,7 @@ def _from_degrees(poses: Floats) -> Floats:
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     steps = np.diff(said)
     rate = 0.0
-    for i, step in enumerate(steps.tolist()):  # each step is near the one before
+    for i, step in enumerate(steps.tolist()):  # Each step is near the step before.
         steps[i] = step + 2 * np.pi * round((rate - step) / (2 * np.pi))
         rate = steps[i]
     yaw = np.radians(np.append(0.0, np.cumsum(steps)))

@@ -9,7 +9,8 @@ from objslam.mapping.checks.finding import Finding
 _RAYS, _FRAMES = 3, 40
 """The fewest rays of a judged frame, and the fewest such frames. Fewer rays may all fit, or all miss, by chance."""
 _BAD, _GOOD = 0.34, 0.67
-"""A frame is bad up to the first share of fitting rays, and good from the second on. Values farther apart find fewer."""
+"""A frame is bad up to the first share of fitting rays, and good from the second on. Values farther apart find fewer mixed
+logs."""
 _LEAST = 0.2
 """The least share of bad and of good frames. A larger value needs more frames of the other recording."""
 _DISPERSION = 1.6

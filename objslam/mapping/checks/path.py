@@ -18,11 +18,13 @@ _FASTEST_TURN = 8.0
 _JUMP = 5.0
 """The speed (m/s) above which a step of an otherwise slow path may be a jump. It equals live.max_speed."""
 _JUMP_TURN = 20.0
-"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. It is four times live.max_speed."""
+"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. As in a live session, it is 4 rad/s for
+each m/s of live.max_speed."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
 _TIMES = 20.0
-"""The least speed of a jump as a multiple of the robot's usual speed. A larger number warns less often."""
+"""The least speed of a jump, in quarters of the speed that the moving robot exceeds in a tenth of its steps. It also applies
+to turn rates. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
@@ -32,13 +34,15 @@ _FROZEN_SECONDS = 8.0
 _MOVING_PX = 12.0
 """The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
 _LEAST_STEP = 0.01
-"""The least step (m) of a path whose direction is judged. Shorter steps are noise."""
+"""The noise (m) of a position. The direction of a motion is judged if it is more than three times as long. A larger value
+suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
-"""The least distance in such a time, as a share of the longest one. Shorter distances are noise."""
+"""The least distance in a time of `_PIECE` that is compared, as a share of the longest one. Shorter distances are noise."""
 _OTHER_SCALE = 0.1
-"""The least logarithm of the ratio of the two distances. Real odometry errs by up to 8 %. A larger one warns less often."""
+"""The logarithm of the ratio between the distances by localisation and odometry, above which a run warns. Real odometry errs
+by up to 8 %. A larger value warns less often."""
 _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 
@@ -114,7 +118,10 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
 
 
 def log_is_split(way: Floats, jumps: Bools) -> bool:
-    """Return whether the jumps of a localisation do not cancel. Then it changed to another map. One jump is a correction."""
+    """Return whether a localisation jumps by more than 1 m, as if it changed to another map. A shorter jump is a correction.
+
+    way: (N-1,) m, the steps of the path. jumps: (N-1,) which steps are jumps.
+    """
     return bool(jumps.any() and way[jumps].max() > 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Compare measured ranges with the distances that bearings alone give."""
+"""Compare measured ranges with the distances that bearings alone give, or with the motion by odometry."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ _SPREAD = 0.1
 """The most by which half of the points' ratios may differ from their median, as a share. A wrong unit or scale is equal for
 all points. The ratios of points at wrong positions differ."""
 _SPREAD_OF_UNITS = 0.3
-"""`_SPREAD` for a factor so large that it must be a unit."""
+"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
 _LEAST = 0.04
 """The least error of the ranges, as a share. Smaller errors also come from the depth of things and from cameras that are
 turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
@@ -27,22 +27,24 @@ _SPOILING = 0.06
 _SIGMAS = 5.0
 """The least error in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
-"""The name of each unit of length, by its number in a metre."""
+"""The name of each unit of length, by the number of units in a metre."""
 _CLOSE = 0.25
-"""A factor is one of these units if the logarithm of their ratio is below this."""
+"""A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
+units."""
 _UNIT = 0.7
 """The logarithm of a factor above which no calibration error explains the factor."""
 _GROUP = 8
 """The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which a label in a window is one thing. In a larger crowd, its ranges end at several."""
+"""The crowd (`Part.crowd`) up to which a label in a window is one thing. In a larger crowd, its ranges end at several
+things."""
 _LEAST_BY_ODOMETRY = 0.18
 """The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
 """The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5
-"""With the right factor, the ends of the ranges must come together to this share of their spread at very long ranges. A
-smaller share accepts fewer labels."""
+"""The ends of the ranges come together at the right factor. The spread there, relative to the ranges, must be below this
+share of the relative spread at the largest factor. A smaller share accepts fewer labels."""
 
 
 def check_ranges(found: Agreement, part: Part) -> Finding | None:

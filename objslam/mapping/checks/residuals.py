@@ -14,7 +14,8 @@ _MOST = np.sqrt(2.0)
 """A run warns if the residuals exceed this multiple of the noise in the settings. From this value on, at least half of their
 variance has a cause that the settings do not contain. A larger value warns less often."""
 _SIGMAS = 3.0
-"""The least excess of the multiple over `_MOST`, in its standard deviations. A larger number warns only for longer logs."""
+"""The least excess of the multiple over `_MOST`, in standard deviations of the multiple. A larger number warns only for
+longer logs."""
 _MEDIAN_SIGMA = 0.72
 """The standard deviation of the multiple from one ray: 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
 median m. From n independent rays, it is smaller by the root of n."""
@@ -25,7 +26,8 @@ def misses(
 ) -> float:
     """Return the median residual of the objects that are ok, as a multiple of its expected noise. NaN without such objects.
 
-    At fixed poses, the noise of the localisation is part of it. residual: (R,) rad between each ray and its object.
+    At fixed poses, the expected noise contains the noise of the localisation. residual: (R,) rad between each ray and its
+    object.
     """
     held = _held(objects, association)
     if not held.any():

@@ -27,24 +27,26 @@ _CAUSES = {
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
     """Warn of each shared error that is far from the mean of its prior, and name the probable cause.
 
+    The value of an error that the log does not show follows the noise, so it causes no warning.
     The prior is from the settings or from a calibration file. A large error causes no warning if the file already has it.
     """
     for name, of in calibration.to_dict()["parameters"].items():
         expected = of["prior_mean"]
         sigmas = abs(of["value"] - expected) / of["prior_sigma"]
-        if sigmas > MOST_SIGMAS:
+        if sigmas > MOST_SIGMAS and of["observable"]:
             cause = _CAUSES.get(kind(name), "is the calibration right?")
             unit = "" if of["unit"] == "share" else f" {of['unit']}"
             far = f"{sigmas:.1f} times its prior sigma"
             if expected:
-                far += f" from the {expected:.3g}{unit} of the calibration file; if it has changed, calibrate anew"
+                far += f" from the {expected:.3g}{unit} of the calibration file; if it has changed, calibrate again"
             ledger.warn(f"the shared error {name} is {of['value']:.3g}{unit}, {far}: {cause}")
 
 
 def uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
-    """Return a finding for each shared error that ended at its bound (P,). The true error is larger and is not corrected.
+    """Return a finding for each shared error that ended at its bound (P,). The true error may be larger and is not
+    corrected.
 
-    There is no finding for an error that a calibration file already places at the bound.
+    There is no finding for an error within one standard deviation of its prior mean, which a calibration file may set.
     """
     ended = np.abs(calibration.values) >= 0.999 * bounds
     ended &= np.abs(calibration.values - calibration.expected) > calibration.prior

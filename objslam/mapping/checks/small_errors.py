@@ -31,9 +31,10 @@ _LEAST_SHARE = 0.04
 """The least decrease as a share of all squared deviations. Rays of a real log are not independent, so the sum of many small
 deviations proves nothing. A larger value finds fewer errors."""
 _ROUNDS = 6
-"""The number of Gauss-Newton steps. A larger number is more exact."""
+"""The number of Gauss-Newton steps after each added error. A larger number is more exact."""
 _CLOCK_SIGMA = 0.05
-"""The standard deviation (s) of a clock offset from the tried values. A larger value makes the clock less certain."""
+"""The standard deviation (s) of a clock offset that was found only by trying. A larger value makes the clock less
+certain."""
 
 CAUSES = {
     "clock": "the clock of the camera and that of the poses differ",
@@ -51,7 +52,8 @@ CAUSES = {
 class SmallErrors:
     """Errors that explain the residuals. names, values (P,), sigma (P,): in the units of `core.calibration`.
 
-    errors: the measurements without these errors. estimated: the names of the errors that the run itself estimates.
+    errors: all examined errors, as parameters of the measurements. estimated: the names of the errors that the run itself
+    estimates.
     """
 
     errors: SharedErrors
@@ -67,7 +69,7 @@ class SmallErrors:
         return tuple(n for n, v in named if abs(v) > _HARMFUL[kind(n)] and n not in self.estimated)
 
     def corrected(self, log: Log, only: Collection[str] | None = None) -> Log:
-        """Return a log without the errors, or without `only` those of these names."""
+        """Return a log without the errors. only: the names of the errors to remove, None for all."""
         every = np.zeros(len(self.errors.names))
         for name, value in zip(self.names, self.values.tolist(), strict=True):
             if only is None or name in only:
@@ -88,7 +90,7 @@ class SmallErrors:
         return ", ".join(parts)
 
     def remedy(self, settings: Settings) -> str:
-        """Return the options with which a run estimates the harmful errors. settings: of a run that does not."""
+        """Return the options with which a run estimates the harmful errors. settings: of a run without these options."""
         held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
@@ -115,7 +117,7 @@ def find_small_errors(
 ) -> SmallErrors | None:
     """Return the errors that explain the residuals of the fitting rays, None if there are none.
 
-    noise: the errors of the poses (rad, m).
+    noise: the errors of the poses (rad, m). kinds: the kinds of errors that are examined.
     """
     held = found.point >= 0
     if held.sum() < 10 * len(_KINDS):
@@ -152,7 +154,10 @@ def find_small_errors(
 
 
 def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
-    """Return the errors of a log, from the errors of the same log with its frames moved by an offset (s)."""
+    """Return the errors of a log, from the errors of the same log with the stamps of its frames later by an offset (s).
+
+    errors: None if the search found none. Then the clocks of the cameras are the only errors.
+    """
     own = shared(log, found.keyframes, found.rays, settings)
     values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)
     sigmas = dict.fromkeys(values, _CLOCK_SIGMA)
@@ -163,7 +168,7 @@ def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agree
 
 
 def _gain(system: PointSystem, which: list[int]) -> float:
-    """Return the decrease of the cost by these errors."""
+    """Return the decrease of the cost by the errors `which`."""
     if not which:
         return 0.0
     at = np.ix_(which, which)
@@ -171,6 +176,6 @@ def _gain(system: PointSystem, which: list[int]) -> float:
 
 
 def _step(system: PointSystem, which: list[int]) -> tuple[Floats, Floats]:
-    """Return the step of these errors, and the step of the points (N, 3)."""
+    """Return the step (P,) of the errors `which`, and the step of the points (N, 3)."""
     step = np.linalg.lstsq(system.matrix[np.ix_(which, which)], -system.vector[which], rcond=1e-9)[0]
     return np.asarray(step), np.asarray(system.own + system.back[:, :, which] @ step)

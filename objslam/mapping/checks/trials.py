@@ -24,7 +24,8 @@ hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59."
 _NOT_WORSE = 0.8
 """A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes."""
 _EQUAL = 0.95
-"""Another hypothesis is as good as the best if it has this share of its score. A larger share names fewer alternatives."""
+"""Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
+alternatives."""
 
 
 @dataclass(frozen=True)

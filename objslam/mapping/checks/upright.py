@@ -5,7 +5,8 @@ from objslam.frontend.up import up_axis
 
 
 def lies_on_its_side(keyframes: Keyframes) -> str | None:
-    """Return a warning if the cameras' mean up vector is far from the map's z axis, as after visual SLAM; None otherwise."""
+    """Return a warning if the cameras' mean up vector is far from the map's z axis, as after visual SLAM. None if it is
+    not."""
     up = up_axis(keyframes)
     if up == "z":
         return None

@@ -51,7 +51,7 @@ def widened(
 
 
 def _settled(rays: tuple[Floats, Floats], mine: Floats, start: Floats) -> Floats:
-    """Return the point (3,) nearest to some of the rays."""
+    """Return the point (3,) nearest to the rays in the mask `mine` (R,). rays: origins and directions (R, 3)."""
     point = start
     for _ in range(_STEPS):
         point = nearest_point(rays[0][mine], rays[1][mine], point)

@@ -24,7 +24,8 @@ OUTCOMES: tuple[Outcome, ...] = ("confirmed", "moved", "gone", "new", "unseen")
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one object. probability: that it is where `item` says, or for one that is gone, that it is gone."""
+    """What became of one object. probability: of an object that is gone, that it is gone. Of the others, that it is where
+    `item` says."""
 
     outcome: Outcome
     item: MapObject
@@ -36,7 +37,7 @@ class Comparison:
     """Two maps in the frame of the first.
 
     changes: one for each object of both maps, empty if the registration was refused. reason: of the verdict, in a few words.
-    a_T_b: (4, 4) how the other map lies in the frame of the first.
+    a_T_b: (4, 4) takes points from the frame of the other map to the frame of the first.
     """
 
     registration: Registration
@@ -50,7 +51,8 @@ class Comparison:
 
 
 def compare(a: Session, b: Session) -> Comparison:
-    """Compare a map with that of a later session. The later one needs its views to say that an object is gone."""
+    """Compare a map with the map of a later session. b: the later one, which needs its views to say that an object is
+    gone."""
     found = register(b.objects, a.objects)
     why = reason(found, b.objects, a.objects, (b.name, a.name))
     if not found.accepted:
@@ -67,7 +69,8 @@ def compare(a: Session, b: Session) -> Comparison:
 
 
 def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
-    """Return the probability (N,) that each object was there in a session that did not find it, by what it had in view."""
+    """Return the probability (N,) that each object was there in a session that did not find it, by what the session had in
+    view."""
     looks = a.looks(items, np.array([o.position for o in items]).reshape(-1, 3), np.eye(4))
     lives = np.array([(0, 0) if o.life is None else (o.life.looks, o.life.detections) for o in items]).reshape(-1, 2)
     nobody = np.zeros(len(items), dtype=bool)
@@ -75,7 +78,8 @@ def _there_before(a: Session, items: tuple[MapObject, ...]) -> Floats:
 
 
 def _change(item: MapObject, seen_by: tuple[int, ...], *, new: bool) -> Change:
-    """Return the change of one object. new: whether the earlier session would have found it, as far as that session says."""
+    """Return the change of one object. seen_by: the indices of the sessions that found it. new: whether an object that only
+    the later session found is new. It is if the earlier session had the place in view often enough, or has no views."""
     assert item.life is not None
     p = item.life.probability
     if item.life.state == "gone":

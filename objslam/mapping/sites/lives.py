@@ -15,7 +15,8 @@ GONE = 0.5
 FORGOTTEN = 0.01
 """The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
 UNPROVEN = 0.9
-"""The probability that an object of one session exists if the session does not say. A larger value trusts it more."""
+"""The probability that an object of one session exists, if the session does not say. It is also the largest one that a
+session gives. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
 """The largest ratio of the sizes of an object before and after it moved. A larger value takes more pairs for one object."""
@@ -41,8 +42,9 @@ class Track:
 def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
     """Return the lives (N) of the tracks after one session.
 
-    found: (N,) whether the session found each. looks: (N,) how often it should have. seen: the objects that it found, None
-    elsewhere. when: the time of the session, s. A track without a life begins here.
+    found: (N,) whether the session found each. looks: (N,) in how many frames it should have been detected. seen: the object
+    of the session for each track, None if it was not found. when: the time of the session, s. A track without a life begins
+    here.
     """
     old = [t.life for t in tracks]
     before = np.array([UNPROVEN if life is None else life.probability for life in old])
@@ -77,10 +79,10 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
 
 
 def joined(old: Life, new: Life) -> Life:
-    """Return the life of an object that two sites have, the sessions of one before those of the other.
+    """Return the life of an object that two sites have. old, new: in the earlier and in the later site.
 
-    The later site began with an object of which nothing was known (`UNPROVEN`). What its sessions say of the object goes on
-    from what the earlier site knew, after the first of them found it.
+    The later site began with the prior `UNPROVEN`. Its odds are divided by the odds of this prior, which leaves what its
+    sessions say. They multiply the odds of the earlier site, after one more session that found the object.
     """
     days = np.array([max(new.updated - old.updated, 0.0) / _DAY])
     one, none = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)

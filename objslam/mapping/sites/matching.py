@@ -9,20 +9,21 @@ from objslam.core.object_map import MapObject
 from objslam.core.statistics import SAME_POINT
 
 STILL = 0.05
-"""The standard deviation (m) of the shift of an object that nobody moved: it is nudged, or a detector sees it otherwise. A
-larger value takes larger shifts for the same place."""
+"""The standard deviation (m) of the shift of an object that nobody carried away. Somebody may nudge it, or its boxes may
+differ. A larger value takes larger shifts for the same place."""
 _MISLABELLED = 0.02
-"""The probability that a detector gives an object one other label. A larger value matches objects with unlike labels from
-farther away."""
+"""The probability that a detector gives an object a certain wrong label. A larger value matches objects with unlike labels
+from farther away."""
 
 
 def same_objects(
     ours: list[MapObject], theirs: list[MapObject], positions: Floats, covariance: Floats, other: Floats, other_cov: Floats
 ) -> Ints:
-    """Return pairs (P, 2) of indices of one object, one-to-one, with the least sum of costs.
+    """Return pairs (P, 2) of indices of one object, one-to-one, with the largest sum of gains.
 
-    The cost is the squared Mahalanobis distance, less 2 ln of the probability of both labels. positions, covariance: (N, 3)
-    m and (N, 3, 3) m^2 of `ours`. other, other_cov: (M, 3) and (M, 3, 3) of `theirs`, in the same frame.
+    The gain of a pair is `SAME_POINT` minus its cost, and is positive. The cost is the squared Mahalanobis distance, minus 2
+    ln of the probability of both labels. positions, covariance: (N, 3) m and (N, 3, 3) m^2 of `ours`. other, other_cov:
+    (M, 3) and (M, 3, 3) of `theirs`, in the same frame.
     """
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), dtype=np.int64)

@@ -13,6 +13,7 @@ from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body import Body, surer_body, turned
 from objslam.core.geometry import inverse
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom, TagPose
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
@@ -20,11 +21,11 @@ from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
 _REMEMBERED = 5
-"""The most sessions that an object of a site counts as in the next solve. A larger number averages more sessions, and
-follows an object that is nudged more slowly."""
+"""An object of a site counts as at most this number of sessions in the next solve. A larger number averages more sessions,
+and follows an object that is nudged more slowly."""
 _YOUNG = 2
-"""The most sessions that an object was seen in to count as one that moved there. A larger number finds more late moves, and
-takes more objects that were added for moved ones."""
+"""An object that at most this number of sessions saw may have moved there. A larger number finds more late moves. It also
+takes more added objects for moved ones."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Island:
     """Sessions that share objects, in one map. The frame is that of the first session.
 
     objects: the map, with the life of each object. sessions: the indices (S,) of the sessions, in their order.
-    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first.
-    log_odds: (S,) the evidence that tied each session to those before it, NaN for the first. common: (S,) how many of its
-    objects other sessions have. seen_by: for the id of each object the indices of the sessions that found it.
+    site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. log_odds: (S,)
+    the evidence that tied each session to those before it, NaN for the first. common: (S,) how many objects of each session
+    another session has too. seen_by: for the id of each object, the indices of the sessions that found it.
     """
 
     objects: ObjectMap
@@ -47,11 +48,12 @@ class Island:
 
 
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
-    """Register all pairs of sessions, and join those that overlap to one map each. The largest island comes first.
+    """Register all pairs of sessions, and join each group of sessions that overlap to one map. The largest island comes
+    first.
 
     The sessions are in the order of time, and the first of an island gives its frame. Sessions whose registrations are all
-    refused stay alone. A site among the sessions brings the life of its objects, so that adding a session to it costs what
-    that session costs. Two sites are joined in the same way: what the later one lacks lives through its `visits`.
+    refused stay alone. A site among the sessions brings the life of its objects, so that the sessions of the site need not
+    be read again. Two sites are joined in the same way. An object that the later site lacks lives through its `visits`.
     """
     edges = {
         (a, b): found
@@ -72,7 +74,7 @@ def _tree(
 ) -> tuple[list[int], list[tuple[int, Floats]], list[float]]:
     """Return the sessions that are tied to the first of those left, by the best evidence first (Prim).
 
-    For each, return the one before it in the tree, its pose in the frame of that one, and the log odds of the two.
+    Also return for each its parent in the tree, its pose (4, 4) in the frame of the parent, and the log odds of this tie.
     """
     order, starts, odds = [left[0]], [(left[0], np.eye(4))], [np.nan]
     while True:
@@ -132,7 +134,7 @@ def _items(objects: ObjectMap) -> list[MapObject]:
 
 
 def _matched(tracks: list[Track], solved: JointFrames, items: list[MapObject], start: Floats) -> list[tuple[int, int]]:
-    """Return for each object of a session that a track has its index and the track, at the pose `start` (4, 4)."""
+    """Return the pairs of an object of a session and its track, as indices. start: (4, 4) the pose of the session."""
     positions = np.array([o.position for o in items]).reshape(-1, 3) @ start[:3, :3].T + start[:3, 3]
     spread = np.array([o.covariance for o in items]).reshape(-1, 3, 3)
     turned = start[:3, :3] @ spread @ start[:3, :3].T
@@ -155,7 +157,7 @@ def _live(
     rows: list[tuple[int, int, MapObject]],
     solved: JointFrames,
 ) -> list[int]:
-    """Let the tracks live through the sessions in the order of time. Return those that are not another one that moved."""
+    """Let the tracks live through the sessions in the order of time. Return the tracks that are left after `_follow`."""
     begun: list[int] = []
     for turn, number in enumerate(sorted(range(len(order)), key=order.__getitem__)):
         session = sessions[order[number]]
@@ -185,7 +187,8 @@ def _live(
 
 
 def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
-    """Give the tracks that a site also has the lives that both say together."""
+    """Join the lives of the objects that the tracks begun so far and a site both have. here: the site's objects, by
+    track."""
     for at in begun:
         old, new = tracks[at].life, here[at].life if at in here else None
         if old is not None and new is not None:
@@ -195,7 +198,7 @@ def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject
 def _visit(
     tracks: list[Track], some: list[int], here: dict[int, MapObject], session: Session, positions: Floats, back: Floats
 ) -> None:
-    """Let some tracks live through one session. here: the objects that it found, by track. back: session_T_site."""
+    """Let some tracks live through one session. here: the objects that the session found, by track. back: session_T_site."""
     looks = session.looks(tuple(tracks[at].item for at in some), positions[some], back)
     found = np.array([at in here for at in some], dtype=bool)
     lives = after_session([tracks[at] for at in some], found, looks, [here.get(at) for at in some], session.when)
@@ -204,7 +207,10 @@ def _visit(
 
 
 def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) -> MapObject:
-    """Return an object of a session as the site has it: seen from the sides of this session, and of those before."""
+    """Return an object of a session as the site has it: seen from the sides of this session, and of the sessions before.
+
+    before: the same object after the sessions before, None if they did not see it.
+    """
     seen = item.seen_from
     if seen is not None:
         seen = replace(seen, sides=seen.sides @ site_T_session[:3, :3].T)
@@ -215,9 +221,10 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Give an object that moved the number of the one that is gone. Return the tracks that are left.
+    """Give an object that moved the number of the one that is gone. Return the tracks without those that are gone this way.
 
-    came: the tracks that a later site brought. However often it saw them, they are new to the sessions before.
+    begun: the tracks so far. came: the tracks that a later site brought. However often the site saw them, they are new to
+    the sessions before.
     """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}
     old = [at for at, life in lives.items() if life.state == "gone"]
@@ -238,14 +245,18 @@ def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequ
 
 
 def _later(young: Track, old: Track) -> bool:
-    """Return whether one object was seen first after the other was seen last, by the sessions or by the stamps of a site."""
+    """Return whether `young` was first seen after `old` was last seen. Sessions decide, and in the first session the
+    stamps."""
     return young.begun > old.met or (young.begun == old.met == 0 and young.since > old.item.last_seen)
 
 
 def _objects(
     tracks: list[Track], alive: list[int], rows: list[tuple[int, int, MapObject]], solved: JointFrames
 ) -> tuple[ObjectMap, dict[int, int]]:
-    """Return the map of the tracks, and the track of each id. Objects that are gone are apart, or forgotten."""
+    """Return the map of the tracks, and the track of each id. The map lists objects that are gone apart.
+
+    It leaves out objects whose probability is below `FORGOTTEN`.
+    """
     free = max((t.number for t in tracks if t.number is not None), default=-1) + 1
     there, gone = [], []
     used: dict[int, int] = {}
@@ -262,6 +273,8 @@ def _objects(
             position=solved.positions[at],
             covariance=_at_least_the_best(solved, at, of),
             labels=_labels([o for _, _, o in of]),
+            body=_surest_body(solved, of),
+            ray_point=None,
             first_seen=min(o.first_seen for _, _, o in of),
             last_seen=max(o.last_seen for _, _, o in of),
             life=track.life,
@@ -276,13 +289,22 @@ def _objects(
 
 
 def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, MapObject]]) -> Floats:
-    """Return the covariance of an object, but no smaller one than that of the session that knew it best.
+    """Return the covariance (3, 3) of an object, but no smaller one than that of the session that knew it best.
 
     The errors of its boxes repeat from session to session, so that many sessions do not average them out.
     """
     best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
     rotation = solved.site_T_map[best[1], :3, :3]
     return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
+
+
+def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> Body | None:
+    """Return the body whose size is known best, with its yaw in the frame of the site. None if no session has one."""
+    best: Body | None = None
+    for n, _, o in of:
+        if o.body is not None:
+            best = surer_body(best, turned(o.body, solved.site_T_map[n, :3, :3]))
+    return best
 
 
 def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:

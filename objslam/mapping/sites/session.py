@@ -26,9 +26,9 @@ take the wrong frame of a fast camera."""
 
 @dataclass(frozen=True)
 class Session:
-    """A map in a frame of its own. name: how messages call it. views, rays: what a result folder says of its drive, None for
-    a map alone, which does not say what was in view. visits: returns the sessions of a site, in the order of time; none
-    where the site does not say, and its sessions then count no miss."""
+    """A map in a frame of its own. name: how messages call it. views, rays: the camera frames and the rays of its drive,
+    None for a map without a result folder, which does not say what was in view. visits: a function that returns the sessions
+    of a site, in the order of time. If it returns none, the sessions of the site count no miss."""
 
     name: str
     objects: ObjectMap
@@ -47,7 +47,7 @@ class Session:
 
     @property
     def when(self) -> float:
-        """The time of the session, s: that of its last update for a site, else that of its last sight of an object."""
+        """The time of the session, s: the last update of a site, or the last time at which a session saw an object."""
         lives = [o.life.updated for o in (*self.objects, *self.objects.gone) if o.life is not None]
         seen = lives or [o.last_seen for o in self.objects if np.isfinite(o.last_seen)]
         return max(seen, default=0.0)
@@ -55,9 +55,8 @@ class Session:
     def looks(self, objects: tuple[MapObject, ...], positions: Floats, session_T_map: Floats) -> Ints:
         """Return in how many frames (N,) each object should have been detected if it was at positions (N, 3), m.
 
-        Objects and positions are in a map in which session_T_map (4, 4) is the inverse of the pose of this session. Objects
-        of which nobody knows from where they were detected have no look. No object has one if the session does not know its
-        views.
+        session_T_map: (4, 4) takes points from the frame of the objects and positions to the frame of this session. The
+        result is 0 for an object without `seen_from`, and for all objects if the session does not know its views.
         """
         looks = np.zeros(len(objects), dtype=np.int64)
         known = np.array([o.seen_from is not None for o in objects], dtype=bool)
@@ -86,7 +85,10 @@ class Visit:
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:
-    """Return the boxes of all frames in the order of the frames, and how far (R,) their objects are, NaN where unknown."""
+    """Return the boxes of all frames in the order of the frames, and the distance (R,) m of each box's object.
+
+    The distance is NaN where unknown. Boxes without a camera frame are left out.
+    """
     frame = np.full(len(rays), -1, dtype=np.int64)
     for number, camera in enumerate(views.cameras):
         mine, own = np.flatnonzero(rays.camera == camera.name), np.flatnonzero(views.camera == number)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.geometry import make_pose, quaternion
+from objslam.core.geometry import lift_se2, make_pose, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
 from objslam.output.plot.style import captions, ellipsoid, label_colours
@@ -71,8 +71,8 @@ class MapMessages:
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
         """Make a vision_msgs/Detection3DArray with the labels, positions and covariances of objects.
 
-        The score of a label is its share of the object's boxes. The depth of a 3D box equals its width. A 3D box of unknown
-        size has size 0.
+        The score of a label is its share of the object's boxes. The 3D box is that of the body, turned by its yaw. Without a
+        body, the depth of a 3D box equals its width. A 3D box of unknown size has size 0.
         """
         return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 
@@ -85,8 +85,9 @@ class MapMessages:
         shares = {printable(label): share for label, share in (o.labels or {o.label: 1.0}).items()}
         hypotheses = [self.make("vision_msgs/ObjectHypothesis", *pair) for pair in shares.items()]
         results = [self.make("vision_msgs/ObjectHypothesisWithPose", part, with_covariance) for part in hypotheses]
-        width, height = o.extent or (0.0, 0.0)
-        box = self.make("vision_msgs/BoundingBox3D", pose, self._vector("Vector3", np.array([width, width, height])))
+        turn, size = _upright(o)
+        at = self.pose(make_pose(turn, o.position))
+        box = self.make("vision_msgs/BoundingBox3D", at, self._vector("Vector3", size))
         return self.make("vision_msgs/Detection3D", self.header(stamp), results, box, str(o.id))
 
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
@@ -102,8 +103,9 @@ class MapMessages:
             if o.status != "ok":
                 continue
             colour = colours[o.label]
-            size = np.maximum([o.extent[0], o.extent[0], o.extent[1]] if o.extent else np.zeros(3), _MIN_SIZE)
-            at = make_pose(np.eye(3), o.position)
+            turn, size = _upright(o)
+            size = np.maximum(size, _MIN_SIZE)
+            at = make_pose(turn, o.position)
             above = make_pose(np.eye(3), o.position + np.array([0.0, 0.0, size[2] / 2 + _TEXT_SIZE]))
             made.append(self._marker(stamp, "objects", number, at, size, (*colour, 0.9)))
             made.append(self._marker(stamp, "labels", number, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
@@ -158,3 +160,11 @@ def typestore() -> Typestore:
     known = get_types_from_msg(VISION_MSGS_3D, "vision_msgs/msg/Detection3DArray")
     store.register({name: fields for name, fields in known.items() if name not in store.fielddefs})
     return store
+
+
+def _upright(o: MapObject) -> tuple[Floats, Floats]:
+    """Return the rotation (3, 3) and the size (3,), m, of the box of an object."""
+    if o.body is None:
+        width, height = o.extent or (0.0, 0.0)
+        return np.eye(3), np.array([width, width, height])
+    return lift_se2(np.array([0.0, 0.0, o.body.yaw]))[:3, :3], o.body.size

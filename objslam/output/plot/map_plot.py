@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.bodies.body import Body
+from objslam.core.bodies.upright_box import footprint
 from objslam.core.object_map import MapObject
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
@@ -142,6 +144,8 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
         rim = _ellipse(o, plane)
         if rim is not None:
             below.append(Area(rim, colour, 0.18))
+        if o.body is not None and plane == [0, 1]:  # A body stands along z.
+            below.append(Line(_footprint(o, o.body), colour, _PATH))
     return below, dots
 
 
@@ -151,6 +155,8 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
     entries: list[Line | Marks] = []
     if resolved:
         entries.append(Marks(nowhere, "dot", _NEUTRAL, _WHITE, _DOT, "objects, 2 sigma"))
+    if any(o.body is not None for o in result.map):
+        entries.append(Line(nowhere, _NEUTRAL, _PATH, "their bodies"))
     if resolved < len(result.map):
         entries.append(Marks(nowhere, "dot", _WHITE, _NEUTRAL, _DOT - 1, "unresolved"))
     return tuple(entries)
@@ -164,6 +170,17 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
     turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
     values, vectors = np.linalg.eigh(o.covariance[np.ix_(plane, plane)])
     return o.position[plane] + 2 * ((vectors * np.sqrt(np.maximum(values, 0))) @ np.stack([np.cos(turn), np.sin(turn)])).T
+
+
+def _footprint(o: MapObject, body: Body) -> Floats:
+    """Return the closed outline (n, 2), m, of a body seen from above."""
+    if body.shape == "cuboid":
+        corners = footprint((o.position, body.size, body.yaw))
+        return np.concatenate([corners, corners[:1]])
+    turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS)
+    cos, sin = np.cos(body.yaw), np.sin(body.yaw)
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * body.size[:2] / 2
+    return np.asarray(o.position[:2] + rim @ np.array([[cos, sin], [-sin, cos]]))
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:

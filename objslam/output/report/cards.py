@@ -17,13 +17,17 @@ from objslam.output.report.scene import hexadecimal
 from objslam.output.report.sketch import Sketch, sketch
 from objslam.output.report.timeline import Timeline, timeline
 
-_BINS = 16  # The histogram of an object has this many bars.
+_BINS = 16  # The number of bars in the histogram of an object. More bars show more detail, and each has fewer rays.
 _NEIGHBOURS = 2  # A card names this many of the nearest objects of the label. More say little about duplicates.
 
 
 @dataclass(frozen=True)
 class Neighbour:
-    """Another object of the same label. sigmas: the distance in standard deviations of the difference of the two places."""
+    """A resolved object with the same label as the object of a card.
+
+    distance: between the two objects, m. sigmas: the same difference as a Mahalanobis distance, with the sum of the two
+    covariances. None if a covariance is unknown.
+    """
 
     object: MapObject
     caption: str
@@ -41,7 +45,7 @@ class Card:
     sigma: list[float] | None  # The standard deviations along x, y and z, m.
     seen: tuple[float, float]  # The times of the first and the last observation, s since the first ray.
     rejected: int  # The number of rejected rays.
-    promised_deg: float | None  # The rms that the noise of the boxes promises, deg; None without used rays.
+    promised_deg: float | None  # The rms that the sigmas of the used rays predict, deg; None without used rays.
     error: float | None  # The distance from the matching true object, m; None without a match.
     matched: str | None  # A text that names the matching true object.
     histogram: Histogram | None
@@ -59,9 +63,11 @@ def make_cards(
     path: Floats,
     up: Up,
 ) -> list[Card]:
-    """Return the cards, sorted by label. Their times count from the first ray, s.
+    """Return the cards, sorted by label and id. The times on a card count from the first ray of the result, s.
 
-    crops, errors: by the id of the object. path: (K, 3) positions of the robot, m in map. up: the axis that points up.
+    rays: all rays of the result. crops: the pictures by the id of the object. errors: by the same id, the distance from the
+    matching true object, m, and a text that names this object. path: (K, 3) positions of the robot, m in map. up: the axis
+    of the map that points up.
     """
     begin, end = (float(rays.stamp.min()), float(rays.stamp.max())) if len(rays) else (0.0, 0.0)
     residual_deg = np.degrees(rays.residual)
@@ -104,7 +110,10 @@ def make_cards(
 
 
 def _neighbours(objects: ObjectMap, names: list[str], i: int) -> list[Neighbour]:
-    """Return the nearest resolved objects of the same label as a resolved object."""
+    """Return up to `_NEIGHBOURS` resolved objects with the label of object i, the nearest first. An unresolved i has none.
+
+    names: the caption of each object.
+    """
     o = objects[i]
     if o.status != "ok":
         return []

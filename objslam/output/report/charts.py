@@ -24,7 +24,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Histogram:
-    """A histogram with its axes; the last bar includes the rays beyond the end of the axis."""
+    """A histogram with its axes, in units of the SVG drawing. The last bar includes the rays beyond the end of the axis."""
 
     bars: tuple[Bar, ...]
     ticks: tuple[tuple[float, str], ...]  # Position and text of each tick below the bars.
@@ -38,7 +38,8 @@ def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = N
 
     Args:
         weight: (R,) robust weights. A ray with a weight below `REJECTED_BELOW` is rejected.
-        top: the end of the axis, deg. The default is a round number above nearly all residuals of used rays.
+        bins: the number of bars.
+        top: the end of the axis, deg. The default is the `axis_end` of the used rays, or of all rays if none is used.
     """
     known = np.isfinite(residual)
     residual, used = residual[known], weight[known] >= REJECTED_BELOW
@@ -63,7 +64,7 @@ def histogram(residual: Floats, weight: Floats, bins: int, top: float | None = N
 
 
 def axis_end(residual: Floats) -> float:
-    """Return a round number, deg, above nearly all residuals (R,), deg."""
+    """Return a round number at or above the 98 % quantile of residuals (R,), in the unit of the residuals."""
     most = max(float(np.quantile(residual, 0.98)), 1e-6)
     power = 10.0 ** np.floor(np.log10(most))
     return float(power * _ENDS[np.searchsorted(_ENDS, most / power - 1e-9)])

@@ -1,4 +1,4 @@
-"""Pictures of an object: crops of its best boxes from the images of the log."""
+"""Pictures of the page: crops of chosen boxes, cut from the images of the log."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from objslam.io.text import read_bytes
 from objslam.output.plot.style import REJECTED_BELOW, evenly
 from objslam.sources import SourceOptions, read
 
-_SIDE = 160  # The longer side of a crop on the page has this length, px.
+_SIDE = 160  # The longer side of a crop on the page, px. A larger value shows more detail, and makes the page larger.
 _MARGIN = 0.2  # A crop has a margin on each side of the box. The margin is this share of the box's longer side.
 _MIN_SIDE = 40  # A crop covers at least this length of the image, px.
 _FRAME, _REJECTED_FRAME = (60, 190, 255), (60, 60, 235)
@@ -37,7 +37,7 @@ class Crop:
     score: float  # The score of the box.
     camera: str
     residual_deg: float  # The angle between the ray and its object, NaN without an object.
-    kind: Kind
+    kind: Kind  # Why the box was chosen. "unexplained": its ray belongs to no object.
 
 
 def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str | None]:
@@ -71,7 +71,7 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
     """Choose at most `count` of the best used rays of an object, and return their indices.
 
     The used rays are split into `count` parts in the order of time. The best ray of each part has the highest score. If
-    scores are equal, it has the largest box.
+    scores are equal, the largest box decides.
 
     Args:
         mine: (M,) the indices of the object's rays, in the order of time.
@@ -83,9 +83,11 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 
 
 def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
-    """Choose rays of an object for its pictures: `count` of the best, and half as many each of the worst and the rejected.
+    """Return the indices of the rays for the pictures of an object, each with its kind.
 
-    The worst used rays have the largest residuals, in sigmas. mine: as in `best_rays`.
+    These are up to `count` of the best, and up to half as many, rounded up, of the worst and of the rejected. The worst are
+    the other used rays with the largest residuals, in sigmas. The rejected rays are chosen at even steps. mine: as in
+    `best_rays`.
     """
     found: dict[int, Kind] = dict.fromkeys(best_rays(rays, mine, count).tolist(), "best")
     few = (count + 1) // 2 if count else 0
@@ -97,7 +99,10 @@ def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
 
 
 def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kind]:
-    """Choose rays of a label that belong to no object: those with the highest score of each part of the time."""
+    """Return the indices of up to `count` rays of a label that belong to no object.
+
+    The rays are split into `count` parts in the order of time. Each part gives its ray with the highest score.
+    """
     mine = np.flatnonzero((rays.object < 0) & (rays.label == label))
     most = min(count, len(mine))
     parts = np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], most) if most else []
@@ -109,7 +114,8 @@ def cut_crops(
 ) -> dict[int, Crop]:
     """Return a crop for each ray whose index is in `chosen`, by this index.
 
-    A ray has no crop if no readable image belongs to its stamp, or if its box is outside the image.
+    A ray has no crop if there is no readable image within `MAX_IMAGE_LAG` of its stamp, or if its box is outside the image.
+    progress: is called with the number of image files that are done, and the number of all.
     """
     by_file: dict[Path, list[int]] = {}
     for ray in chosen:

@@ -28,8 +28,8 @@ from objslam.output.report.trends import trends
 from objslam.results.files import CONFIG, PICTURE, REPORT
 from objslam.results.read import load_evaluation, load_map, load_path, load_rays, load_summary, load_truth
 
-_BINS = 32  # The histogram of all rays has this many bars.
-_LABELS = 12  # Of so many labels, the page shows boxes that belong to no object. More would be a list that nobody reads.
+_BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
+_LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -56,7 +56,8 @@ def write_report(
 
     Args:
         log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
-        crops: the number of pictures per object.
+        crops: the most pictures of the best boxes of an object, 0 for no pictures. The worst and the rejected boxes of an
+            object get half as many each. The boxes of no object get `crops` for each label.
         progress: is called with the stage, the steps done and the total number of steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
@@ -138,14 +139,17 @@ def write_report(
 
 
 def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
-    """Return the labels with the most boxes of no object, the most first, and the rays for their pictures."""
+    """Return the labels with the most boxes of no object, in falling order, each with the rays for its pictures."""
     labels, counts = np.unique(rays.label[rays.object < 0].astype(str), return_counts=True)
     most = labels[np.argsort(-counts, kind="stable")][:_LABELS]
     return {str(label): choose_unexplained(rays, str(label), crops) for label in most}
 
 
 def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
-    """Return the images of each camera with the stamps that the run gave them, if it estimated the offset of their clock."""
+    """Return the images of each camera with corrected stamps: the clock offset that the run estimated is added.
+
+    images: by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
+    """
     found = calibration["parameters"] if calibration else {}
     clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}
     return {name: replace(listed, stamps=listed.stamps + clock[name]) for name, listed in images.items()}
@@ -154,8 +158,8 @@ def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None)
 def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
     """Return the error, m, and the match, as text, of each matched object by id. Return also the content of evaluation.json.
 
-    If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default.
-    Without a ground truth, there are no errors, and the content is None.
+    If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default. If
+    there is no ground truth either, there are no errors, and the content is None.
     """
     scores = load_evaluation(out)
     if scores is None:

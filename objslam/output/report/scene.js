@@ -30,7 +30,7 @@
               h / 2 - scale * (a * up[0] + b * up[1] + c * up[2]), depth];
     };
     const near = () => 0.02 * view.distance;
-    // Look from a direction, from so far that the objects and the path fill the view. Far objects are left out.
+    // Look from a direction, so far away that objects and path fill the view. Those outside low and high do not count.
     const inside = p => p.every((x, i) => x >= data.low[i] - 1e-3 && x <= data.high[i] + 1e-3);
     const whole = [...objects.map(o => o.at), ...Array.from({length: path.length / 3}, (_, i) => [...path.subarray(3 * i, 3 * i + 3)])]
       .filter(inside);
@@ -64,7 +64,7 @@
       pen.stroke(); pen.setLineDash([]);
     };
     const drawFloor = () => {
-      // A grid of a round size below everything. Its lines are as far apart as the scale on the page says.
+      // A grid below everything. Returns the distance of its lines, m, which is a round number.
       const step = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500].find(s => size / s < 16) ?? size / 10;
       const low = data.low.map(x => Math.floor(x / step - 1) * step), high = data.high.map(x => Math.ceil(x / step + 1) * step);
       const z = data.low[2];
@@ -91,7 +91,7 @@
       stroke(i => i < data.used && data.of[i] === focus, theme.used, 1.2, 0.85);
       stroke(i => i >= data.used && data.of[i] === focus, theme.rejected, 1.2, 0.9);
     };
-    // In the dark, colours that were chosen for white paper are mixed with white.
+    // In dark mode, the colours are mixed with white, because they were chosen for white paper.
     const shade = hex => {
       const parts = [1, 3, 5].map(i => parseInt(hex.slice(i, i + 2), 16));
       return `rgb(${parts.map(x => Math.round(theme.dark ? x + 0.45 * (255 - x) : x)).join(" ")})`;
@@ -117,7 +117,7 @@
       if (shows("ellipsoids")) for (const {o, p} of seen) if (o.ok && o.axes.length) outline(o, p);
       for (const {o, p} of seen) {
         const big = o.id === chosen || o.id === hovered;
-        // A stem down to the floor tells the height and the place.
+        // A stem down to the floor shows the height and the position.
         pen.beginPath(); pen.strokeStyle = theme.faint; pen.globalAlpha = 0.5; pen.lineWidth = 1;
         segment(p, project(o.at[0], o.at[1], data.low[2])); pen.stroke(); pen.globalAlpha = 1;
         pen.beginPath(); pen.arc(p[0], p[1], big ? 7 : 5, 0, 7);
@@ -135,7 +135,8 @@
       return seen;
     };
     const drawLabels = seen => {
-      // The nearest objects are named first. A label that would cover another one is left out, save that of the chosen object.
+      // The chosen object and the one under the pointer are named first, then the others from near to far. A name of the
+      // others is left out if it would cover another name.
       const taken = [], first = ({o}) => (o.id === chosen || o.id === hovered ? 0 : 1);
       pen.font = "12px system-ui, sans-serif"; pen.textBaseline = "middle"; pen.lineJoin = "round";
       for (const {o, p} of [...seen].sort((a, b) => first(a) - first(b) || a.p[2] - b.p[2])) {

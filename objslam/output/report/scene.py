@@ -13,7 +13,7 @@ from objslam.io.rays_parquet import RaysTable
 from objslam.output.plot.style import REJECTED_BELOW, captions, ellipsoid, evenly, frame_objects, label_colours, sample
 
 _MAX_USED, _MAX_REJECTED = 1500, 300
-"""The most rays of each kind. More rays make the page larger and the view slower, and hide the objects."""
+"""The most used and the most rejected rays in the view. More make the page larger and the view slower, and hide objects."""
 _MAX_PATH = 1000  # The most poses of a path. More make the page larger, and nobody sees the difference.
 
 
@@ -23,8 +23,9 @@ def upright(up: Up) -> Floats:
 
 
 def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Truth | None, up: Up) -> dict[str, Any]:
-    """Return the data as JSON values. Positions are in the frame of the view, m. Arrays are float32 in base64.
+    """Return the data as JSON values. Positions are in the frame of the view, m.
 
+    The rays, the path and the true path are float32 arrays in base64. "axes" are the map's axes in the frame of the view.
     truth: the ground truth in the frame of the map. up: the axis of the map that points up.
     """
     turn = upright(up)
@@ -61,7 +62,10 @@ def hexadecimal(colour: tuple[float, float, float]) -> str:
 
 
 def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
-    """Return the half axes of an object's 2-sigma ellipsoid as vectors, m, none where it has no covariance."""
+    """Return the half axes of the 2-sigma ellipsoid of object i, as vectors in the frame of the view, m.
+
+    There are none if the object has no covariance. turn: the rotation of `upright`.
+    """
     found = ellipsoid(objects[i])
     return [] if found is None else (turn @ (found[1] * found[0])).T.round(4).tolist()
 
@@ -74,7 +78,10 @@ def _thinned(truth: Truth | None, turn: Floats) -> Floats:
 
 
 def _rays(objects: ObjectMap, rays: RaysTable, turn: Floats) -> dict[str, Any]:
-    """Return the rays of objects: both ends (6 numbers), the object's id, and how many of them, the first, are used."""
+    """Return the rays that the view draws, the used ones first. turn: the rotation of `upright`.
+
+    rays: both ends of each ray (6 numbers), m. of: the id of the object of each ray. used: the number of used rays.
+    """
     row = {o.id: i for i, o in enumerate(objects)}
     index = np.array([row.get(int(j), -1) for j in rays.object], dtype=np.int64)
     used = (index >= 0) & (rays.weight >= REJECTED_BELOW)

@@ -9,9 +9,9 @@ from objslam.output.plot.style import evenly
 
 WIDTH, HEIGHT = 160.0, 100.0  # The area of a sketch, in units of the drawing.
 _MARGIN = 8.0  # The width of the margin around what is drawn, in units of the drawing.
-_MOST = 40  # The most rays of each kind. More rays would merge into one area.
+_MOST = 40  # The most used and the most rejected rays in a sketch. More rays would merge into one area.
 _BAR = 0.3  # The longest scale bar is this share of the width.
-_ELLIPSE = np.stack([np.cos(t := np.linspace(0, 2 * np.pi, 40, endpoint=False)), np.sin(t)])
+_ELLIPSE = np.stack([np.cos(t := np.linspace(0, 2 * np.pi, 40, endpoint=False)), np.sin(t)])  # A unit circle.
 _STEPS = (5.0, 2.0, 1.0)  # A scale bar is one of these numbers times a power of ten, m.
 
 
@@ -19,8 +19,9 @@ _STEPS = (5.0, 2.0, 1.0)  # A scale bar is one of these numbers times a power of
 class Sketch:
     """The rays of an object from above, in units of the drawing.
 
-    used, rejected, path, ellipse: SVG path data. dot: the place of the object. others: the places of the other objects of
-    its label. bar: the length of the scale bar. metres: what it stands for, as text.
+    used, rejected, path, ellipse: SVG path data. The ellipse is that of 2 sigma, and empty without a covariance. dot: the
+    position of the object. others: the positions of the other objects of its label. bar: the length of the scale bar.
+    metres: the length in the map that the bar stands for, as text.
     """
 
     used: str
@@ -42,11 +43,11 @@ def sketch(
     path: Floats,
     others: Floats,
 ) -> Sketch | None:
-    """Return the sketch of an object; None without a position or without rays. All positions are from above, m.
+    """Return the sketch of an object; None without a position or without rays. Positions are in a plane seen from above, m.
 
     Args:
-        origins, directions: (M, 2) of the rays; the part of a unit direction in the plane.
-        used: (M,) whether a ray counts.
+        origins, directions: (M, 2) of the rays. A direction is the part of the unit vector in the plane.
+        used: (M,) whether a ray is used. The others are rejected.
         position: (2,) of the object. covariance: (2, 2), m^2.
         path: (K, 2) of the robot.
         others: (N, 2) of the other objects of the label.
@@ -94,6 +95,6 @@ def sketch(
 
 
 def _polyline(points: Floats) -> str:
-    """Return a path through points (N, 2). Those far outside the drawing are moved to its surroundings, and cut there."""
+    """Return SVG path data through points (N, 2). A point far outside the drawing is moved nearer, but stays outside."""
     near = np.clip(points, -WIDTH, 2 * WIDTH)
     return "".join(f"{'L' if i else 'M'}{x:.1f} {y:.1f}" for i, (x, y) in enumerate(near.tolist()))

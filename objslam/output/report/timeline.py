@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 
-_BINS = 150  # The number of bars of a timeline. Larger shows shorter sightings, and makes the page larger.
+_BINS = 150  # The number of bars of a timeline. A larger number shows shorter sightings, and makes the page larger.
 WIDTH, HEIGHT = 150.0, 12.0  # The area of the bars, in units of the drawing.
 
 
@@ -19,9 +19,10 @@ class Timeline:
 
 
 def timeline(stamps: Floats, used: Bools, begin: float, end: float) -> Timeline:
-    """Return the timeline of rays at stamps (M,), s, between the first and the last stamp of the drive.
+    """Return the timeline of an object's rays at stamps (M,), s.
 
-    The height of a bar grows with the root of the number of its rays. Rejected rays stand on top of the used rays.
+    used: (M,) whether a ray is used. begin, end: the stamps of the first and the last ray of the result, s. The height of a
+    bar grows with the square root of the number of its rays. Rejected rays stand on top of the used rays.
     """
     place = (stamps - begin) / max(end - begin, 1e-9)
     index = np.clip((place * _BINS).astype(int), 0, _BINS - 1)
@@ -33,6 +34,6 @@ def timeline(stamps: Floats, used: Bools, begin: float, end: float) -> Timeline:
 
 
 def _bars(bottom: Floats, height: Floats) -> str:
-    """Return a path of bars. bottom, height: (_BINS,) where each bar begins, and how far it goes up."""
+    """Return bars as SVG path data. bottom: (_BINS,) the y, downwards, of the lower edges. height: (_BINS,)."""
     rows = np.flatnonzero(height > 0).tolist()
     return "".join(f"M{i} {bottom[i]:.1f}v{-height[i]:.1f}h1v{height[i]:.1f}z" for i in rows)

@@ -30,9 +30,11 @@ class Point:
 
 @dataclass(frozen=True)
 class Trend:
-    """Curves of the median residual. `curves` has the points of `before` (empty if unknown) and `after` the calibration.
+    """Curves of the median residual. `curves` has the name and the points of each curve.
 
-    below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart in degrees.
+    `before` is the curve with the shared errors left in, and it is missing if that is unknown. `after` is the curve with the
+    shared errors taken out. below, beside: position and text of each tick. level: the height of `_HONEST`, None for a chart
+    in degrees.
     """
 
     title: str

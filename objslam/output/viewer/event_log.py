@@ -21,6 +21,7 @@ _WHY = {
     "labels": "one object assumed for each label",
     "association": "association at the latest poses",
     "merge": "merge of objects that the new poses move together",
+    "bodies": "bearings to the centres of bodies",
 }
 """The words that the log shows for the reason of each round."""
 _COUNTS = {

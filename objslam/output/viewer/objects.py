@@ -6,6 +6,8 @@ import numpy as np
 import rerun as rr
 
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body import Body
+from objslam.core.geometry import lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Truth
@@ -14,6 +16,7 @@ from objslam.output.plot.style import captions, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
 _MAX_LABELS = 60  # Labels are hidden at first if the map has more objects than this. More labels would overlap.
+_OPACITY = 90  # The opacity of bodies, 0 to 255. More opaque bodies hide the points and ellipsoids inside them.
 _TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # The RGB colours are black, white, grey.
 
 
@@ -23,9 +26,10 @@ def colours(objects: ObjectMap) -> list[tuple[int, int, int]]:
 
 
 def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path: Floats, *, static: bool = True) -> None:
-    """Log the resolved objects as points, `map/objects`, and four entities below it.
+    """Log the resolved objects as points, `map/objects`, and six entities below it.
 
-    `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `unresolved` has the
+    `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `bodies` has
+    filled ellipsoids, and `cuboids` has boxes, of objects with a body. `unresolved` has the
     ray of each unresolved object. `labels` has the captions of all objects.
 
     Args:
@@ -53,7 +57,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
         line_radii=rr.Radius.ui_points(0.6),
     )
     log("/uncertainty", bodies, bool(shapes))
-    sized = [(i, every[i].extent) for i in resolved if every[i].extent is not None]
+    sized = [(i, every[i].extent) for i in resolved if every[i].extent is not None and every[i].body is None]
     boxes = rr.Boxes3D(
         centers=[every[i].position for i, _ in sized],
         half_sizes=[[e[0] / 2, e[0] / 2, e[1] / 2] for _, e in sized if e is not None],
@@ -61,6 +65,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
         radii=rr.Radius.ui_points(0.8),
     )
     log("/extent", boxes, bool(sized))
+    _log_bodies(log, [(o.position, o.body, colour[i]) for i, o in enumerate(every) if o.body is not None])
     named = [i for i, o in enumerate(every) if np.isfinite(o.position).all()]
     unresolved = [(i, (ray[0], every[i].position)) for i in named if (ray := every[i].ray) is not None]
     ways = [way for _, way in unresolved]
@@ -75,6 +80,23 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     log("/labels", names, bool(named))
     lines = rr.LineStrips3D(np.stack([places, ends], axis=1), colors=[_LEADER], radii=rr.Radius.ui_points(0.4))
     log("/labels/lines", lines, bool(named) and shown)
+
+
+def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]]) -> None:
+    """Log bodies at places: filled ellipsoids and cuboids, so that they differ from the lines of the 2-sigma ellipsoids."""
+    for name, kind, some in (
+        ("/bodies", rr.Ellipsoids3D, [one for one in bodies if one[1].shape != "cuboid"]),
+        ("/cuboids", rr.Boxes3D, [one for one in bodies if one[1].shape == "cuboid"]),
+    ):
+        turns = lift_se2(np.array([[0.0, 0.0, body.yaw] for _, body, _ in some]).reshape(-1, 3))[:, :3, :3]
+        shapes = kind(
+            centers=[place for place, _, _ in some],
+            half_sizes=[body.size / 2 for _, body, _ in some],
+            quaternions=quaternion_from_rotation(turns) if some else [],
+            colors=[(*colour, _OPACITY) for _, _, colour in some],
+            fill_mode="solid",
+        )
+        log(name, shapes, bool(some))
 
 
 def log_truth(recording: Any, truth: Truth) -> None:

@@ -28,7 +28,10 @@ _DEPTH_HEADER = 12  # The size of the header before the PNG in a compressed dept
 
 
 def colour_image(message: Any) -> NDArray[Any]:
-    """Return the pixels (H, W, 3), uint8, BGR, of an image message. Raises DecodeError for malformed data or depth."""
+    """Return the pixels (H, W, 3), uint8, BGR, of an image message.
+
+    Raises DecodeError if the data are malformed, or if they are depth as float or compressed.
+    """
     if (packing := _packing(message)) is not None:
         if "compresseddepth" in packing:
             raise DecodeError(f"not a colour image but depth of the format {message.format[:40]!r}")

@@ -51,11 +51,14 @@ def test_csv_holds_every_number(result, tmp_path):
 def test_geojson_is_what_the_rfc_asks_for(result, tmp_path, datum):
     data = json.loads(write_export(result, "geojson", tmp_path / "x.geojson", datum).read_text())
     jsonschema.Draft202012Validator(SCHEMA).validate(data)
-    *found, path = data["features"]
+    kinds = ("object", "path", "footprint")
+    found, (path,), prints = ([f for f in data["features"] if f["properties"]["kind"] == kind] for kind in kinds)
     objects, trajectory = load_map(result).objects, load_trajectory(result)
     assert [f["id"] for f in found] == [o.id for o in objects]
     assert [f["properties"]["label"] for f in found] == [o.label for o in objects]
     assert [f["geometry"] is None for f in found] == [o.status != "ok" for o in objects]
+    assert [f["properties"]["object"] for f in prints] == [o.id for o in objects if o.body is not None and o.status == "ok"]
+    assert all(f["geometry"]["coordinates"][0][0] == f["geometry"]["coordinates"][0][-1] for f in prints)
     assert len(path["geometry"]["coordinates"]) == len(trajectory)
     if datum is None:
         assert data["coordinates_in"] == "metres in the frame map"
@@ -174,7 +177,7 @@ def test_a_fixed_run_says_why_it_has_no_edges(tmp_path):
 def test_a_file_goes_into_the_result_and_leaves_with_it(mapped, result, tmp_path):
     copy = Path(shutil.copytree(result, tmp_path / "out"))
     written = {write_export(copy, to).name for to in FORMATS}
-    write_result(mapped, copy)  # what was exported of an older run would be taken for this one's
+    write_result(mapped, copy)  # An export of an older run would be taken for one of this run.
     assert not written & {file.name for file in copy.iterdir()}
 
 

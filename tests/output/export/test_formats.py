@@ -34,7 +34,7 @@ def test_each_format_has_a_name_a_file_and_a_line_of_help_of_its_own() -> None:
 
 
 def test_a_new_format_is_one_new_file(result: Path, tmp_path: Path) -> None:
-    """It is offered, told in the help, written, and removed by the next run."""
+    """The format is offered, described in the help, written, and removed by the next run."""
     package, out = tmp_path / "objslam", tmp_path / "out"
     shutil.copytree(Path(objslam.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__", "models"))
     shutil.copytree(result, out)

@@ -72,7 +72,8 @@ def test_the_objects(messages, result):
     for detection, o in zip(message.detections, shown, strict=True):
         place = detection.bbox.center.position
         assert [place.x, place.y, place.z] == o.position.tolist()
-        assert detection.bbox.size.z == (o.extent[1] if o.extent else 0.0)
+        height = o.body.size[2] if o.body else o.extent[1] if o.extent else 0.0
+        assert detection.bbox.size.z == height
         hypothesis = detection.results[0]
         assert hypothesis.hypothesis.class_id == next(iter(o.labels)) if o.labels else o.label
         covariance = np.asarray(hypothesis.pose.covariance).reshape(6, 6)

@@ -1,4 +1,4 @@
-"""The report, read back as a browser would: what it holds, that nothing in it acts, and that it asks for nothing outside."""
+"""The report, read back as a browser would: what it shows, that no text of a result runs as code, that it loads nothing."""
 
 from __future__ import annotations
 

@@ -28,12 +28,12 @@ class Recording:
                 self.types[chunk.entity_path, field.name] = kind
 
     def get(self, path: str, component: str) -> list[Any]:
-        """The rows of a component that hold something, be it nothing at that time."""
+        """The rows of a component that were logged, also if what was logged is empty."""
         assert (path, component) in self.columns, f"no {component} in {path}"
         return [row for row in self.columns[path, component] if row is not None]
 
     def paths(self) -> set[str]:
-        """The entities that are not the blueprint's."""
+        """The entities of the data, without those of the blueprint."""
         roots = ("/map", "/log", "/plots", "/summary", "/field")
         return {path for path, _ in self.columns if path.startswith(roots)}
 

@@ -48,7 +48,7 @@ def test_a_picture_without_a_screen(out: Path, tmp_path: Path) -> None:
 
 
 def test_a_viewer_that_hangs_up_says_so(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What goes wrong after it has loaded the recording is said as it is."""
+    """An error after the recording is loaded is reported with its own text."""
 
     def hang_up(*_: object) -> None:
         raise RuntimeError("the connection was lost\nand more")

@@ -26,7 +26,7 @@ def a_round(why: str, owner: list[int], count: int, cost: float | None = 1.0, po
 def test_where_the_rays_go_says_what_became_of_an_object() -> None:
     trace = (
         a_round("association", [0, 0, 0, 1, 1, 2, 2, 2, -1], 3, positions=[[0, 0, 0], [0.3, 0.4, 0], [5, 5, 0]]),
-        # 0 and 1 are one; 2 is gone; one of its rays and the free one are somebody new
+        # Objects 0 and 1 become one. Object 2 is gone. One of its rays and the unexplained ray are a new object.
         a_round("association", [0, 0, 0, 0, 0, -1, -1, 1, 1], 2, 0.5),
     )
     lines = [(line.at, line.level, line.text) for line in round_events(trace, ("cup",))]

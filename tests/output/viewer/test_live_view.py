@@ -90,7 +90,7 @@ def test_a_message_comes_through_whole(result: RunResult) -> None:
 
 
 def test_frames_get_their_images_where_they_are_found(result: RunResult, tmp_path: Path) -> None:
-    """What a session hands over has none: they are asked for by the camera's name and the stamp."""
+    """A snapshot has no images. The view asks for each by the name of the camera and the stamp."""
     bare = dataclasses.replace(frame(result, 7), image=None)
     snapshot = dataclasses.replace(snapshots(result, 4)[-1], frames=(bare,))
     images = {("front", bare.stamp): np.full((480, 640, 3), (200, 20, 10), dtype=np.uint8)}
@@ -227,7 +227,7 @@ def test_a_viewer_that_comes_back_is_found(result: RunResult, viewer: tuple[subp
 
 
 def test_a_process_ends_however_its_viewer_is(viewer: tuple[subprocess.Popen[bytes], int]) -> None:
-    """Without a close, and with a viewer that takes nothing more."""
+    """The process ends without `close`, while its viewer is stopped."""
     process, port = viewer
     script = (
         "import os, signal, sys, time\n"
@@ -257,7 +257,7 @@ def test_a_process_ends_however_its_viewer_is(viewer: tuple[subprocess.Popen[byt
     )
     assert done.returncode == 0, done.stderr
     logger, shown = done.stdout.split()
-    assert shown == "1"  # it hung
+    assert shown == "1"  # the viewer was stopped after one snapshot
     wait_for(lambda: not Path(f"/proc/{logger}").exists())
     process.send_signal(signal.SIGCONT)
 

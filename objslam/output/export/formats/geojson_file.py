@@ -1,4 +1,4 @@
-"""The GeoJSON format (RFC 7946): objects as points and the path as a line, for QGIS, web maps and fleet tools."""
+"""The GeoJSON format (RFC 7946): objects as points, their footprints, and the path as a line, for QGIS and others."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
+    from objslam.core.bodies.body import Body
     from objslam.core.object_map import MapObject
     from objslam.output.export.content import Content, Datum
 
@@ -22,7 +23,8 @@ def _dump(content: Content) -> bytes:
 
     With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are in m,
     in the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
-    above the ellipsoid is unknown. An unresolved object is a feature without a geometry.
+    above the ellipsoid is unknown. An object with a body has a second feature, its footprint. An unresolved object is a
+    feature without a geometry.
     """
     datum, path = content.datum, content.path
     features = [_object(o, datum) for o in content.objects.objects]
@@ -30,6 +32,7 @@ def _dump(content: Content) -> bytes:
         geometry = {"type": "LineString", "coordinates": _coordinates(path.poses[:, :3, 3], datum)}
         properties = {"kind": "path", "start": float(path.stamps[0]), "end": float(path.stamps[-1])}
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    features += [_footprint(o, o.body, datum) for o in content.objects.objects if o.body is not None and o.status == "ok"]
     collection: dict[str, Any] = {"type": "FeatureCollection"}
     if datum is None:
         collection["coordinates_in"] = f"metres in the frame {content.objects.frame}"
@@ -43,10 +46,25 @@ def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
     properties: dict[str, Any] = {"kind": "object", "label": o.label, "status": o.status}
     properties |= {"z": _finite(o.position[2]), "sigma": _finite(o.sigma), "width": width, "height": height, "rays": o.rays}
     properties |= {name: _finite(getattr(o, name)) for name in ("first_seen", "last_seen", "existence")}
-    geometry = None
+    geometry: dict[str, Any] | None = None
+    if o.body is not None:
+        properties |= {"shape": o.body.shape, "size": o.body.size.tolist(), "yaw": o.body.yaw}
     if o.status == "ok":
         geometry = {"type": "Point", "coordinates": _coordinates(o.position[None], datum)[0]}
     return {"type": "Feature", "geometry": geometry, "properties": properties, "id": o.id}
+
+
+def _footprint(o: MapObject, body: Body, datum: Datum | None) -> dict[str, Any]:
+    """Return the footprint of a body as a rectangle. Its corners go counter-clockwise, as the RFC asks."""
+    import numpy as np
+
+    from objslam.core.bodies.upright_box import footprint
+
+    corners = footprint((o.position, body.size, body.yaw))
+    closed = np.concatenate([corners, corners[:1]])
+    ring = np.column_stack([closed, np.full(len(closed), o.position[2])])
+    geometry = {"type": "Polygon", "coordinates": [_coordinates(ring, datum)]}
+    return {"type": "Feature", "geometry": geometry, "properties": {"kind": "footprint", "object": o.id, "label": o.label}}
 
 
 def _coordinates(points: Floats, datum: Datum | None) -> list[list[float]]:

@@ -1,0 +1,53 @@
+"""The body of an object: its shape, its size and its heading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+
+Shape = Literal["point", "sphere", "ellipsoid", "cuboid"]
+SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid")
+"""The shapes of objects. A point has no size."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """An upright body around the position of its object.
+
+    shape: `cuboid`, `ellipsoid`, or `sphere` if its boxes do not tell an ellipsoid from a sphere. size: (3,) m, the full
+    length, width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the
+    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most that of an unknown direction (0.91).
+    """
+
+    shape: Shape
+    size: Floats
+    yaw: float
+    size_sigma: Floats
+    yaw_sigma: float
+
+
+def turned(body: Body, rotation: Floats) -> Body:
+    """Return a body after a rotation (3, 3) about an upright axis."""
+    x, y, _ = rotation @ np.array([np.cos(body.yaw), np.sin(body.yaw), 0.0])
+    return replace(body, yaw=float(np.pi / 2 - (np.pi / 2 - np.arctan2(y, x)) % np.pi))
+
+
+@dataclass(frozen=True)
+class PlacedBody:
+    """A body in a map. centre: (3,) m, None if the rays through the centres of its boxes tell the place as well. covariance:
+    (7, 7) of the centre, the size and the yaw."""
+
+    body: Body
+    centre: Floats | None
+    covariance: Floats
+
+
+def surer_body(a: Body | None, b: Body | None) -> Body | None:
+    """Return the body whose size is known better, or the only one."""
+    if a is None or b is None:
+        return a or b
+    return b if b.size_sigma.prod() < a.size_sigma.prod() else a

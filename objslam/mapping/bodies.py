@@ -1,0 +1,221 @@
+"""Give the objects of a solution bodies: upright spheres, ellipsoids and cuboids that fit the edges of their boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.observations import MIN_DEPTH, extents
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.body import SHAPES, Body, PlacedBody
+from objslam.core.camera import Camera, undistort
+from objslam.core.statistics import grouped_median
+from objslam.frontend.up import up_axis
+from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.graph.robust_cost import ray_information
+from objslam.mapping.solution import Solution
+from objslam.triangulation.bodies.edges import BoxEdges, contacts, tangent_planes
+from objslam.triangulation.bodies.prior import apparent_half_axes
+from objslam.triangulation.bodies.solve import Bodies, solve_bodies
+
+_FEWEST = 5
+"""The least number of boxes of a body. With a larger number, more objects stay points."""
+_CLEAR = 1.0
+"""The angle between the centre of a body and that of its box, in standard deviations of the error that boxes share, above
+which the position is the centre of the body. It is 4 for a cabinet from close by, and below 0.6 for things on a table that a
+noisy detector sees. With a larger value, more objects stay where their rays meet."""
+_ANY_YAW = np.pi / np.sqrt(12)
+"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
+
+
+def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
+    """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
+
+    The covariance of a centre contains the noise of the boxes and the errors that they share. It also contains what the
+    covariance of the point has beyond the noise of its rays, such as the noise of solved poses.
+    """
+    if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
+        return solution
+    views = _views(solution, cameras, settings)
+    if not len(views.ray):
+        return solution
+    prior = settings.rays.box_sigma
+    told = settings.noise.rays
+    learn = prior == type(settings.rays)().box_sigma if told == "auto" else told
+    found = solve_bodies(
+        views.edges,
+        views.points,
+        views.half,
+        tuple(solution.rays.label_names[solution.association.label[j]] for j in views.objects),
+        side=views.side,
+        share=2 * prior,
+        learn=learn,
+        sizes=settings.bodies.sizes,
+        bent=views.bent,
+    )
+    clear = _shifts_clearly(found, views)
+    bodies: list[PlacedBody | None] = [None] * solution.association.count
+    extra = _beyond_rays(solution, settings, views)
+    for at, j in enumerate(views.objects.tolist()):
+        if found.shape[at]:
+            bodies[j] = _body(found, at, extra[at], clear=bool(clear[at]))
+    to_centre = np.zeros((len(solution.rays), 3))
+    to_centre[views.ray] = np.einsum("bji,bj->bi", views.poses[:, :3, :3], found.to_centre)
+    return replace(solution, bodies=tuple(bodies), body_share=float(found.share[0]), to_centre=to_centre)
+
+
+@dataclass(frozen=True)
+class _Views:
+    """The boxes of objects with a point.
+
+    objects: (n,) the objects, ray: (B,) the used rays. body: (B,) the object of each box as an index into `objects`. points:
+    (n, 3) m. half: (n, 2) m, the apparent half axes across and upwards.
+    """
+
+    solution: Solution
+    cameras: tuple[Camera, ...]
+    settings: Settings
+    objects: Ints
+    ray: Ints
+    body: Ints
+    points: Floats
+    half: Floats
+
+    @property
+    def side(self) -> Floats:
+        """(B,) px, half the geometric mean of the sides of the image of each box."""
+        half = np.array([np.sqrt(c.size.prod()) / 2 for c in self.cameras])
+        return np.asarray(half[self._camera])
+
+    @property
+    def bent(self) -> bool:
+        """Whether any used camera distorts its image."""
+        return any(self.cameras[i].fisheye or self.cameras[i].distortion.any() for i in np.unique(self._camera))
+
+    @property
+    def _camera(self) -> Ints:
+        return self.solution.keyframes.camera[self.solution.rays.keyframe[self.ray]]
+
+    @property
+    def poses(self) -> Floats:
+        """(B, 4, 4) map_T_camera of each box."""
+        poses = self.solution.estimate.map_T_base @ self.solution.keyframes.base_T_camera
+        return np.asarray(poses[self.solution.rays.keyframe[self.ray]])
+
+    def edges(self, touched: Floats | None = None) -> BoxEdges:
+        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch them, if known."""
+        rays, settings, poses = self.solution.rays.take(self.ray), self.settings, self.poses
+        count = len(self.ray)
+        normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), np.zeros((count, 4), dtype=bool)
+        direction = np.zeros((count, 3))  # The direction of a ray may already point to the centre of a body.
+        good = np.zeros(count, dtype=bool)
+        for i in np.unique(self._camera):
+            mine, camera = np.flatnonzero(self._camera == i), self.cameras[i]
+            box = rays.box[mine]
+            contact = None if touched is None else contacts(camera, box, poses[mine], touched[mine])
+            normal[mine], turn[mine], good[mine] = tangent_planes(camera, box, poses[mine], contact)
+            direction[mine], _ = undistort(camera, (box[:, :2] + box[:, 2:]) / 2)
+            border = max(settings.rays.border, 0.0)
+            bound[mine] = np.concatenate([box[:, :2] <= border, box[:, 2:] >= camera.size - 1 - border], axis=1)
+        turn[~good] = 1.0
+        bound[~good] = True  # A bound of a plane without a normal never counts.
+        own = self.points[self.body] - poses[:, :3, 3]
+        distance = np.maximum(np.linalg.norm(own, axis=1), MIN_DEPTH)
+        yaw, place = np.zeros(count), 0.0
+        if settings.mode != "joint":
+            angle, place = pose_noise(rays, self.solution.keyframes, settings)
+            yaw = np.sqrt(np.maximum(angle**2 - rays.sigma**2, 0.0))
+        size = np.sqrt(np.maximum(rays.box[:, 2:] - rays.box[:, :2], 0.0).prod(axis=1))
+        return BoxEdges(
+            body=self.body,
+            origin=poses[:, :3, 3],
+            normal=normal,
+            turn=turn,
+            sigma=np.full(count, np.sqrt(2) * settings.rays.pixel_sigma),
+            shift=np.hypot(yaw, place / distance) / turn.mean(axis=1),
+            bound=bound,
+            size=size,
+            direction=np.einsum("bij,bj->bi", poses[:, :3, :3], direction),
+            range=rays.range,
+            range_sigma=np.hypot(rays.range_sigma, place),
+            # A range may end on any part of the body, or behind it if the body has holes.
+            range_bias=np.where(np.isfinite(rays.range), np.hypot(rays.range_bias, self.half[self.body, 0]), 0.0),
+        )
+
+
+def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> _Views:
+    keyframes, estimate, association, rays = solution.keyframes, solution.estimate, solution.association, solution.rays
+    map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
+    sizes = extents(rays, association, estimate.positions, map_T_camera, keyframes, cameras)
+    fit = (
+        np.isfinite(estimate.covariance[:, 0, 0])
+        & np.isfinite(estimate.positions).all(axis=1)
+        & np.isfinite(sizes).all(axis=1)
+    )
+    fit[list(estimate.tags)] = False  # The corners of a tag tell more than its box.
+    sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe]]
+    box = (rays.box[:, 2:] > rays.box[:, :2]).all(axis=1)
+    ray = np.flatnonzero((association.object >= 0) & sees_size & box)
+    ray = ray[fit[association.object[ray]]]
+    number = np.bincount(association.object[ray], minlength=association.count)
+    objects = np.flatnonzero(fit & (number >= _FEWEST))
+    ray = ray[np.isin(association.object[ray], objects)]
+    return _Views(
+        solution,
+        cameras,
+        settings,
+        objects,
+        ray,
+        np.searchsorted(objects, association.object[ray]),
+        estimate.positions[objects],
+        apparent_half_axes(*sizes[objects].T),
+    )
+
+
+def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
+    """Return whether the centre of each body (n,) is farther from the centres of its boxes than their shared error.
+
+    If it is not, the rays through the centres of the boxes give the place at least as well, and the body gives only the
+    size.
+    """
+    edges = views.edges()
+    shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
+    ratio = np.linalg.norm(found.to_centre, axis=1) / np.maximum(shared, 1e-12)
+    return np.asarray(grouped_median(ratio, views.body, len(views.objects)) > _CLEAR)
+
+
+def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
+    """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2."""
+    estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
+    if settings.mode != "joint" and estimate.calibration is None:
+        return np.zeros((len(views.objects), 3, 3))
+    use = views.ray[estimate.weight[views.ray] > 0]
+    origin, direction = (part[use] for part in rays.in_map(estimate.map_T_base @ keyframes.base_T_camera))
+    owner = solution.association.object[use]
+    distance = np.maximum(np.linalg.norm(estimate.positions[owner] - origin, axis=1), MIN_DEPTH)
+    noise, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
+    across = 1 / np.hypot(noise[use] * distance, place) ** 2
+    along = np.where(np.isfinite(rays.range[use]), 1 / rays.range_sigma[use], 0.0) ** 2
+    information = ray_information(direction, across, along, owner, solution.association.count)[views.objects]
+    more = estimate.covariance[views.objects] - np.linalg.pinv(information, hermitian=True)
+    size, vectors = np.linalg.eigh((more + np.swapaxes(more, 1, 2)) / 2)
+    return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, np.maximum(size, 0.0), vectors))
+
+
+def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
+    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the centre is the
+    position."""
+    centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
+    covariance = found.covariance[at].copy()
+    # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.
+    covariance[:3, :3] += (found.share[0] * half.mean()) ** 2 * np.eye(3)
+    covariance[[3, 6], [3, 6]] += found.share[1] ** 2
+    slope = found.slope[at].copy()
+    slope[3:6] *= 2.0  # from half axes to sizes
+    covariance = slope @ covariance @ slope.T
+    covariance[:3, :3] += extra
+    sigma = np.sqrt(np.diagonal(covariance))
+    body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], float(min(sigma[6], _ANY_YAW)))
+    return PlacedBody(body, centre if clear else None, (covariance + covariance.T) / 2)

@@ -1,0 +1,92 @@
+"""Bearings to the centres of bodies, for the joint mode.
+
+The centre of a box is not the image of the centre of the object. For large objects nearby, this error bends the estimated
+path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import grouped_median
+from objslam.core.types import Association, Rays
+from objslam.mapping.bodies import with_bodies
+from objslam.mapping.solution import Solution, with_noise_of, without_errors
+
+if TYPE_CHECKING:
+    from objslam.core.estimate import Estimate
+    from objslam.mapping.joint_alternation import JointState
+
+_ROUNDS = 2
+"""The most rounds in which bodies and poses are solved in turns. More rounds are slower, and change less than the noise."""
+_KEPT = 0.5
+"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. If one
+is lost, all bearings stay as they were."""
+_WORTH = 0.1
+"""The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
+shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
+again."""
+
+
+def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
+    """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
+
+    If no body shifts its bearings enough (`_WORTH`), or if an object would be lost, the estimate is as before, and the
+    second value is None.
+    """
+    from objslam.graph import batch_solver
+
+    if not state.settings.bodies.use:
+        return estimate, None
+    # An object that the boxes' centres brought into the graph may have a little less parallax by the centres of bodies.
+    joint = state.settings.joint
+    joint = joint.model_copy(update={"min_parallax_deg": _KEPT * joint.min_parallax_deg})
+    settings = state.settings.model_copy(update={"joint": joint})
+    added = None
+    for _ in range(_ROUNDS):
+        keyframes, rays = state.keyframes, state.rays
+        if state.errors is not None:
+            keyframes, rays = without_errors(state.errors, estimate)
+        shift = with_bodies(Solution(keyframes, rays, association, estimate, ()), state.cameras, state.settings).to_centre
+        held = association.object >= 0
+        if shift is None or not _any_object((np.linalg.norm(shift, axis=1) / rays.sigma)[held], association.object[held]):
+            break
+        measured = state.rays if state.errors is None else state.errors.rays
+        turned = to_centres(measured, shift)
+        errors = None
+        if state.errors is not None:
+            errors = replace(with_noise_of(state.errors, estimate), rays=turned, settings=settings)
+        solved = batch_solver.solve_joint(
+            keyframes,
+            turned if errors is None else rays,
+            association,
+            settings,
+            state.ledger,
+            partial(state.progress, "bodies"),
+            estimate.map_T_base @ keyframes.base_T_camera,
+            state.trace,
+            errors,
+            None if estimate.calibration is None else estimate.calibration.values,
+        )
+        if (estimate.solved & ~solved.solved).any():
+            break
+        estimate, added = solved, shift
+        if state.trace is not None:
+            state.trace.end_round("bodies", association, estimate)
+    return estimate, added
+
+
+def to_centres(rays: Rays, added: Floats) -> Rays:
+    """Return rays with a vector (R, 3) added to each direction, in the camera frame."""
+    direction = rays.direction + added
+    return replace(rays, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def _any_object(deviation: Floats, object: Ints) -> bool:
+    """Return whether the median deviation (R,) of the rays of any object is worth another solve."""
+    return bool((grouped_median(deviation, object, int(object.max()) + 1) > _WORTH).any())

@@ -1,0 +1,95 @@
+"""The edges of boxes as planes through the camera that touch the body of the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera, project, undistort
+
+LEFT, TOP, RIGHT, BOTTOM = range(4)
+"""The order of the edges of a box (x1, y1, x2, y2)."""
+_STEP = 0.5
+"""The step (px) of the differences that give the direction of an edge. A larger step is less exact in a wide lens."""
+_OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
+_ACROSS = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class BoxEdges:
+    """The four edges of B boxes as planes.
+
+    body: (B,) the object of each box. origin: (B, 3) m, the camera in map. normal: (B, 4, 3) unit, in map, away from the
+    box.
+    turn: (B, 4) rad per px, by how much a plane turns if its edge moves. sigma: (B,) px, the noise of an edge. shift: (B,)
+    px, noise that moves a box as a whole, such as that of the pose. bound: (B, 4) whether an edge is at the image's border,
+    so that the object may reach farther. size: (B,) px, the geometric mean of the sides of each box. direction: (B, 3) unit,
+    in map, through the centre of the box. range: (B,) m along it to the surface, NaN if unknown. range_sigma: (B,) m.
+    range_bias: (B,) m, the error that ranges share.
+    """
+
+    body: Ints
+    origin: Floats
+    normal: Floats
+    turn: Floats
+    sigma: Floats
+    shift: Floats
+    bound: Bools
+    size: Floats
+    direction: Floats
+    range: Floats
+    range_sigma: Floats
+    range_bias: Floats
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def take(self, boxes: Bools | Ints) -> BoxEdges:
+        """Select boxes by a mask or by indices."""
+        selected: dict[str, Any] = {name: value[boxes] for name, value in vars(self).items()}
+        return replace(self, **selected)
+
+
+def tangent_planes(
+    camera: Camera, boxes: Floats, map_T_camera: Floats, contact: Floats | None = None
+) -> tuple[Floats, Floats, Bools]:
+    """Return normals (B, 4, 3) in map, turns (B, 4), rad per px, and which boxes (B,) have all four planes.
+
+    boxes: (B, 4) px of the raw image. map_T_camera: (B, 4, 4). contact: (B, 4) px, where each edge touches the image of the
+    body, as y of a vertical edge and as x of a horizontal one. The default is the middle of each edge. In a distorted image
+    an edge is a curve of rays. Its plane holds the ray of the contact and the direction of the edge there.
+    """
+    low, high = boxes[:, :2], boxes[:, 2:]
+    middle = (low + high) / 2
+    if contact is None:
+        contact = middle[:, [1, 0, 1, 0]]
+    pixel = np.stack([boxes, contact], axis=-1)  # Vertical edges have x first. Horizontal edges have y first.
+    pixel[:, 1::2] = pixel[:, 1::2, ::-1]
+    along = _ACROSS[:, ::-1] * _STEP
+    parts = [pixel, pixel - along, pixel + along, pixel - _ACROSS * _STEP, pixel + _ACROSS * _STEP]
+    direction, valid = undistort(camera, np.stack(parts).reshape(-1, 2))
+    ray, before, after, inside, outside = direction.reshape(5, -1, 4, 3)
+    normal = np.cross(ray, after - before)
+    length = np.linalg.norm(normal, axis=2, keepdims=True)
+    normal /= np.maximum(length, 1e-12)
+    turn = (normal * (outside - inside)).sum(axis=2) / (2 * _STEP)
+    normal *= (np.sign(turn) * _OUTWARD)[..., None]
+    good = valid.reshape(5, -1, 4).all(axis=(0, 2)) & (np.abs(turn) > 0).all(axis=1) & (high > low).all(axis=1)
+    return normal @ np.swapaxes(map_T_camera[:, :3, :3], 1, 2), np.abs(turn), good
+
+
+def contacts(camera: Camera, boxes: Floats, map_T_camera: Floats, touched: Floats) -> Floats:
+    """Return where (B, 4), px, the edges of boxes (B, 4) touch the image of a body, given the points (B, 4, 3) in map.
+
+    A point that is not in front of the camera gives the middle of its edge. Other points are moved to the edge's ends.
+    """
+    local = np.einsum("bij,bki->bkj", map_T_camera[:, :3, :3], touched - map_T_camera[:, None, :3, 3])
+    ahead = local[..., 2] > 0
+    safe = np.where(ahead[..., None], local, [0.0, 0.0, 1.0])
+    pixel = project(camera, safe.reshape(-1, 3)).reshape(-1, 4, 2)
+    along = np.stack([pixel[:, 0, 1], pixel[:, 1, 0], pixel[:, 2, 1], pixel[:, 3, 0]], axis=1)
+    low, high = boxes[:, [1, 0, 1, 0]], boxes[:, [3, 2, 3, 2]]
+    return np.asarray(np.where(ahead & np.isfinite(along), np.clip(along, low, high), (low + high) / 2))

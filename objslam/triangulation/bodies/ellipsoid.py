@@ -1,0 +1,109 @@
+"""Upright ellipsoids by seven parameters without a singularity.
+
+The parameters are the centre x, y, z (m), three numbers p, q, s of the horizontal section, and the logarithm k of the half
+axis upwards. The horizontal section has the matrix exp(2 [[p + q, s], [s, p - q]]) of squared half axes. So a round section
+needs no yaw, and a prior around q = s = 0 prefers no direction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+
+_ROUND = 1e-3
+"""The aspect below which a series replaces quotients by it. A larger value loses digits of the series."""
+_LEAST = 1e-9
+"""The least length (m) of a divisor. A larger length distorts small bodies."""
+
+
+def section(values: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """Return the quadratic form v^T M v (...,) of vectors v = (x, y, z), and its derivatives (..., 4) by p, q, s and k.
+
+    values: (..., 7) parameters. M is the matrix of squared half axes, so the square root of the form with a unit vector is
+    the distance of a tangent plane from the centre.
+    """
+    p, q, s, k = np.moveaxis(values[..., 3:], -1, 0)
+    aspect2 = q * q + s * s
+    aspect = np.sqrt(aspect2)
+    round_ = aspect < _ROUND
+    safe = np.where(round_, 1.0, aspect)
+    # sinh(2 a) / a, and its derivative by a divided by a
+    gain = np.where(round_, 2 + 4 / 3 * aspect2, np.sinh(2 * safe) / safe)
+    slope = np.where(round_, 8 / 3 + 16 / 15 * aspect2, (2 * safe * np.cosh(2 * safe) - np.sinh(2 * safe)) / safe**3)
+    across, along, cross = x * x + y * y, x * x - y * y, 2 * x * y
+    lean, scale, upward = q * along + s * cross, np.exp(2 * p), np.exp(2 * k) * z * z
+    flat = scale * (np.cosh(2 * aspect) * across + gain * lean)
+    common = 2 * gain * across + slope * lean
+    by = np.stack([2 * flat, scale * (common * q + gain * along), scale * (common * s + gain * cross), 2 * upward], axis=-1)
+    return flat + upward, by
+
+
+def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the support of ellipsoids (see `shapes.Kind`): the root of n^T M n (the dual quadric)."""
+    squared, by = section(values, *np.moveaxis(normals, -1, 0))
+    distance = np.sqrt(np.maximum(squared, _LEAST**2))
+    return distance, by / (2 * distance[..., None]), normals @ matrices(values[:, 0]) / distance[..., None]
+
+
+def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
+    """Return the ranges of ellipsoids (see `shapes.Kind`): the nearer root of a quadratic equation."""
+    inverse, start = np.linalg.inv(matrices(values)), origins - values[:, :3]
+    a = np.einsum("bi,bij,bj->b", directions, inverse, directions)
+    b = np.einsum("bi,bij,bj->b", directions, inverse, start)
+    c = np.einsum("bi,bij,bj->b", start, inverse, start) - 1
+    inner = b * b - a * c
+    hit = (inner > 0) & (c > 0) & (b < 0)
+    distance = np.where(hit, (-b - np.sqrt(np.where(hit, inner, 0.0))) / a, 0.0)
+    normal = np.einsum("bij,bj->bi", inverse, start + distance[:, None] * directions)
+    slope = np.where(hit, (normal * directions).sum(axis=1), 1.0)
+    _, by = section(values, *normal.T)
+    return distance, np.where(hit[:, None], np.column_stack([normal, by / 2]) / slope[:, None], 0.0), hit
+
+
+def matrices(values: Floats) -> Floats:
+    """Return the matrices M (N, 3, 3) of squared half axes, m^2, of ellipsoids (N, 7)."""
+    half, yaw = half_axes(values), heading(values)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    a, b, c = (half**2).T
+    matrix = np.zeros((len(values), 3, 3))
+    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2] = a * cos**2 + b * sin**2, a * sin**2 + b * cos**2, c
+    matrix[:, 0, 1] = matrix[:, 1, 0] = (a - b) * cos * sin
+    return matrix
+
+
+def half_axes(values: Floats) -> Floats:
+    """Return the half axes (N, 3), m, of ellipsoids (N, 7): the long and the short horizontal one, and the upward one."""
+    aspect = np.hypot(values[:, 4], values[:, 5])
+    return np.exp(np.column_stack([values[:, 3] + aspect, values[:, 3] - aspect, values[:, 6]]))
+
+
+def heading(values: Floats) -> Floats:
+    """Return the yaw (N,), rad in (-pi/2, pi/2], of the long horizontal axis of ellipsoids (N, 7)."""
+    return np.asarray(0.5 * np.arctan2(values[:, 5], values[:, 4]))
+
+
+def from_axes(centre: Floats, half: Floats, yaw: Floats) -> Floats:
+    """Return ellipsoids (N, 7) from centres (N, 3), half axes (N, 3) along x, y, z before the turn, m, and yaws (N,)."""
+    log = np.log(half)
+    aspect = (log[:, 0] - log[:, 1]) / 2
+    flat = [(log[:, 0] + log[:, 1]) / 2, aspect * np.cos(2 * yaw), aspect * np.sin(2 * yaw)]
+    return np.column_stack([centre, *flat, log[:, 2]])
+
+
+def axes_jacobian(values: Floats) -> Floats:
+    """Return the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters of ellipsoids (N, 7).
+
+    A round section has no yaw. Its derivatives are those of an aspect of 1e-3.
+    """
+    half, twice = half_axes(values), 2 * heading(values)
+    aspect = np.maximum(np.hypot(values[:, 4], values[:, 5]), _ROUND)
+    cos, sin = np.cos(twice), np.sin(twice)
+    by = np.zeros((len(values), 7, 7))
+    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    for row, sign in ((3, 1.0), (4, -1.0)):
+        by[:, row, 3] = half[:, row - 3]
+        by[:, row, 4], by[:, row, 5] = sign * half[:, row - 3] * cos, sign * half[:, row - 3] * sin
+    by[:, 5, 6] = half[:, 2]
+    by[:, 6, 4], by[:, 6, 5] = -sin / (2 * aspect), cos / (2 * aspect)
+    return by

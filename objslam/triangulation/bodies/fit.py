@@ -1,0 +1,185 @@
+"""Fit upright ellipsoids to the boxes of objects: robust, damped Gauss-Newton steps for all objects at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import CAUCHY_K
+from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.residuals import ROWS, Residuals, residuals
+from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
+
+_ITERATIONS = 40
+"""The most steps of a fit. Ten are usual. More steps are slower."""
+STILL = 1e-9
+"""The decrease of the cost that a step promises at which a body is at rest. The cost is half a sum of squared deviations. A
+larger decrease ends sooner."""
+_UPHILL = 1e-3
+"""The share by which a step may raise the cost. The steps hold the distance in the residuals fixed, so at the optimum they
+may raise the cost by a trace. A larger share accepts worse steps."""
+_DAMPING = (1e-3, 1e-9, 1e6)
+"""The first, least and most damping of a step, as a share of the curvature. More damping makes shorter steps."""
+_LONGEST = 0.7
+"""The longest step of a logarithm or an angle (rad). A longer step may leave the region in which the linear model holds."""
+_REMAIN = 0.7
+"""The share of moving bodies below which the others are left out of the next steps. A larger share copies more often."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian prior on the parameters of N bodies. mean: (N, 7). information: (N, 7, 7)."""
+
+    mean: Floats
+    information: Floats
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much the boxes count.
+
+    variance: (B, 5) of each residual. Residuals that share an error count as few, so their variance is larger than that of
+    one residual. spread: (B, 5) the standard deviation of one residual. robust: whether residuals beyond their spread count
+    less (Cauchy's weight).
+    """
+
+    variance: Floats
+    spread: Floats
+    robust: bool = True
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The best bodies. values: (N, 7). weight: (B, 5) of each residual, one over its variance. found: (B,) its residuals.
+
+    information: (N, 7, 7) of boxes and prior. prior: (N, 7, 7) of the prior alone.
+    """
+
+    values: Floats
+    weight: Floats
+    found: Residuals
+    information: Floats
+    prior: Floats
+
+
+def fit(
+    edges: BoxEdges,
+    start: Floats,
+    prior: Prior,
+    weights: Weights,
+    kind: Kind,
+    *,
+    still: float = STILL,
+    most: int = _ITERATIONS,
+) -> Fit:
+    """Return the most probable bodies (N, 7) of one kind from a start. most: of the steps. still: see `STILL`."""
+    values = start.copy()
+    moving = np.arange(len(start))
+    damping = np.full(len(start), _DAMPING[0])
+    steps = 0
+    while len(moving) and steps < most:
+        part = moving
+        boxes = np.flatnonzero(np.isin(edges.body, part))
+        some = edges.take(boxes)
+        some = replace(some, body=np.searchsorted(part, some.body))
+        mine = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
+        own = Prior(prior.mean[part], prior.information[part])
+        values[part], damping[part], rest, steps = _steps(
+            some, values[part], damping[part], own, mine, kind, (steps, most, still)
+        )
+        moving = part[~rest]
+    now = residuals(edges, values, kind)
+    weight = _weight(now, weights)
+    information, _, _ = _normal(edges.body, np.argsort(edges.body, kind="stable"), now, weight, prior, values)
+    return Fit(values, weight, now, information, prior.information)
+
+
+def _steps(
+    edges: BoxEdges,
+    values: Floats,
+    damping: Floats,
+    prior: Prior,
+    weights: Weights,
+    kind: Kind,
+    limits: tuple[int, int, float],
+) -> tuple[Floats, Floats, Bools, int]:
+    """Return bodies and dampings after steps, which bodies are at rest, and the number of steps. It ends if many are.
+
+    limits: the number of steps so far, the most steps, and the promised decrease of the cost at rest.
+    """
+    steps, most, enough = limits
+    order, still = np.argsort(edges.body, kind="stable"), np.zeros(len(values), dtype=bool)
+    now = residuals(edges, values, kind)
+    while steps < most and (~still).mean() > _REMAIN:
+        steps += 1
+        weight = _weight(now, weights)
+        information, gradient, cost = _normal(edges.body, order, now, weight, prior, values)
+        damped = information + (damping[:, None] * np.einsum("nii->ni", information))[..., None] * np.eye(PARAMETERS)
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        longest = np.abs(step[:, 3:]).max(axis=1)
+        step *= np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-12))[:, None]
+        promised = -(step * gradient).sum(axis=1)
+        trial = values + step
+        new = residuals(edges, trial, kind)
+        better = _cost(edges.body, new, weight, prior, trial) <= cost * (1 + _UPHILL) + enough
+        values = np.where(better[:, None], trial, values)
+        now = new if better.all() else _chosen(better[edges.body], new, now)
+        still |= (promised < enough) | (damping >= _DAMPING[2])
+        damping = np.clip(np.where(better, damping / 10, damping * 10), *_DAMPING[1:])
+    return values, damping, still, steps
+
+
+def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
+    return Residuals(
+        np.where(which[:, None], new.value, old.value),
+        np.where(which[:, None, None], new.by, old.by),
+        np.where(which[:, None], new.use, old.use),
+        old.sigma,
+    )
+
+
+def grouped(body: Ints, order: Ints, rows: Floats, count: int) -> Floats:
+    """Return the sums (count, ...) of rows (B, ...) of each body (B,). order: indices that sort the bodies."""
+    total = np.zeros((count, *rows.shape[1:]))
+    if len(order):
+        which, begin = np.unique(body[order], return_index=True)
+        total[which] = np.add.reduceat(rows[order], begin, axis=0)
+    return total
+
+
+def _weight(now: Residuals, weights: Weights) -> Floats:
+    weight = now.use / weights.variance
+    if not weights.robust:
+        return weight
+    squared = now.use * (now.value / weights.spread) ** 2
+    # A box of another thing is wrong in all its edges, so the four residuals of a box share one deviation.
+    squared[:, : ROWS - 1] = squared[:, : ROWS - 1].sum(axis=1, keepdims=True) / 2
+    return np.asarray(weight / (1 + squared / CAUCHY_K**2))
+
+
+def _normal(
+    body: Ints, order: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
+    weighted = now.by * weight[..., None]
+    total = np.concatenate(
+        [
+            (np.swapaxes(weighted, 1, 2) @ now.by).reshape(len(body), -1),
+            (weighted * now.value[..., None]).sum(axis=1),
+        ],
+        axis=1,
+    )
+    sums = grouped(body, order, total, len(values))
+    split = PARAMETERS**2
+    information = sums[:, :split].reshape(-1, PARAMETERS, PARAMETERS) + prior.information
+    gradient = sums[:, split:] + np.einsum("nij,nj->ni", prior.information, values - prior.mean)
+    return information, gradient, _cost(body, now, weight, prior, values)
+
+
+def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
+    """Return half the sum of squares (N,) of each body, with its prior, at given weights (Cauchy's loss lies below it)."""
+    off = values - prior.mean
+    own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))
+    return np.asarray(0.5 * own + 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off))

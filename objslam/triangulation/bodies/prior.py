@@ -1,0 +1,128 @@
+"""What is believed of the size of a body before its boxes count: its apparent size, its label, known sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.triangulation.bodies.fit import Prior
+from objslam.triangulation.bodies.shapes import PARAMETERS
+
+_POSITION = 20.0
+"""The standard deviation (m) of a centre around the point. A larger value leaves more to the boxes."""
+_SIZE = 0.7
+"""The standard deviation of the logarithm of a half axis around its apparent value. 0.7 is a factor of 2. A larger value
+leaves more to the boxes, and lets an object that is seen from one side become deep or flat."""
+_ASPECT = 0.35
+"""The standard deviation of the two numbers of the aspect. The median ratio of the horizontal half axes is then 2.3. A
+larger value allows longer objects."""
+_YAW = np.pi / np.sqrt(12)
+"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
+_DOT = 1e-4
+"""The half axes (m) of an ellipsoid that stands for a point."""
+_LIKE = 2.0
+"""The number of bodies of a label at which their spread weighs as much as the spread above. A larger number learns
+slower."""
+_LEAST = 0.1
+"""The least standard deviation of the logarithm of a size that a label tells. A smaller value trusts the label more."""
+_TIE = 1e-3
+"""The standard deviation of the logarithms by which the half axes of a sphere differ. It is practically none."""
+
+
+def weak_prior(points: Floats, half: Floats) -> Prior:
+    """Return the prior of bodies at points (N, 3), m, with the apparent half axes (N, 2) across and upwards, m."""
+    count, log = len(points), np.log(half)
+    mean = np.column_stack([points, log[:, 0], np.zeros((count, 2)), log[:, 1]])
+    sigma = np.array([*[_POSITION] * 3, _SIZE, _ASPECT, _ASPECT, _SIZE])
+    return Prior(mean, np.tile(np.diag(sigma**-2), (count, 1, 1)))
+
+
+def label_prior(weak: Prior, values: Floats, covariance: Floats, label: Ints, cuboid: Bools) -> Prior:
+    """Return the prior that the bodies of each label have in common (empirical Bayes; Efron and Morris 1973).
+
+    values, covariance: (N, 7), (N, 7, 7) of bodies that were fitted with the weak prior. label: (N,). cuboid: (N,) which
+    bodies are cuboids. The result is for ellipsoids. A label with one body, and
+    the label -1, keep the weak prior.
+    """
+    mean, variance = weak.mean.copy(), 1 / np.einsum("nii->ni", weak.information).copy()
+    for one in np.unique(label):
+        mine = np.flatnonzero(label == one)
+        if one < 0 or len(mine) < 2:
+            continue
+        for at in (3, 6):
+            own = values[mine, at]
+            noise = covariance[mine, at, at]
+            between = max(float(np.var(own) - noise.mean()), 0.0)
+            between = max((len(mine) * between + _LIKE * _SIZE**2) / (len(mine) + _LIKE), _LEAST**2)
+            weight = 1 / (noise + between)
+            mean[mine, at] = (weight * own).sum() / weight.sum()
+            variance[mine, at] = between + 1 / weight.sum()
+        squares = (values[mine, 4:6] ** 2 - np.einsum("nii->ni", covariance[mine, 4:6, 4:6])).mean(axis=1)
+        one_number = values[mine, 4] ** 2 - covariance[mine, 4, 4]  # The yaw of a cuboid is a number of its own.
+        squares = np.where(cuboid[mine], one_number / 2, squares).mean()
+        aspect = (len(mine) * max(float(squares), 0.0) + _LIKE * _ASPECT**2) / (len(mine) + _LIKE)
+        variance[mine, 4:6] = max(aspect, _LEAST**2)
+    information = np.zeros_like(weak.information)
+    information[:, range(PARAMETERS), range(PARAMETERS)] = 1 / variance
+    return Prior(mean, information)
+
+
+def known_sizes(
+    prior: Prior, values: Floats, names: tuple[str, ...], sizes: Mapping[str, tuple[float, float, float]]
+) -> Prior:
+    """Return the prior with known sizes (length, width, height), m, of labels. names: the label of each body.
+
+    The yaw of a body stays free: its aspect is drawn towards the known one in the direction that the fit has found.
+    """
+    mean, information = prior.mean.copy(), prior.information.copy()
+    for body, name in enumerate(names):
+        if name not in sizes:
+            continue
+        length, width, height = *sorted(sizes[name][:2], reverse=True), sizes[name][2]
+        aspect = 0.5 * np.log(length / width)
+        towards = values[body, 4:6] if np.linalg.norm(values[body, 4:6]) > _TIE else np.array([1.0, 0.0])
+        towards = towards / np.linalg.norm(towards)
+        mean[body, 3:] = 0.5 * np.log(length * width / 4), *(aspect * towards), np.log(height / 2)
+        information[body, [3, 6], [3, 6]] = _LEAST**-2
+        information[body, 4:6, 4:6] = np.outer(towards, towards) / _LEAST**2 + np.eye(2) / _ASPECT**2
+    return Prior(mean, information)
+
+
+def sphere_prior(prior: Prior) -> Prior:
+    """Return the prior of spheres: its three half axes are equal."""
+    information = prior.information.copy()
+    information[:, [4, 5], [4, 5]] += _TIE**-2
+    tie = np.zeros(PARAMETERS)
+    tie[[3, 6]] = 1.0, -1.0
+    mean = prior.mean.copy()
+    mean[:, 4:6] = 0.0
+    # The tie draws the difference of the two logarithms to zero, and their own priors stay.
+    precision = information[:, [3, 6], [3, 6]]
+    common = (precision * mean[:, [3, 6]]).sum(axis=1) / precision.sum(axis=1)
+    mean[:, 3] = mean[:, 6] = common
+    return Prior(mean, information + np.outer(tie, tie) / _TIE**2)
+
+
+def cuboid_prior(prior: Prior, start: Floats) -> Prior:
+    """Return the prior of cuboids (N, 7) with the sizes and aspects that a prior of ellipsoids has. Their yaw is free."""
+    mean, information = prior.mean.copy(), prior.information.copy()
+    towards = np.stack([np.cos(2 * start[:, 5]), np.sin(2 * start[:, 5])], axis=1)
+    mean[:, 4], mean[:, 5] = (prior.mean[:, 4:6] * towards).sum(axis=1), start[:, 5]
+    aspect = np.einsum("ni,nij,nj->n", towards, prior.information[:, 4:6, 4:6], towards)
+    information[:, 4:6, 4:6] = aspect[:, None, None] * np.diag([1.0, 0.0]) + np.diag([0.0, _YAW**-2])
+    return Prior(mean, information)
+
+
+def dot_prior(prior: Prior) -> Prior:
+    """Return the prior of points: ellipsoids of `_DOT` m."""
+    mean, information = prior.mean.copy(), prior.information.copy()
+    mean[:, 3:] = np.log(_DOT), 0.0, 0.0, np.log(_DOT)
+    information[:, 3:, 3:] = _TIE**-4 * np.eye(4)
+    return Prior(mean, information)
+
+
+def apparent_half_axes(width: Floats, height: Floats) -> Floats:
+    """Return the apparent half axes (N, 2), m, across and upwards, from medians (N,) of the width and the height, m."""
+    return np.maximum(np.column_stack([width, height]) / 2, 1e-3)

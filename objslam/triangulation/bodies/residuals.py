@@ -1,0 +1,87 @@
+"""The residuals of boxes against bodies, and their derivatives.
+
+A plane with the outward unit normal n through the camera m touches the body with the centre c and the support h(n) if
+n . (c - m) + h(n) = 0. An ellipsoid with the matrix M has h = sqrt(n^T M n), so this is the equation of its dual quadric
+(Hartley and Zisserman 2004, section 8.3). The left side divided by the distance of the touched point is the angle by which
+the body reaches beyond the plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
+
+ROWS = 5
+"""The residuals of a box: its shift in two axes and half its size in two axes, px, and its range, m."""
+_LEAST = 1e-9
+"""The least length (m) of a divisor. A larger length distorts small bodies."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """The residuals of B boxes.
+
+    value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
+    range (m). Where an edge is a bound, the two edges of its axis stand in the places of shift and size. by: (B, 5, 7)
+    their derivatives by the parameters of the bodies. use: (B, 5) whether a residual counts. sigma: (B, 5) its noise.
+    """
+
+    value: Floats
+    by: Floats
+    use: Floats
+    sigma: Floats
+
+
+def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
+    """Return the gaps (B, 4), m, by which bodies (N, 7) reach beyond their planes, the derivatives (B, 4, 7), and the points
+    (B, 4, 3) in map at which the bodies come closest to the planes."""
+    own = values[edges.body]
+    reach, by_shape, points = kind.support(own[:, None], edges.normal)
+    gap = (edges.normal * (own[:, :3] - edges.origin)[:, None]).sum(axis=2) + reach
+    return gap, np.concatenate([edges.normal, by_shape], axis=2), own[:, None, :3] + points
+
+
+def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
+    """Return the residuals of bodies (N, 7) of one kind. Their derivatives hold the distance of the touched points fixed."""
+    gap, by_gap, points = edge_gaps(edges, values, kind)
+    scale = np.maximum(np.linalg.norm(points - edges.origin[:, None], axis=2) * edges.turn, _LEAST)  # m per px
+    off, by = gap / scale, by_gap / scale[..., None]
+    count = len(edges)
+    value, use = np.empty((count, ROWS)), np.ones((count, ROWS))
+    jacobian = np.empty((count, ROWS, PARAMETERS))
+    for out, mixed in ((value, off), (jacobian, by)):
+        low, high = mixed[:, :2], mixed[:, 2:]
+        out[:, :2], out[:, 2:4] = (high - low) / 2, (high + low) / 2
+    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    for place in (axis, axis + 2):
+        value[row, place], jacobian[row, place] = off[row, place], by[row, place]
+        use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
+    value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
+    return Residuals(value, jacobian, use, nominal_noise(edges))
+
+
+def nominal_noise(edges: BoxEdges) -> Floats:
+    """Return the noise (B, 5) of the residuals, before the log tells it."""
+    edge, sigma = edges.sigma / np.sqrt(2), np.empty((len(edges), ROWS))
+    sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
+    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    for place in (axis, axis + 2):
+        sigma[row, place] = np.hypot(edges.sigma, edges.shift)[row]
+    sigma[:, 4] = np.where(np.isfinite(edges.range), edges.range_sigma, 1.0)
+    return sigma
+
+
+def _ranges(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
+    """Return predicted minus measured ranges (B,), m, to the surface, their derivatives (B, 7), and which (B,) count."""
+    known = np.flatnonzero(np.isfinite(edges.range))
+    gap, by, use = np.zeros(len(edges)), np.zeros((len(edges), PARAMETERS)), np.zeros(len(edges))
+    if len(known):
+        distance, by[known], hit = kind.ranges(values[edges.body[known]], edges.origin[known], edges.direction[known])
+        gap[known] = np.where(hit, distance - edges.range[known], 0.0)
+        use[known] = hit
+    return gap, by, use

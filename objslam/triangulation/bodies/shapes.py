@@ -1,0 +1,45 @@
+"""The two kinds of bodies, an upright ellipsoid and an upright cuboid: what tangent planes and rays find of them.
+
+Both have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
+of the half axis upwards. p is the mean logarithm of the horizontal half axes. `support` returns how far tangent planes are
+from the centre, `ranges` how far the surface is along rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from objslam.core.arrays import Bools, Floats
+from objslam.triangulation.bodies import cuboid, ellipsoid
+
+PARAMETERS = 7
+"""The number of parameters of a body."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of bodies.
+
+    support: from parameters (B, 1, 7) and unit normals (B, 4, 3) to the distances (B, 4), m, of tangent planes from the
+    centre, their derivatives (B, 4, 4) by the last four parameters, and the touched points (B, 4, 3), m, from the centre.
+    ranges: from parameters (B, 7), origins (B, 3), m, and directions (B, 3) to the distances (B,), m, of the surface, their
+    derivatives (B, 7), and which rays (B,) hit it. half_axes: from parameters (N, 7) to the half axes (N, 3), m, the long
+    horizontal one first. heading: to the yaw (N,) of the long axis. axes_jacobian: to the derivatives (N, 7, 7) of centre,
+    half axes and yaw.
+    """
+
+    support: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+    ranges: Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Bools]]
+    half_axes: Callable[[Floats], Floats]
+    heading: Callable[[Floats], Floats]
+    axes_jacobian: Callable[[Floats], Floats]
+
+
+def _kind(module: Any) -> Kind:
+    return Kind(module.support, module.ranges, module.half_axes, module.heading, module.axes_jacobian)
+
+
+ELLIPSOID, CUBOID = _kind(ellipsoid), _kind(cuboid)
+"""The kinds of bodies. A sphere is an ellipsoid with a tight prior."""

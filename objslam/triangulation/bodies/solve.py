@@ -1,0 +1,288 @@
+"""Find the bodies of all objects of a map: fit, learn the noise and the sizes of labels, and choose a shape for each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.triangulation.bodies.choice import log_evidence
+from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.fit import Fit, Prior, Weights, fit
+from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
+from objslam.triangulation.bodies.residuals import Residuals, edge_gaps
+from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.shared import (
+    Sides,
+    covariance_of,
+    effective_variance,
+    share_of,
+    sides_of,
+    some_of_each_side,
+    spread_of,
+    white_factors,
+)
+
+Measure = Callable[[Floats | None], BoxEdges]
+"""The edges of the boxes, given the points (B, 4, 3) in map at which the bodies touch them. None means unknown points."""
+
+_POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
+_ROUNDS = 2
+"""How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
+_PER_SIDE = 3
+"""The number of boxes from each side that choose the shape and tell the noise. Boxes from one side repeat one error, so more
+are slower and tell little. All boxes count in the last fit."""
+_RARE = 20.0
+"""The odds against a sphere before the boxes count, because few things are balls. With larger odds, fewer are spheres."""
+_STEPS = 12
+"""The most steps of a fit that chooses a shape. A fit that needs more is of a shape that its boxes do not show."""
+_ENOUGH = 1e-3
+"""The decrease of the cost, in units of the logarithm of a probability, at which a fit ends. A larger one ends sooner."""
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """The bodies of N objects.
+
+    values: (N, 7) parameters of a cuboid or of an ellipsoid (see `shapes`). covariance: (N, 7, 7). shape: (N,) the chosen
+    shape, an index into `SHAPES`. evidence: (4, N) the logarithm of the evidence of each shape. weight: (B,) the robust
+    weight of each box. share: (2,) the standard deviations of the errors of shift and size that boxes of one side share, as
+    shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) the direction to the
+    centre of each body, minus the direction to the centre of its box, in map. It is 0 for a point.
+    """
+
+    values: Floats
+    covariance: Floats
+    shape: Ints
+    evidence: Floats
+    weight: Floats
+    share: Floats
+    factors: Floats
+    to_centre: Floats
+
+    @property
+    def axes(self) -> Floats:
+        """(N, 7) centre, m, half axes, m, and yaw, rad."""
+        return self._by_kind("axes")
+
+    @property
+    def slope(self) -> Floats:
+        """(N, 7, 7) derivatives of `axes` by the parameters."""
+        return self._by_kind("slope")
+
+    def _by_kind(self, what: str) -> Floats:
+        found = [
+            kind.axes_jacobian(self.values)
+            if what == "slope"
+            else np.column_stack([self.values[:, :3], kind.half_axes(self.values), kind.heading(self.values)])
+            for kind in (ELLIPSOID, CUBOID)
+        ]
+        return _rows(self.shape == _CUBOID, found[1], found[0])
+
+
+@dataclass(frozen=True)
+class _State:
+    """The noise, the prior and the bodies of the rounds so far.
+
+    rounds, balls: (N, 7) ellipsoids and spheres. cuboids: one or several starts (N, 7). evidence, shape: as in `Bodies`.
+    best: the better of ellipsoid and cuboid, with its covariance (N, 7, 7). None before the first round. sized:
+    (N,) whether the size is known, so that no sphere is tried.
+    """
+
+    factors: Floats
+    share: Floats
+    prior: Prior
+    rounds: Floats
+    cuboids: tuple[Floats, ...]
+    balls: Floats
+    evidence: Floats
+    shape: Ints
+    best: Fit | None
+    covariance: Floats
+    sized: Bools
+
+
+def solve_bodies(
+    measure: Measure,
+    points: Floats,
+    half: Floats,
+    names: tuple[str, ...],
+    *,
+    side: Floats,
+    share: float,
+    learn: bool = True,
+    sizes: Mapping[str, tuple[float, float, float]] | None = None,
+    bent: bool = True,
+) -> Bodies:
+    """Return the bodies of objects at points (N, 3), m, with apparent half axes (N, 2), m, and labels.
+
+    side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn: whether the share and the noise
+    are estimated. bent: whether the images are distorted, so that the planes of the edges depend on the points of contact.
+    """
+    edges = measure(None)
+    sides = sides_of(edges, points)
+    few = some_of_each_side(sides, _PER_SIDE)
+    label = np.unique(np.array(names), return_inverse=True)[1].ravel()
+    weak = weak_prior(points, half)
+    nothing = np.zeros((4, len(points))), np.zeros(len(points), dtype=np.int64), None, np.zeros((len(points), 7, 7))
+    balls = sphere_prior(weak).mean
+    sized = np.array([name in (sizes or {}) for name in names])
+    now = _State(np.ones(2), np.full(2, share), weak, weak.mean, (), balls, *nothing, sized)
+    for number in range(_ROUNDS + 1):
+        some = edges.take(few)
+        now = _round(some, sides_of(some, points), now, side[few])
+        best = now.best
+        if number == _ROUNDS or best is None:
+            break
+        # Boxes that show no body, such as marks of one size, say nothing of the noise and the sizes of the others.
+        own = np.where(now.shape != _POINT, label, -1)
+        prior = label_prior(weak, best.values, now.covariance, own, now.shape == _CUBOID)
+        if sizes:
+            prior = known_sizes(prior, now.rounds, names, sizes)
+        now = replace(now, prior=prior)
+        if learn and (now.shape != _POINT).any():
+            some_sides, which = sides_of(some, points), now.shape != _POINT
+            factors = white_factors(best.found, some_sides, which[some.body])
+            found = share_of(some, best, some_sides, factors, share, which)
+            now = replace(now, factors=factors, share=found)
+        if bent:
+            gaps = (edge_gaps(edges, one, kind)[2] for one, kind in ((now.cuboids[0], CUBOID), (now.rounds, ELLIPSOID)))
+            edges = measure(_rows((now.shape == _CUBOID)[edges.body], *gaps))
+    return _finished(edges, sides, now)
+
+
+def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
+    """Return the state with the best body of each shape, and the most evident shapes."""
+    weights = _weights(edges, sides, now)
+    rounds = fit(edges, now.rounds, now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    if now.best is None:  # The ellipsoid tells the cuboid where to begin.
+        now = replace(now, cuboids=_cuboid_starts(rounds.values))
+    square, square_prior = _best_cuboids(edges, now.cuboids, now.prior, weights)
+    ball_prior = sphere_prior(now.prior)
+    ball = fit(edges, now.balls, ball_prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    evidence = np.stack(
+        [
+            _dot_evidence(edges, now.prior, weights, side),
+            log_evidence(edges, ball, ball_prior, weights) - np.log(_RARE) - 1e9 * now.sized,
+            log_evidence(edges, rounds, now.prior, weights),
+            log_evidence(edges, square, square_prior, weights),
+        ]
+    )
+    best = _mixed(evidence[_CUBOID] > evidence[_ELLIPSOID], edges.body, square, rounds)
+    return replace(
+        now,
+        rounds=rounds.values,
+        cuboids=(square.values,),
+        balls=ball.values,
+        evidence=evidence,
+        shape=evidence.argmax(axis=0),
+        best=best,
+        covariance=covariance_of(edges, best, sides, now.factors, now.share),
+    )
+
+
+def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:
+    """Return the bodies of the chosen shapes from all boxes."""
+    weights = _weights(edges, sides, now)
+    count, boxes = len(now.shape), len(edges)
+    starts = {_POINT: now.balls, _SPHERE: now.balls, _ELLIPSOID: now.rounds, _CUBOID: now.cuboids[0]}
+    values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
+    gap, weight = np.zeros((boxes, 2)), np.zeros(boxes)
+    for shape in np.unique(now.shape).tolist():
+        mine = np.flatnonzero(now.shape == shape)
+        at = np.flatnonzero(np.isin(edges.body, mine))
+        own = replace(edges.take(at), body=np.searchsorted(mine, edges.body[at]))
+        loose = Prior(now.prior.mean[mine], now.prior.information[mine])
+        some = Weights(weights.variance[at], weights.spread[at])
+        start, kind = starts[shape][mine], CUBOID if shape == _CUBOID else ELLIPSOID
+        if shape == _CUBOID:
+            loose = cuboid_prior(loose, start)
+        tight = sphere_prior(loose) if shape in (_POINT, _SPHERE) else loose
+        best = fit(own, start, tight, some, kind, still=_ENOUGH)
+        if tight is not loose:  # A sphere may be an ellipsoid, of which the covariance has to tell.
+            best = fit(own, best.values, loose, some, kind, most=0)
+        values[mine] = best.values
+        covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
+        gap[at], weight[at] = best.found.value[:, :2], best.weight[:, 0] * some.variance[:, 0]
+    to_centre = np.where((now.shape != _POINT)[edges.body, None], _to_centre(edges, values[:, :3], gap), 0.0)
+    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre)
+
+
+def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
+    variance = effective_variance(edges, sides, now.factors, now.share)
+    return Weights(variance, spread_of(edges, now.factors, now.share))
+
+
+def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
+    """Return unit directions (B, 3) to centres (N, 3), minus those to the centres of the bodies' boxes.
+
+    gap: (B, 2) px, by which the body's box lies to the right of the seen one, and below it.
+    """
+    ray = edges.direction
+    predicted = ray.copy()
+    for axis in range(2):
+        across = edges.normal[:, axis + 2] - edges.normal[:, axis]
+        across = across - (across * ray).sum(axis=1, keepdims=True) * ray
+        across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+        turn = edges.turn[:, [axis, axis + 2]].mean(axis=1)
+        predicted += (gap[:, axis] * turn)[:, None] * across
+    predicted /= np.linalg.norm(predicted, axis=1, keepdims=True)
+    towards = centre[edges.body] - edges.origin
+    away = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    return np.asarray(towards / away - predicted)
+
+
+def _dot_evidence(edges: BoxEdges, prior: Prior, weights: Weights, side: Floats) -> Floats:
+    """Return the logarithm of the evidence (N,) of points, which do not explain the sides of boxes."""
+    dots, variance, spread = dot_prior(prior), weights.variance.copy(), weights.spread.copy()
+    variance[:, 2:4] = spread[:, 2:4] = np.inf
+    found = fit(
+        edges, dots.mean, dots, replace(weights, variance=variance, spread=spread), ELLIPSOID, still=_ENOUGH, most=_STEPS
+    )
+    return log_evidence(edges, found, dots, weights, free_side=side)
+
+
+def _cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
+    """Return two starts (N, 7) of cuboids, along the axes of ellipsoids (N, 7) and at 45 degrees to them."""
+    starts = []
+    for turn in (0.0, np.pi / 4):
+        start = rounds.copy()
+        start[:, 4], start[:, 5] = np.hypot(rounds[:, 4], rounds[:, 5]) * np.cos(2 * turn), ELLIPSOID.heading(rounds) + turn
+        start[:, [3, 6]] -= np.log(2) / 4  # The ellipsoid around a cuboid is larger than the cuboid.
+        starts.append(start)
+    return starts[0], starts[1]
+
+
+def _best_cuboids(edges: BoxEdges, starts: tuple[Floats, ...], prior: Prior, weights: Weights) -> tuple[Fit, Prior]:
+    """Return the most evident cuboids from some starts (N, 7), with their priors."""
+    best: tuple[Fit, Prior, Floats] | None = None
+    for start in starts:
+        own = cuboid_prior(prior, start)
+        found = fit(edges, start, own, weights, CUBOID, still=_ENOUGH, most=_STEPS)
+        evidence = log_evidence(edges, found, own, weights)
+        if best is None:
+            best = found, own, evidence
+            continue
+        turned = evidence > best[2]
+        mean, information = (_rows(turned, getattr(own, k), getattr(best[1], k)) for k in ("mean", "information"))
+        best = _mixed(turned, edges.body, found, best[0]), Prior(mean, information), np.maximum(evidence, best[2])
+    assert best is not None
+    return best[0], best[1]
+
+
+def _mixed(which: Bools, body: Ints, first: Fit, second: Fit) -> Fit:
+    """Return the first fit for some bodies (N,), and the second for the others."""
+    boxes = which[body]
+    found = Residuals(
+        *(_rows(boxes, a, b) for a, b in zip(vars(first.found).values(), vars(second.found).values(), strict=True))
+    )
+    weight = _rows(boxes, first.weight, second.weight)
+    rest = (_rows(which, getattr(first, k), getattr(second, k)) for k in ("values", "information", "prior"))
+    values, information, prior = rest
+    return Fit(values, weight, found, information, prior)
+
+
+def _rows(which: Bools, first: Floats, second: Floats) -> Floats:
+    return np.where(which.reshape(-1, *[1] * (first.ndim - 1)), first, second)

@@ -1,0 +1,156 @@
+"""Bodies from boxes: exact without noise, honest with noise, and no more shape than the boxes carry."""
+
+import numpy as np
+import pytest
+from triangulation.true_boxes import CAMERAS, corner_box, edges_of, looking_at, outline_box, random_bodies, views_of
+
+from objslam.core.bodies.body import SHAPES
+from objslam.core.camera import project
+from objslam.triangulation.bodies.edges import BoxEdges, contacts
+from objslam.triangulation.bodies.ellipsoid import from_axes
+from objslam.triangulation.bodies.fit import Prior, Weights, fit
+from objslam.triangulation.bodies.prior import weak_prior
+from objslam.triangulation.bodies.residuals import edge_gaps, residuals
+from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.shared import covariance_of, sides_of
+from objslam.triangulation.bodies.solve import solve_bodies
+
+
+def plain(count):
+    """Weights of one, without robustness."""
+    return Weights(np.ones((count, 5)), np.ones((count, 5)), robust=False)
+
+
+@pytest.mark.parametrize("lens", CAMERAS)
+def test_true_ellipsoids_are_found_from_their_boxes(lens):
+    rng, camera = np.random.default_rng(1), CAMERAS[lens]
+    true = random_bodies(8, rng)
+    views = [views_of(camera, body, 10, rng) for body in true]
+    boxes, poses = (np.concatenate(part) for part in zip(*views, strict=True))
+    body = np.repeat(np.arange(8), 10)
+    values = true + rng.normal(0, 0.05, true.shape)
+    prior, contact = Prior(values, np.tile(1e-12 * np.eye(7), (8, 1, 1))), None
+    for _ in range(1 if lens == "pinhole" else 6):  # The contacts converge by a factor of about 50.
+        edges = edges_of(camera, boxes, poses, body, contact=contact)
+        values = fit(edges, values, prior, plain(len(body)), ELLIPSOID).values
+        contact = contacts(camera, boxes, poses, edge_gaps(edges, values, ELLIPSOID)[2])
+    assert np.abs(values - true).max() < 1e-6
+
+
+def test_a_true_cuboid_is_found_from_its_boxes():
+    rng, camera = np.random.default_rng(2), CAMERAS["pinhole"]
+    centre, half, yaw = np.array([0.2, -0.1, 0.3]), np.array([0.5, 0.3, 0.4]), 0.5
+    poses = [
+        looking_at(centre + d * np.array([np.cos(a), np.sin(a), 0.4]), centre + rng.normal(0, 0.1, 3))
+        for a, d in zip(rng.uniform(0, 6, 20), rng.uniform(2, 4, 20), strict=True)
+    ]
+    boxes = np.array([corner_box(camera, centre, half, yaw, pose) for pose in poses])
+    edges = edges_of(camera, boxes, np.array(poses), np.zeros(20, dtype=int))
+    start = np.array([[0.25, -0.05, 0.2, -1.0, 0.1, 0.3, -1.0]])
+    found = fit(edges, start, Prior(start, 1e-12 * np.eye(7)[None]), plain(20), CUBOID).values
+    assert np.abs(found[0, :3] - centre).max() < 1e-6
+    assert np.abs(CUBOID.half_axes(found)[0] - half).max() < 1e-6
+    assert abs(CUBOID.heading(found)[0] - yaw) < 1e-6
+
+
+@pytest.mark.parametrize("kind", [ELLIPSOID, CUBOID])
+def test_the_derivatives_are_those_of_differences(kind):
+    rng = np.random.default_rng(3)
+    normal, place = rng.normal(size=(200, 4, 3)), 3 * rng.normal(size=(200, 3))
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    towards = -place + 0.2 * rng.normal(size=(200, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    at = np.array([[0.1, 0.2, -0.1, -0.5, 0.3, 0.4, -0.9]])
+    far = np.linalg.norm(place, axis=1) > 1.5
+    none, one = np.zeros((200, 4), dtype=bool), np.ones(200)
+    edges = BoxEdges(
+        np.zeros(200, dtype=int), place, normal, none + 0.002, one, 0 * one, none, one, towards, one + 1, one, 0 * one
+    ).take(far)
+    found = residuals(edges, at, kind)
+    _, by_gap, _ = edge_gaps(edges, at, kind)
+    slope = kind.axes_jacobian(at)[0]
+    for k in range(7):
+        step = 1e-6 * np.eye(7)[k]
+        ahead, behind = edge_gaps(edges, at + step, kind)[0], edge_gaps(edges, at - step, kind)[0]
+        assert np.abs((ahead - behind) / 2e-6 - by_gap[..., k]).max() < 1e-6
+        ahead, behind = residuals(edges, at + step, kind), residuals(edges, at - step, kind)
+        same = (ahead.use[:, 4] > 0) & (behind.use[:, 4] > 0)
+        off = np.abs((ahead.value - behind.value)[:, 4] / 2e-6 - found.by[:, 4, k])[same]
+        assert np.quantile(off, 0.95) < 1e-5
+        sides = [np.append(kind.half_axes(at + s)[0], kind.heading(at + s)) for s in (step, -step)]
+        assert np.abs((sides[0] - sides[1]) / 2e-6 - slope[3:, k]).max() < 1e-6
+    assert found.use[:, 4].mean() > 0.5
+
+
+def test_the_covariance_is_that_of_repeated_boxes():
+    rng, camera, many = np.random.default_rng(4), CAMERAS["pinhole"], 1000
+    true = from_axes(np.zeros((1, 3)), np.array([[0.5, 0.25, 0.35]]), np.array([0.6]))
+    boxes, poses = views_of(camera, true[0], 30, rng, arc=2.5)
+    body = np.repeat(np.arange(many), 30)
+    noisy = np.tile(boxes, (many, 1)) + rng.normal(0, 2, (30 * many, 4))
+    edges = edges_of(camera, noisy, np.tile(poses, (many, 1, 1)), body, sigma=2.0)
+    prior = weak_prior(np.zeros((many, 3)), np.tile([[0.35, 0.35]], (many, 1)))
+    now = residuals(edges, prior.mean, ELLIPSOID)
+    found = fit(edges, prior.mean, prior, Weights(now.sigma**2, now.sigma), ELLIPSOID)
+    told = covariance_of(edges, found, sides_of(edges, prior.mean[:, :3]), np.ones(2), np.zeros(2)).mean(axis=0)
+    root = np.linalg.cholesky(told)
+    spread = np.linalg.solve(root, np.linalg.solve(root, np.cov(found.values.T)).T)
+    assert np.abs(np.sqrt(np.linalg.eigvalsh(spread)) - 1).max() < 0.1
+
+
+def solved(camera, boxes, poses, points, half):
+    """The bodies of as many objects as points, whose boxes come in their order."""
+    body = np.repeat(np.arange(len(points)), len(boxes) // len(points))
+    side = np.full(len(boxes), 277.0)
+    return solve_bodies(
+        lambda _: edges_of(camera, boxes, poses, body, sigma=2.0),
+        points,
+        half,
+        ("thing",) * len(points),
+        side=side,
+        share=0.05,
+        bent=False,
+    )
+
+
+def test_the_shape_is_chosen_by_what_the_boxes_show():
+    rng, camera = np.random.default_rng(5), CAMERAS["pinhole"]
+    ball = from_axes(np.zeros((1, 3)), np.full((1, 3), 0.3), np.zeros(1))[0]
+    egg = from_axes(np.zeros((1, 3)), np.array([[0.5, 0.2, 0.3]]), np.array([0.7]))[0]
+    poses = np.array(
+        [looking_at(d * np.array([np.cos(a), np.sin(a), 0.3]), rng.normal(0, 0.1, 3)) for a, d in zip(
+            rng.uniform(0, 5, 40), rng.uniform(2, 4, 40), strict=True)]
+    )  # fmt: skip
+    cuboid = [corner_box(camera, np.zeros(3), np.array([0.5, 0.2, 0.3]), 0.7, pose) for pose in poses]
+    pixels = np.concatenate([project(camera, -pose[:3, 3][None] @ pose[:3, :3]) for pose in poses])
+    free = rng.uniform(5, 150, (40, 2))
+    label = np.concatenate([pixels - free, pixels + free], axis=1)  # boxes of any size
+    things = (
+        [outline_box(camera, ball, pose) for pose in poses],
+        [outline_box(camera, egg, pose) for pose in poses],
+        cuboid,
+        label,
+    )
+    boxes = np.concatenate([np.array(one) for one in things]) + rng.normal(0, 2, (160, 4))
+    found = solved(camera, boxes, np.tile(poses, (4, 1, 1)), np.zeros((4, 3)), np.full((4, 2), 0.3))
+    assert [SHAPES[one] for one in found.shape] == ["sphere", "ellipsoid", "cuboid", "point"]
+    assert np.abs(found.axes[1, 3:6] / [0.5, 0.2, 0.3] - 1).max() < 0.05
+    assert np.abs(found.axes[2, 3:6] / [0.5, 0.2, 0.3] - 1).max() < 0.05
+
+
+def test_from_one_side_the_depth_stays_near_its_prior_and_says_so():
+    rng, camera = np.random.default_rng(6), CAMERAS["pinhole"]
+    body = from_axes(np.zeros((1, 3)), np.array([[0.6, 0.15, 0.3]]), np.array([np.pi / 2]))[0]  # wide, and flat in depth
+    boxes, poses = [], []
+    for _ in range(40):
+        a, d = rng.uniform(-0.08, 0.08), rng.uniform(1.5, 3.0)
+        poses.append(looking_at(d * np.array([np.cos(a), np.sin(a), 0.05]), rng.normal(0, 0.1, 3)))
+        boxes.append(outline_box(camera, body, poses[-1]))
+    noisy = np.array(boxes) + rng.normal(0, 2, (40, 4))
+    found = solved(camera, noisy, np.array(poses), np.zeros((1, 3)), np.array([[0.6, 0.3]]))
+    covariance = found.slope[0] @ found.covariance[0] @ found.slope[0].T
+    half, sigma = found.axes[0, 3:6], np.sqrt(np.diag(covariance))
+    depth = int(np.argmax(sigma[3:5]))
+    assert half.max() < 1.2
+    assert half.min() > 0.05
+    assert sigma[3 + depth] > 0.15 * half[depth]

@@ -1,0 +1,136 @@
+"""Points against bodies on simulated boxes of ellipsoids: errors of centres, sizes and yaws, honesty, and time.
+
+The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. The benchmark says whether it can be
+imported here, and compares nothing with it otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import time
+
+import numpy as np
+
+from objslam.config import load_settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera, undistort
+from objslam.simulation.outlines import looking_at, outline_box
+from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
+from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
+from objslam.triangulation.bodies.solve import Bodies, solve_bodies
+from objslam.triangulation.triangulate import triangulate
+
+CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
+LARGE = 0.2  # The ratio of size and distance above which an object counts as large.
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--objects", type=int, default=200)
+    parser.add_argument("--boxes", type=int, default=30, help="boxes of each object")
+    parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of each edge, px")
+    parser.add_argument("--arc", type=float, nargs=2, default=(60.0, 180.0), help="range of azimuths of the views, degrees")
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    for seed in range(options.seeds):
+        rng = np.random.default_rng(seed)
+        true, boxes, poses, distance = scene(options.objects, options.boxes, options.arc, rng)
+        boxes = boxes + rng.normal(0.0, options.noise, boxes.shape)
+        points = triangulated(boxes, poses, len(true))
+        start = time.process_time()
+        bodies = solved(boxes, poses, points)
+        report(seed, true, points, bodies, distance, time.process_time() - start)
+    peer = importlib.util.find_spec("gtsam_quadrics")
+    print(
+        "gtsam-quadrics:", "absent (it needs Python 3.10 and numpy < 1.24)" if peer is None else "present, but not compared"
+    )
+
+
+def scene(count: int, per: int, arc: tuple[float, float], rng: np.random.Generator) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return ellipsoids (N, 7) of 0.1 to 1.5 m, exact boxes, poses, and the distance (N,) of each, 1 to 5 m."""
+    true: list[Floats] = []
+    boxes: list[Floats] = []
+    poses: list[Floats] = []
+    distances = []
+    while len(true) < count:
+        half = np.clip(np.exp(rng.uniform(np.log(0.05), np.log(0.75)) + rng.normal(0, 0.4, 3)), 0.05, 0.75)
+        body = from_axes(rng.uniform(-5, 5, (1, 3)) * [1, 1, 0.1], half[None], rng.uniform(-1.5, 1.5, 1))[0]
+        away, first, wide, high = (
+            rng.uniform(1, 5),
+            rng.uniform(0, 6.3),
+            np.radians(rng.uniform(*arc)),
+            rng.uniform(-0.3, 0.8),
+        )
+        seen: list[tuple[Floats, Floats]] = []
+        for _ in range(4 * per):
+            angle, far = first + wide * rng.uniform(-0.5, 0.5), away * rng.uniform(0.8, 1.2)
+            place = body[:3] + np.array([far * np.cos(angle), far * np.sin(angle), high])
+            pose = looking_at(place, body[:3] + rng.normal(0, 0.15 * far, 3))
+            box = outline_box(CAMERA, body, pose)
+            if box is not None and (box[:2] >= 1).all() and (box[2:] <= CAMERA.size - 2).all():
+                seen.append((box, pose))
+            if len(seen) == per:
+                break
+        if len(seen) == per:
+            true.append(body)
+            boxes += [box for box, _ in seen]
+            poses += [pose for _, pose in seen]
+            distances.append(away)
+    return np.array(true), np.array(boxes), np.array(poses), np.array(distances)
+
+
+def owners(boxes: Floats, count: int) -> Ints:
+    return np.repeat(np.arange(count), len(boxes) // count)
+
+
+def triangulated(boxes: Floats, poses: Floats, count: int) -> Floats:
+    """Return the points (N, 3) at which the rays through the centres of boxes meet."""
+    rays, _ = undistort(CAMERA, (boxes[:, :2] + boxes[:, 2:]) / 2)
+    rays = np.einsum("bij,bj->bi", poses[:, :3, :3], rays)
+    sigma, settings = np.full(len(boxes), 3 / CAMERA.focal), load_settings().triangulation
+    return triangulate(poses[:, :3, 3], rays, owners(boxes, count), count, sigma, settings).positions
+
+
+def solved(boxes: Floats, poses: Floats, points: Floats) -> Bodies:
+    """Return the bodies of objects at points (N, 3), with the default noise of the settings."""
+    count, number = len(points), len(boxes)
+    body = owners(boxes, count)
+    size = boxes[:, 2:] - boxes[:, :2]
+    away = np.linalg.norm(points[body] - poses[:, :3, 3], axis=1)
+    half = np.median((size * away[:, None] / CAMERA.focal).reshape(count, -1, 2), axis=1) / 2
+    direction, _ = undistort(CAMERA, (boxes[:, :2] + boxes[:, 2:]) / 2)
+
+    def measure(_: Floats | None) -> BoxEdges:
+        normal, turn, _ = tangent_planes(CAMERA, boxes, poses)
+        none, flat = np.zeros((number, 4), dtype=bool), np.zeros(number)
+        towards = np.einsum("bij,bj->bi", poses[:, :3, :3], direction)
+        edge = np.full(number, np.sqrt(2) * load_settings().rays.pixel_sigma)
+        ranges = np.full(number, np.nan), flat + 1, flat
+        return BoxEdges(body, poses[:, :3, 3], normal, turn, edge, flat, none, np.sqrt(size.prod(axis=1)), towards, *ranges)
+
+    side = np.full(number, np.sqrt(CAMERA.size.prod()) / 2)
+    return solve_bodies(measure, points, half, ("thing",) * count, side=side, share=0.1, bent=False)
+
+
+def report(seed: int, true: Floats, points: Floats, bodies: Bodies, distance: Floats, seconds: float) -> None:
+    large = 2 * half_axes(true).max(axis=1) / distance > LARGE
+    point, body = (np.linalg.norm(at - true[:, :3], axis=1) for at in (points, bodies.values[:, :3]))
+    print(
+        f"seed {seed}: {len(true)} objects, shapes {np.bincount(bodies.shape, minlength=4).tolist()}, {seconds:.2f} s of CPU"
+    )
+    for name, which in (("large", large), ("other", ~large)):
+        for what, measure in (("median", np.median), ("RMSE", lambda e: np.sqrt((e**2).mean()))):
+            a, b = measure(point[which]), measure(body[which])
+            print(f"  {name} {which.sum():4d} {what:>6}: point {a:.4f} m, body {b:.4f} m, ratio {b / a:.2f}")
+    sides = np.abs(bodies.axes[:, 3:6] / half_axes(true) - 1)
+    yaw = np.degrees(np.abs((bodies.axes[:, 6] - heading(true) + np.pi / 2) % np.pi - np.pi / 2))
+    off = bodies.values[:, :3] - true[:, :3]
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(bodies.covariance[:, :3, :3]), off)
+    print(f"  half axes off by {100 * np.median(sides):.1f} % (median), yaw by {np.median(yaw):.1f} deg (median)")
+    print(f"  centres inside the 95 % ellipsoid: {100 * (squared <= CHI2_95).mean():.1f} %")
+
+
+if __name__ == "__main__":
+    main()
